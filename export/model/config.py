@@ -1,0 +1,200 @@
+"""Every number of the TIC-VLA network in one frozen dataclass; presets `1b` (paper size) and `nano` (ours)."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+SEMANTIC_INTERFACES = ("kv", "values-only")
+PARAMETERISATIONS = ("increments", "offsets")
+
+
+class ModelConfigError(ValueError):
+    """A model configuration that contradicts itself."""
+
+
+def _require(ok: bool, message: str) -> None:
+    if not ok:
+        raise ModelConfigError(message)
+
+
+@dataclass(frozen=True)
+class VisionConfig:
+    """InternViT-style encoder and its projector (design §3; defaults are InternViT-300M)."""
+
+    image_px: int = 448
+    patch_px: int = 14
+    stem_channels: tuple[int, ...] = ()
+    """Channels of stride-2 3×3 convolutions before the embedding; empty: one patch×patch convolution."""
+    hidden: int = 1024
+    layers: int = 24
+    heads: int = 16
+    mlp: int = 4096
+    layer_norm_eps: float = 1e-6
+    layer_scale_init: float = 0.1
+    pixel_shuffle: int = 2
+    """Side of the patch square folded into one visual token (2 is InternVL's ×0.5)."""
+    projector_eps: float = 1e-5
+    token_dim: int = 896
+    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
+    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+
+    def __post_init__(self) -> None:
+        _require(self.image_px % self.patch_px == 0, f"image_px {self.image_px} is not a multiple of {self.patch_px}")
+        _require(self.grid % self.pixel_shuffle == 0, f"grid {self.grid} is not a multiple of {self.pixel_shuffle}")
+        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} is not a multiple of heads {self.heads}")
+        _require(
+            not self.stem_channels or self.patch_px == 2 ** len(self.stem_channels),
+            f"{len(self.stem_channels)} stride-2 stem layers do not make patch_px {self.patch_px}",
+        )
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side."""
+        return self.image_px // self.patch_px
+
+    @property
+    def tokens(self) -> int:
+        """Visual tokens of one frame."""
+        return (self.grid // self.pixel_shuffle) ** 2
+
+
+@dataclass(frozen=True)
+class LanguageConfig:
+    """Qwen2.5-style decoder (design §3; defaults are Qwen2.5-0.5B as in InternVL3-1B)."""
+
+    hidden: int = 896
+    layers: int = 24
+    heads: int = 14
+    kv_heads: int = 2
+    head_dim: int = 64
+    mlp: int = 4864
+    vocab: int = 151674
+    rope_theta: float = 1e6
+    rms_eps: float = 1e-6
+    token_merge: int = 1
+    """Side of the square of visual tokens merged into one language token (1: none, as in the paper)."""
+    max_context: int = 1536
+    im_start_id: int = 151644
+    im_end_id: int = 151645
+    img_start_id: int = 151665
+    img_end_id: int = 151666
+    img_context_id: int = 151667
+
+    def __post_init__(self) -> None:
+        _require(self.heads % self.kv_heads == 0, f"heads {self.heads} is not a multiple of kv_heads {self.kv_heads}")
+        ids = (self.im_start_id, self.im_end_id, self.img_start_id, self.img_end_id, self.img_context_id)
+        _require(len(set(ids)) == 5 and max(ids) < self.vocab, f"special ids {ids} must be distinct and below vocab")
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """Action expert: cross-attention over visual tokens, delayed semantics, state and latency (paper Table 7)."""
+
+    hidden: int = 512
+    layers: int = 6
+    heads: int = 8
+    ffn: int = 2048
+    steps: int = 30
+    step_s: float = 0.1
+    kv_dropout: float = 0.1
+    state_dropout: float = 0.5
+    semantic_interface: str = "kv"
+    latency_aware: bool = True
+    motion_offset: bool = True
+    parameterisation: str = "increments"
+    initial_step: tuple[float, float, float] = (0.05, 0.0, 0.0)
+    """(dx m, dy m, dθ rad) a step that the head's bias starts from: 0.5 m/s straight ahead."""
+
+    def __post_init__(self) -> None:
+        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} is not a multiple of heads {self.heads}")
+        _require(
+            self.semantic_interface in SEMANTIC_INTERFACES,
+            f"semantic_interface {self.semantic_interface!r}: expected one of {SEMANTIC_INTERFACES}",
+        )
+        _require(
+            self.parameterisation in PARAMETERISATIONS,
+            f"parameterisation {self.parameterisation!r}: expected one of {PARAMETERISATIONS}",
+        )
+        for name in ("kv_dropout", "state_dropout"):
+            _require(0 <= getattr(self, name) < 1, f"{name} must be in [0, 1)")
+
+
+@dataclass(frozen=True)
+class ValueConfig:
+    """Value network of reinforcement learning (paper appendix A)."""
+
+    channels: int = 256
+    conv_layers: int = 3
+
+
+@dataclass(frozen=True)
+class TicVlaConfig:
+    """The whole network."""
+
+    name: str
+    vision: VisionConfig = field(default_factory=VisionConfig)
+    language: LanguageConfig = field(default_factory=LanguageConfig)
+    action: ActionConfig = field(default_factory=ActionConfig)
+    value: ValueConfig = field(default_factory=ValueConfig)
+
+    def __post_init__(self) -> None:
+        side = self.vision.grid // self.vision.pixel_shuffle
+        _require(side % self.language.token_merge == 0, f"{side} tokens a side do not merge by {self.language.token_merge}")
+        _require(
+            self.language.token_merge > 1 or self.vision.token_dim == self.language.hidden,
+            f"token_dim {self.vision.token_dim} must equal the language model's hidden {self.language.hidden}",
+        )
+
+    @property
+    def frame_tokens(self) -> int:
+        """Language tokens that one frame takes."""
+        return self.vision.tokens // self.language.token_merge**2
+
+    @property
+    def kv_dim(self) -> int:
+        """Width of one token of the semantic state: last-layer K‖V (256 at paper size)."""
+        return 2 * self.language.kv_heads * self.language.head_dim
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON form."""
+        return dataclasses.asdict(self)
+
+
+PRESETS = {
+    "1b": TicVlaConfig(name="1b"),
+    "nano": TicVlaConfig(
+        name="nano",
+        vision=VisionConfig(
+            image_px=128,
+            patch_px=16,
+            stem_channels=(24, 48, 96, 192),
+            hidden=192,
+            layers=4,
+            heads=3,
+            mlp=768,
+            pixel_shuffle=1,
+            token_dim=256,
+        ),
+        language=LanguageConfig(
+            hidden=256,
+            layers=4,
+            heads=4,
+            kv_heads=2,
+            head_dim=64,
+            mlp=688,
+            vocab=1024,
+            rope_theta=1e4,
+            token_merge=2,
+            max_context=512,
+            im_start_id=1,
+            im_end_id=2,
+            img_start_id=3,
+            img_end_id=4,
+            img_context_id=5,
+        ),
+        action=ActionConfig(hidden=256, heads=4, ffn=1024),
+        value=ValueConfig(channels=128),
+    ),
+}
