@@ -1,0 +1,231 @@
+"""Flight recorder: never in the caller's way, readable whatever happened to the process or the disk."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from edge.recorder import Recorder, encode
+from edge.recording import RecordingError, jpeg_bytes, read_messages
+
+JPEG = b"\xff\xd8\xff\xe0 not a picture, but bytes of one \xff\xd9"
+
+
+def _wait_for(condition, timeout_s: float = 5.0) -> bool:
+    end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+    while time.monotonic_ns() < end_ns:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_records_come_back_in_order_with_their_stamps(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    for tick in range(300):
+        recorder.put("/tick", 1_000 + tick, {"tick": tick, "command": [0.1, 0.0, -0.2], "reason": "ok"})
+    assert recorder.close()
+    assert recorder.dropped == {}
+    messages = list(read_messages(tmp_path / "flight.mcap"))
+    assert [(topic, stamp_ns, payload["tick"]) for topic, stamp_ns, payload in messages] == [
+        ("/tick", 1_000 + tick, tick) for tick in range(300)
+    ]
+
+
+def test_camera_bytes_become_a_foxglove_compressed_image(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    recorder.put("/camera", 12_345_678_901_234, JPEG)
+    assert recorder.close()
+    ((topic, stamp_ns, payload),) = read_messages(tmp_path / "flight.mcap")
+    assert (topic, stamp_ns) == ("/camera", 12_345_678_901_234)
+    assert payload["timestamp"] == {"sec": 12_345, "nsec": 678_901_234}
+    assert payload["format"] == "jpeg"
+    assert jpeg_bytes(payload) == JPEG
+
+
+def test_an_ordinary_mcap_reader_sees_topics_and_schemas(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    recorder.put("/camera", 1, JPEG)
+    recorder.put("/tick", 2, {"tick": 0})
+    recorder.put("/unheard-of", 3, {"a": 1})
+    assert recorder.close()
+    with (tmp_path / "flight.mcap").open("rb") as stream:
+        found = {
+            channel.topic: (schema.name, schema.encoding, channel.message_encoding)
+            for schema, channel, _ in make_reader(stream).iter_messages()
+        }
+    assert found == {
+        "/camera": ("foxglove.CompressedImage", "jsonschema", "json"),
+        "/tick": ("tic_vla.Tick", "jsonschema", "json"),
+        "/unheard-of": ("tic_vla.Object", "jsonschema", "json"),
+    }
+
+
+def test_a_hanging_disk_costs_the_caller_records_not_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk_answers = threading.Event()
+    monkeypatch.setattr("edge.recorder.os.fsync", lambda _: disk_answers.wait())
+    recorder = Recorder(tmp_path / "flight.mcap", capacity=8)
+    for index in range(10):
+        recorder.put("/tick", index, {"tick": index})  # returns although the writer is stuck
+    recorder.put("/camera", 10, JPEG)
+    assert recorder.dropped == {"/tick": 2, "/camera": 1}
+    assert recorder.close(timeout_s=0.1) is False
+    assert "not finished within 0.1 s" in (recorder.error or "")
+    disk_answers.set()
+
+
+def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap", capacity_bytes=1000)
+    recorder.put("/camera", 1, b"x" * 1001)
+    assert recorder.close()
+    assert recorder.dropped == {"/camera": 1}
+
+
+def test_a_disk_that_is_full_stops_writing_and_is_reported(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    recorder = Recorder("/dev/full")
+    recorder.put("/tick", 1, {"tick": 0})
+    assert _wait_for(lambda: recorder.error is not None)
+    recorder.put("/tick", 2, {"tick": 1})
+    assert "/dev/full stopped: No space left on device" in (recorder.error or "")
+    assert recorder.dropped["/tick"] >= 1
+    assert recorder.close() is False
+
+
+def test_a_missing_directory_is_reported_not_raised(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "missing" / "flight.mcap")
+    recorder.put("/tick", 1, {"tick": 0})
+    assert "No such file or directory" in (recorder.error or "")
+    assert recorder.dropped == {"/tick": 1}
+    assert recorder.close() is False
+
+
+def test_a_file_removed_while_recording_is_reported(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    recorder = Recorder(folder / "flight.mcap")
+    recorder.put("/tick", 1, {"tick": 0})
+    (folder / "flight.mcap").unlink()
+    folder.rmdir()
+    assert _wait_for(lambda: recorder.error is not None)
+    assert "was removed" in (recorder.error or "")
+    recorder.close()
+
+
+def test_put_after_close_is_dropped_and_counted(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    recorder.close()
+    recorder.put("/tick", 1, {"tick": 0})
+    assert recorder.dropped == {"/tick": 1}
+
+
+def test_one_record_json_cannot_hold_does_not_end_the_recording(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    recorder.put("/tick", 1, {"tick": object()})
+    recorder.put("/tick", -1, {"tick": 1})
+    recorder.put("/tick", 3, {"tick": 2})
+    assert recorder.close()
+    assert recorder.dropped == {"/tick": 2}
+    assert [payload["tick"] for _, _, payload in read_messages(tmp_path / "flight.mcap")] == [2]
+
+
+def test_numpy_values_and_non_finite_numbers_are_valid_json() -> None:
+    payload = {"a": np.float32(0.5), "b": np.array([[1.0, math.nan], [math.inf, 2.0]]), "c": (np.int64(3), None)}
+    assert json.loads(encode(payload, 0)) == {"a": 0.5, "b": [[1.0, None], [None, 2.0]], "c": [3, None]}
+
+
+def test_threads_may_record_at_the_same_time(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap", capacity=10_000)
+    threads = [
+        threading.Thread(target=lambda name=name: [recorder.put(name, n, {"n": n}) for n in range(500)])
+        for name in ("/tick", "/semantic", "/other")
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert recorder.close()
+    for name in ("/tick", "/semantic", "/other"):
+        numbers = [payload["n"] for topic, _, payload in read_messages(tmp_path / "flight.mcap") if topic == name]
+        assert numbers == list(range(500))
+
+
+RECORD_FOR_EVER = """
+import sys, time
+from edge.recorder import Recorder
+recorder = Recorder(sys.argv[1])
+tick = 0
+while True:
+    recorder.put("/tick", time.monotonic_ns(), {"tick": tick})
+    recorder.put("/camera", time.monotonic_ns(), bytes(range(256)) * 40)
+    tick += 1
+    time.sleep(0.01)
+"""
+
+
+def test_a_recording_process_killed_in_the_middle_leaves_a_readable_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    process = subprocess.Popen([sys.executable, "-c", RECORD_FOR_EVER, str(path)])
+    try:
+        assert _wait_for(lambda: path.exists() and path.stat().st_size > 0, 20)
+        time.sleep(2.2)
+        killed_ns = time.monotonic_ns()
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    messages = list(read_messages(path))
+    ticks = [payload["tick"] for topic, _, payload in messages if topic == "/tick"]
+    assert ticks == list(range(len(ticks)))
+    assert len(ticks) > 0
+    assert killed_ns - messages[-1][1] < 2_000_000_000  # a second of buffering, and slack for a busy machine
+
+
+@pytest.fixture(scope="module")
+def whole_file(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("whole") / "flight.mcap"
+    recorder = Recorder(path)
+    for tick in range(2_000):
+        recorder.put("/tick", tick, {"tick": tick, "noise": os.urandom(100).hex()})
+    assert recorder.close()
+    return path.read_bytes()
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(part=st.floats(0.0, 1.0))
+def test_a_file_cut_anywhere_yields_a_prefix_and_never_raises(part: float, whole_file: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole_file[: 8 + int(part * (len(whole_file) - 8))])
+    ticks = [payload["tick"] for _, _, payload in read_messages(path)]
+    assert ticks == list(range(len(ticks)))
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(part=st.floats(0.01, 0.99), flip=st.integers(1, 255))
+def test_a_damaged_byte_never_yields_a_wrong_record(part: float, flip: int, whole_file: bytes, tmp_path: Path) -> None:
+    damaged = bytearray(whole_file)
+    damaged[int(part * len(damaged))] ^= flip
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(bytes(damaged))
+    ticks = [payload["tick"] for _, _, payload in read_messages(path)]
+    assert ticks == sorted(set(ticks)) and set(ticks) <= set(range(2_000))
+
+
+def test_a_file_that_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("hello, this is not MCAP")
+    with pytest.raises(RecordingError, match=r"notes\.txt is not an MCAP file"):
+        list(read_messages(path))
