@@ -1,0 +1,59 @@
+"""Pose history of the robot's odometry, read by two threads and written by a third without a lock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edge.geometry import SE2, interpolate
+
+
+@dataclass(frozen=True)
+class StampedPose:
+    """Odometry as received: monotonic stamp, `T_odom_base`, body velocity."""
+
+    stamp_ns: int
+    T_odom_base: SE2
+    vx_mps: float
+    vy_mps: float
+    wz_radps: float
+
+
+class PoseHistory:
+    """The last `capacity` poses; one writer, any number of readers, nobody ever waits.
+
+    Slots are replaced whole, and copying a list is atomic in CPython, so a reader sees complete poses only.
+    """
+
+    def __init__(self, capacity: int = 4096) -> None:
+        self._slots: list[StampedPose | None] = [None] * capacity
+        self._count = 0
+
+    def put(self, pose: StampedPose) -> None:
+        """Add the newest pose; poses that do not advance in time are ignored."""
+        newest = self.newest()
+        if newest is not None and pose.stamp_ns <= newest.stamp_ns:
+            return
+        self._slots[self._count % len(self._slots)] = pose
+        self._count += 1
+
+    def newest(self) -> StampedPose | None:
+        """The last pose put, or None."""
+        return self._slots[(self._count - 1) % len(self._slots)] if self._count else None
+
+    def at(self, stamp_ns: int) -> SE2 | None:
+        """`T_odom_base` at an instant, interpolated; the nearest end outside the history; None while it is empty."""
+        count = self._count
+        slots = list(self._slots)
+        after: StampedPose | None = None
+        # Backwards from the newest: what is asked for is nearly always a fraction of a second old.
+        for index in range(count - 1, max(count - len(slots), 0) - 1, -1):
+            before = slots[index % len(slots)]
+            if before is None or (after is not None and before.stamp_ns >= after.stamp_ns):
+                break  # the writer has overtaken this end of the copy
+            if before.stamp_ns <= stamp_ns:
+                if after is None:
+                    return before.T_odom_base
+                fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+                return interpolate(before.T_odom_base, after.T_odom_base, fraction)
+            after = before
+        return after.T_odom_base if after is not None else None

@@ -1,0 +1,39 @@
+"""The semantic state: what the control thread knows of the last released generation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.geometry import SE2
+from edge.reasoning_text import Waypoints
+
+
+@dataclass(frozen=True)
+class SemanticState:
+    """Immutable result of one generation, with the anchor that its keys and values belong to.
+
+    It is published by a single reference assignment, so keys, values and anchor can never be of two generations.
+    """
+
+    generation: int
+    anchor_ns: int
+    T_odom_anchor: SE2
+    ready_ns: int
+    last_layer_kv: npt.NDArray[np.float32]
+    """K‖V of the language model's last layer, [1, T, kv_dim]."""
+    context_keys: npt.NDArray[np.float32]
+    """Keys for every cross-attention layer, [layers, 1, heads, T, d]."""
+    context_values: npt.NDArray[np.float32]
+    text: str
+    waypoints: Waypoints | None
+
+    def delay_s(self, now_ns: int) -> float:
+        """Δt: now − anchor (inference time plus time since it finished)."""
+        return (now_ns - self.anchor_ns) / 1e9
+
+    def motion_offset(self, T_odom_base: SE2) -> SE2:
+        """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
+        return self.T_odom_anchor.inverse() @ T_odom_base
