@@ -1,0 +1,233 @@
+"""The Go2's sport controller: sport actions and velocity commands -> joint torques; pure, no physics engine inside.
+
+Mode numbers are those of SportModeState. A mode is reported when the robot has arrived in it; while it is still getting
+up or lying down it reports the mode it left (recovery reports 8 until it stands).
+
+What the trot can do without falling (measured on a flat floor, friction 0.8; see tests/test_sim_go2.py) is less than
+the real robot's range, and commands are clipped to it: see GaitConfig.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import cos, pi
+from typing import NamedTuple
+
+from sim_hil.gait import GRAVITY_MPS2, BodyMotion, GaitConfig, GaitState, start_gait, step_gait
+from sim_hil.go2_urdf import LEG_GEOMETRY, TORQUE_LIMITS_NM, TOTAL_MASS_KG
+from sim_hil.kinematics import Vec3, joint_angles, joint_torque
+
+MODE_BALANCE_STAND, MODE_LOCOMOTION, MODE_LIE_DOWN, MODE_JOINT_LOCK = 1, 3, 5, 6
+MODE_DAMPING, MODE_RECOVERY_STAND = 7, 8
+STANDING_MODES = frozenset((MODE_BALANCE_STAND, MODE_LOCOMOTION, MODE_JOINT_LOCK))
+ERROR_NOT_STANDING = 4202  # the sport controller is not in a state that allows the action
+
+# Ranges of the real Move request.
+VX_RANGE_MPS, VY_RANGE_MPS, WZ_RANGE_RADPS = (-2.5, 3.8), (-1.0, 1.0), (-4.0, 4.0)
+HOLD_S = 1.0  # firmware from V1.1.6 keeps the latest Move for one second
+
+LYING_RAD = (-0.25, 1.32, -2.70, 0.25, 1.32, -2.70, -0.25, 1.32, -2.70, 0.25, 1.32, -2.70)
+_NO_PUSH: tuple[Vec3, ...] = ((0.0, 0.0, 0.0),) * 4
+_WEIGHT: tuple[Vec3, ...] = ((0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4),) * 4
+
+
+class SportAction(Enum):
+    """Requests of the sport service that change what the robot is doing."""
+
+    DAMP = "Damp"
+    BALANCE_STAND = "BalanceStand"
+    STOP_MOVE = "StopMove"
+    STAND_UP = "StandUp"
+    STAND_DOWN = "StandDown"
+    RECOVERY_STAND = "RecoveryStand"
+
+
+class Measured(NamedTuple):
+    """What the controller reads every step: joints (FR, FL, RR, RL x hip, thigh, calf) and the body."""
+
+    q_rad: tuple[float, ...]
+    dq_radps: tuple[float, ...]
+    body: BodyMotion
+    up: float  # world z of the base's up axis: 1 upright, -1 on its back
+
+
+class _Motion(NamedTuple):
+    """A scripted motion: joint targets reached one after the other, then a mode."""
+
+    keyframes: tuple[tuple[float, tuple[float, ...]], ...]  # (seconds to get there, joint angles)
+    mode: int
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+class SportController:
+    """The mode machine and its torques. Deterministic; call `step` once every dt_s."""
+
+    def __init__(self, dt_s: float, gait: GaitConfig | None = None) -> None:
+        self._dt_s = dt_s
+        self._config = gait if gait is not None else GaitConfig()
+        self._mode = MODE_LIE_DOWN
+        self._time_s = 0.0
+        self._motion: _Motion | None = None
+        self._motion_start_s = 0.0
+        self._motion_from: tuple[float, ...] = LYING_RAD
+        self._gait: GaitState = start_gait(self._config, 0.0)
+        self._command: Vec3 = (0.0, 0.0, 0.0)
+        self._command_s = -HOLD_S
+        self._targets: tuple[float, ...] = LYING_RAD
+        self._latest: Measured | None = None
+
+    @property
+    def mode(self) -> int:
+        """SportModeState.mode."""
+        return self._mode
+
+    @property
+    def gait_type(self) -> int:
+        """SportModeState.gait_type: 1 while trotting, else 0."""
+        return 1 if self._mode == MODE_LOCOMOTION else 0
+
+    @property
+    def commanded(self) -> Vec3:
+        """The velocity command in force, (vx m/s, vy m/s, wz rad/s): zero unless the robot may move."""
+        expired = self._time_s - self._command_s >= HOLD_S - 1e-9
+        if expired or self._mode not in (MODE_BALANCE_STAND, MODE_LOCOMOTION) or self._motion is not None:
+            return (0.0, 0.0, 0.0)
+        return self._command
+
+    def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
+        """Take a velocity; kept one second, clipped to the robot's range, without effect unless it stands balanced."""
+        if self._mode not in (MODE_BALANCE_STAND, MODE_LOCOMOTION) or self._motion is not None:
+            return
+        self._command = (
+            _clip(vx_mps, *VX_RANGE_MPS),
+            _clip(vy_mps, *VY_RANGE_MPS),
+            _clip(wz_radps, *WZ_RANGE_RADPS),
+        )
+        self._command_s = self._time_s
+
+    def request(self, action: SportAction) -> int:
+        """Start an action; return 0, or 4202 where the robot's posture does not allow it."""
+        standing = self._mode in STANDING_MODES and self._motion is None
+        if action is SportAction.DAMP:
+            self._forget_command()
+            self._motion, self._mode = None, MODE_DAMPING
+        elif action is SportAction.STOP_MOVE:
+            self._forget_command()
+        elif action is SportAction.BALANCE_STAND:
+            if not standing:
+                return ERROR_NOT_STANDING
+            if self._mode == MODE_JOINT_LOCK:
+                self._enter_balance()
+        elif action is SportAction.STAND_UP:
+            if self._mode != MODE_JOINT_LOCK or self._motion is not None:
+                self._start(((0.4, self._folded()), (1.2, self._standing())), MODE_JOINT_LOCK)
+        elif action is SportAction.STAND_DOWN:
+            if self._mode != MODE_LIE_DOWN or self._motion is not None:
+                self._start(((1.5, LYING_RAD),), MODE_LIE_DOWN)
+        elif action is SportAction.RECOVERY_STAND:
+            if self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION) and self._motion is None:
+                return 0
+            self._mode = MODE_RECOVERY_STAND
+            self._start(((0.8, LYING_RAD), (1.2, self._standing())), MODE_BALANCE_STAND)
+        return 0
+
+    def _forget_command(self) -> None:
+        self._command, self._command_s = (0.0, 0.0, 0.0), -HOLD_S
+
+    def _standing(self) -> tuple[float, ...]:
+        feet = start_gait(self._config, 0.0).feet
+        return tuple(angle for leg, foot in enumerate(feet) for angle in joint_angles(leg, foot))
+
+    def _folded(self) -> tuple[float, ...]:
+        # A robot that already stands goes straight up or stays; only a collapsed one folds its legs first.
+        if self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION):
+            return self._standing()
+        return LYING_RAD
+
+    def _start(self, keyframes: tuple[tuple[float, tuple[float, ...]], ...], mode: int) -> None:
+        self._forget_command()
+        self._motion = _Motion(keyframes, mode)
+        self._motion_start_s = self._time_s
+        self._motion_from = self._latest.q_rad if self._latest is not None else LYING_RAD
+
+    def _enter_balance(self) -> None:
+        self._mode = MODE_BALANCE_STAND
+        yaw = self._latest.body.yaw_rad if self._latest is not None else 0.0
+        self._gait = start_gait(self._config, yaw)
+
+    def step(self, measured: Measured) -> tuple[float, ...]:
+        """Advance by dt_s; return the 12 joint torques, N.m, within the motors' limits."""
+        self._latest = measured
+        fallen = measured.up < 0.5 and self._mode in STANDING_MODES
+        if fallen:
+            # A robot that has lost its balance goes limp, as the real one does: flailing breaks it.
+            self._motion, self._mode = None, MODE_DAMPING
+            self._forget_command()
+        if self._motion is not None:
+            torques = self._scripted(measured)
+        elif self._mode == MODE_DAMPING:
+            self._targets = measured.q_rad
+            torques = tuple(-2.0 * dq for dq in measured.dq_radps)
+        elif self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION):
+            torques = self._walk(measured)
+        elif self._mode == MODE_JOINT_LOCK:
+            torques = self._track(measured, self._standing_targets, 90.0, 2.5, _WEIGHT)
+        else:
+            torques = self._track(measured, LYING_RAD, 25.0, 2.0, _NO_PUSH)
+        self._time_s += self._dt_s
+        return torques
+
+    @property
+    def _standing_targets(self) -> tuple[float, ...]:
+        return self._targets
+
+    def _walk(self, measured: Measured) -> tuple[float, ...]:
+        command = self.commanded
+        self._gait, output = step_gait(self._config, self._gait, command, measured.body, self._dt_s)
+        self._mode = MODE_LOCOMOTION if command != (0.0, 0.0, 0.0) else MODE_BALANCE_STAND
+        targets = tuple(angle for leg, foot in enumerate(output.feet) for angle in joint_angles(leg, foot))
+        gains = (70.0, 2.0) if self._gait.walking else (90.0, 2.5)
+        return self._track(measured, targets, *gains, output.push)
+
+    def _scripted(self, measured: Measured) -> tuple[float, ...]:
+        motion = self._motion
+        assert motion is not None
+        elapsed = self._time_s - self._motion_start_s
+        begin = self._motion_from
+        for duration, end in motion.keyframes:
+            if elapsed < duration:
+                blend = 0.5 * (1.0 - cos(pi * elapsed / duration))
+                targets = tuple(a + (b - a) * blend for a, b in zip(begin, end, strict=True))
+                return self._track(measured, targets, 90.0, 2.5, _NO_PUSH)
+            elapsed, begin = elapsed - duration, end
+        self._motion = None
+        self._targets = begin
+        self._mode = motion.mode
+        if motion.mode == MODE_BALANCE_STAND:
+            self._enter_balance()
+        return self._track(measured, begin, 90.0, 2.5, _NO_PUSH)
+
+    def _track(
+        self, measured: Measured, targets: tuple[float, ...], kp: float, kd: float, push: tuple[Vec3, ...]
+    ) -> tuple[float, ...]:
+        """PD on the joints plus the torque of each foot's push on the ground (without it the knees sag)."""
+        limits = (TORQUE_LIMITS_NM[0], TORQUE_LIMITS_NM[1], TORQUE_LIMITS_NM[2])
+        previous, inverse_dt = self._targets, 1.0 / self._dt_s
+        torques = []
+        for leg in range(4):
+            base = 3 * leg
+            q = measured.q_rad[base : base + 3]
+            carry = joint_torque(leg, q, push[leg])  # type: ignore[arg-type]
+            lower_upper = LEG_GEOMETRY[leg].limits_rad
+            for joint in range(3):
+                i = base + joint
+                target = _clip(targets[i], *lower_upper[joint])
+                # Swing targets move fast: the damping term must not fight the motion it is asked for.
+                rate = _clip((targets[i] - previous[i]) * inverse_dt, -15.0, 15.0)
+                torque = kp * (target - q[joint]) + kd * (rate - measured.dq_radps[i]) + carry[joint]
+                torques.append(_clip(torque, -limits[joint], limits[joint]))
+        self._targets = targets
+        return tuple(torques)
