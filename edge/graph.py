@@ -34,8 +34,10 @@ class Graph:
             self._session = ort.InferenceSession(
                 artifacts.contents[contract.file], sess_options=options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime raises several unrelated types for a bad graph
-            raise ArtifactError(f"{contract.file}: ONNX Runtime cannot open it ({str(error).splitlines()[0]})") from error
+        except Exception as error:
+            raise ArtifactError(
+                f"{contract.file}: ONNX Runtime cannot open it ({str(error).splitlines()[0]})"
+            ) from error
         self.name = name
         for declared, found in (
             (contract.inputs, self._session.get_inputs()),

@@ -17,7 +17,7 @@ from edge.prompt import PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_TEXT_CHARS
 
 
-class Cancelled(Exception):
+class CancelledError(Exception):
     """The generation was told to stop."""
 
 
@@ -58,7 +58,7 @@ class LanguageModel:
     def generate(
         self, segments: Sequence[Segment], *, max_new_tokens: int, cancelled: Callable[[], bool]
     ) -> Generation:
-        """Run one generation; raises Cancelled between calls, ContextOverflowError when the prompt does not fit."""
+        """Run one generation; raises CancelledError between calls, ContextOverflowError when the prompt does not fit."""
         prompt_tokens = sum(len(segment.ids) for segment in segments)
         room = self._runtime.max_context - prompt_tokens
         if room < 0:
@@ -97,7 +97,7 @@ class LanguageModel:
         cancelled: Callable[[], bool],
     ) -> tuple[int, list[Array]]:
         if cancelled():
-            raise Cancelled
+            raise CancelledError
         feeds: dict[str, Array] = {
             "input_ids": np.array([ids], dtype=np.int64),
             "visual_tokens": self._no_frame if frames is None else frames,

@@ -127,14 +127,16 @@ def _read_manifest(directory: Path) -> tuple[bytes, dict[str, Any]]:
         raw = path.read_bytes()
         manifest: Any = json.loads(raw)
     except OSError as error:
-        raise ArtifactError(f"{path}: cannot be read ({error.strerror}); is this a directory of edge-export?") from error
+        raise ArtifactError(
+            f"{path}: cannot be read ({error.strerror}); is this a directory of edge-export?"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path}: not JSON ({error})") from error
     if not isinstance(manifest, dict):
         raise ArtifactError(f"{path}: expected a JSON object")
     if manifest.get("schema_version") != SCHEMA_VERSION:
         raise ArtifactError(
-            f"{path}: schema version {manifest.get('schema_version')!r}, this runner reads {SCHEMA_VERSION}; export again"
+            f"{path}: schema version {manifest.get('schema_version')!r}, expected {SCHEMA_VERSION}; export again"
         )
     missing = [section for section in _SECTIONS if section not in manifest]
     if missing:
@@ -153,7 +155,11 @@ def _read_file(directory: Path, name: str, entry: Any) -> bytes:
     if not _PLAIN_NAME.fullmatch(name) or name == MANIFEST_NAME:
         raise ArtifactError(f"{MANIFEST_NAME}: file name {name!r} is not a plain name")
     path = directory / name
-    if not isinstance(entry, dict) or not isinstance(entry.get("bytes"), int) or not isinstance(entry.get("sha256"), str):
+    if (
+        not isinstance(entry, dict)
+        or not isinstance(entry.get("bytes"), int)
+        or not isinstance(entry.get("sha256"), str)
+    ):
         raise ArtifactError(f"{MANIFEST_NAME}: entry of {name} must give bytes and sha256")
     if path.is_symlink() or not path.is_file():
         raise ArtifactError(f"{path}: missing or not a regular file")
@@ -198,7 +204,9 @@ def _runtime(section: dict[str, Any]) -> RuntimeConfig:
         isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6 for v in [*numbers, *offsets]
     ):
         raise ArtifactError(f"{MANIFEST_NAME}: runtime values must be numbers that are not negative")
-    values = {key: value if key == "step_s" else int(value) for key, value in section.items() if key != "frame_offsets_s"}
+    values = {
+        key: value if key == "step_s" else int(value) for key, value in section.items() if key != "frame_offsets_s"
+    }
     return RuntimeConfig(frame_offsets_s=tuple(float(v) for v in offsets), **values)
 
 
@@ -224,11 +232,14 @@ def check_contract(artifacts: Artifacts) -> None:
     for graph, tensor, dtype, shape in expected:
         if tensor.dtype != dtype or tensor.shape != shape:
             raise ArtifactError(
-                f"{graph.file}: {tensor.name} is {tensor.dtype}{list(tensor.shape)}, the runner expects {dtype}{list(shape)}"
+                f"{graph.file}: {tensor.name} is {tensor.dtype}{list(tensor.shape)}, "
+                f"the runner expects {dtype}{list(shape)}"
             )
     trajectory = action.output("trajectory")
     if trajectory.dtype != "float" or len(trajectory.shape) != 3 or trajectory.shape[2] != 3:
         raise ArtifactError(f"{action.file}: trajectory is {list(trajectory.shape)}, the runner expects [1, steps, 3]")
     steps = trajectory.shape[1]
     if not isinstance(steps, int) or steps * runtime.step_s < 1.0:
-        raise ArtifactError(f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at")
+        raise ArtifactError(
+            f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at"
+        )

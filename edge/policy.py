@@ -43,7 +43,12 @@ class Policy:
         return cast(FloatArray, keys), cast(FloatArray, values)
 
     def act(
-        self, visual_tokens: FloatArray, state: tuple[float, float, float], delay_s: float, offset: SE2, semantic: SemanticState
+        self,
+        visual_tokens: FloatArray,
+        state: tuple[float, float, float],
+        delay_s: float,
+        offset: SE2,
+        semantic: SemanticState,
     ) -> FloatArray:
         """Planned trajectory [steps, 3] in the current robot frame (every tick, control thread)."""
         feeds = {

@@ -20,7 +20,7 @@ _LINE = re.compile(rf"waypoints: {_POINT} {_POINT} {_POINT}", re.ASCII)
 
 
 def parse_waypoints(text: str) -> Waypoints | None:
-    """(x m, y m) at 3, 6 and 9 s after the anchor, in the anchor's robot frame, from the text's last line; else None."""
+    """(x m, y m) at 3, 6, 9 s after the anchor, in the anchor's robot frame, from the text's last line; else None."""
     if len(text) > MAX_TEXT_CHARS:
         return None
     lines = text.rstrip("\n").rsplit("\n", 1)

@@ -58,7 +58,9 @@ def parse_release_delay(argument: str) -> ReleaseDelay:
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ReleaseDelayError(f"release delay {argument!r}: neither a number of seconds nor a file ({error})") from error
+        raise ReleaseDelayError(
+            f"release delay {argument!r}: neither a number of seconds nor a file ({error})"
+        ) from error
     except ValueError as error:
         raise ReleaseDelayError(f"release delay profile {path}: not JSON ({error})") from error
     if not isinstance(content, dict) or content.get("schema") != 1:

@@ -1,4 +1,4 @@
-"""Ring buffer of encoded frames: written by the control thread, read by the reasoning thread; nothing is encoded twice."""
+"""Ring buffer of encoded frames: the control thread writes, the reasoning thread reads; nothing is encoded twice."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def build_artifacts(export: Export, out: Path, progress: Progress) -> dict[str, Any]:
-    """Write `out` and return its manifest; raises GateError, ArtifactError or OSError and then leaves nothing behind."""
+    """Write `out`, return its manifest; raises GateError, ArtifactError or OSError and then leaves nothing behind."""
     partial = out.with_name(out.name + ".partial")
     if out.exists():
         # Checked again here because building takes long: an existing directory is replaced only if it is one of ours.
@@ -186,12 +186,14 @@ def report_html(manifest: Mapping[str, Any]) -> str:
         f"<p>Weights: {html.escape(manifest['provenance']['weights_origin'])} ({trained}).</p>"
         "<table><tr><th>graph</th><th>parameters</th><th>precision</th><th>cosine</th><th>max-abs</th>"
         f"<th>between inputs</th><th>verdict</th></tr>{rows}</table>"
-        "<p>Every graph ran in ONNX Runtime from the bytes in this directory and was compared with PyTorch: measured.</p>"
+        "<p>Measured: every graph ran in ONNX Runtime from the bytes in this directory, compared with PyTorch.</p>"
         "</html>\n"
     )
 
 
-def verify_directory(directory: Path, rebuild: Callable[[dict[str, Any]], Export], progress: Progress) -> dict[str, Any]:
+def verify_directory(
+    directory: Path, rebuild: Callable[[dict[str, Any]], Export], progress: Progress
+) -> dict[str, Any]:
     """Hashes, contract and parity of an existing directory once more; raises ArtifactError or GateError."""
     load_artifacts(directory)
     manifest = read_manifest(directory)

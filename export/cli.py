@@ -34,14 +34,18 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         "edge-export", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: hashes, I/O contract and parity once more")
+    p.add_argument(
+        "command", nargs="?", choices=["verify"], help="verify DIR: hashes, I/O contract and parity once more"
+    )
     p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
     p.add_argument("--target", default="cpu", help="device to export for (default: cpu)")
     p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
     p.add_argument("--model", default="nano", help="preset: nano or 1b (default: nano)")
     source = p.add_mutually_exclusive_group()
     source.add_argument("--checkpoint", type=Path, metavar="PATH", help="weights as safetensors (see --save-weights)")
-    source.add_argument("--random-weights", type=int, metavar="SEED", help="untrained weights of this seed (default: 0)")
+    source.add_argument(
+        "--random-weights", type=int, metavar="SEED", help="untrained weights of this seed (default: 0)"
+    )
     p.add_argument("--save-weights", type=Path, metavar="PATH", help="also write the weights as safetensors")
     p.add_argument("--out", type=Path, metavar="DIR", help="artifact directory to write")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")

@@ -83,7 +83,7 @@ def graph_specs(model: TicVla) -> list[GraphSpec]:
             {
                 "input_ids": {1: new},
                 "visual_tokens": {0: frames},
-                **dict.fromkeys(past_names(c, "past_key_values"), {2: old}),
+                **{name: {2: old} for name in past_names(c, "past_key_values")},
             },
         ),
         GraphSpec(
@@ -166,7 +166,7 @@ def _strip(proto: onnx.ModelProto) -> None:
     proto.producer_name = "tic-vla-edge"
     proto.doc_string = ""
     del proto.metadata_props[:]
-    graphs = [proto.graph, *[function for function in proto.functions]]
+    graphs = [proto.graph, *proto.functions]
     for graph in graphs:
         graph.doc_string = ""
         del graph.metadata_props[:]

@@ -54,7 +54,9 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
         past = 0 if index % 2 == 0 else int(rng.integers(1, 60))
         ids = rng.integers(language.img_context_id + 1, language.vocab, (1, 3 + index))
         image = np.full((1, frames * config.frame_tokens), language.img_context_id)
-        caches = {n: normal(1, language.kv_heads, past, language.head_dim) for n in past_names(config, "past_key_values")}
+        caches = {
+            n: normal(1, language.kv_heads, past, language.head_dim) for n in past_names(config, "past_key_values")
+        }
         return {
             # Also a single token on a filled cache: what every decoding step looks like.
             "input_ids": np.concatenate([ids[:, :2], image, ids[:, 2:]], axis=1) if index != 3 else ids[:, :1],

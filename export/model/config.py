@@ -141,7 +141,9 @@ class TicVlaConfig:
 
     def __post_init__(self) -> None:
         side = self.vision.grid // self.vision.pixel_shuffle
-        _require(side % self.language.token_merge == 0, f"{side} tokens a side do not merge by {self.language.token_merge}")
+        _require(
+            side % self.language.token_merge == 0, f"{side} tokens a side do not merge by {self.language.token_merge}"
+        )
         _require(
             self.language.token_merge > 1 or self.vision.token_dim == self.language.hidden,
             f"token_dim {self.vision.token_dim} must equal the language model's hidden {self.language.hidden}",

@@ -117,7 +117,7 @@ class LanguageModel(nn.Module):
         return self.norm(x), present, torch.cat(parts, dim=-1)
 
     def forward(self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor]) -> tuple[Tensor, ...]:
-        """Return `next_token` [1, 1], `logits` [1, vocab] of the last position, `last_layer_kv` [1, S, kv_dim], caches."""
+        """`next_token` [1, 1], `logits` [1, vocab] of the last position, `last_layer_kv` [1, S, kv_dim], caches."""
         x, present, last_layer_kv = self.hidden_states(input_ids, visual_tokens, past)
         logits = self.lm_head(x[:, -1])
         return logits.argmax(-1, keepdim=True), logits, last_layer_kv, *present

@@ -71,8 +71,9 @@ def load_weights(path: Path, config: TicVlaConfig) -> tuple[TicVla, WeightsInfo]
         raise WeightsError(f"{path}: missing tensors {missing[:3]}, unknown tensors {extra[:3]}")
     for name, tensor in tensors.items():
         if tensor.shape != wanted[name].shape or tensor.dtype != wanted[name].dtype:
+            want = wanted[name]
             raise WeightsError(
-                f"{path}: {name} is {tensor.dtype}{tuple(tensor.shape)}, expected {wanted[name].dtype}{tuple(wanted[name].shape)}"
+                f"{path}: {name} is {tensor.dtype}{list(tensor.shape)}, expected {want.dtype}{list(want.shape)}"
             )
         if not torch.isfinite(tensor).all():
             raise WeightsError(f"{path}: {name} has values that are not finite")
