@@ -1,0 +1,285 @@
+"""The demo's report: true to the recordings, self-contained, and inert whatever the model wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests import synthetic_run
+from tools.report import checks, demo_report, page, run_data
+from tools.report.demo_report import RunFiles, load_run, spread, write_report
+from tools.report.run_data import ReportError
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("demo")
+    synthetic_run.write_run(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def summary(run_dir: Path) -> dict[str, Any]:
+    return write_report(RunFiles(run_dir, run_dir / "artifacts"), wall_s=80.0)
+
+
+@pytest.fixture(scope="module")
+def html(run_dir: Path, summary: dict[str, Any]) -> str:
+    return (run_dir / "report.html").read_text(encoding="utf-8")
+
+
+def _checks_of(tmp_path: Path, **parts: Any) -> dict[str, checks.Check]:
+    synthetic_run.write_run(tmp_path, **parts)
+    return {check.name: check for check in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
+
+
+def _failed(found: dict[str, checks.Check]) -> set[str]:
+    return {name for name, check in found.items() if not check.passed}
+
+
+# ---- the page
+
+
+class _Collector(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def _parse(html: str) -> _Collector:
+    parser = _Collector()
+    parser.feed(html)
+    return parser
+
+
+def test_the_page_loads_nothing_from_anywhere(html: str) -> None:
+    for tag, attributes in _parse(html).tags:
+        assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
+        assert "href" not in attributes and "srcset" not in attributes
+        if "src" in attributes:
+            assert str(attributes["src"]).startswith("data:image/")
+    assert "url(" not in html and "@import" not in html
+
+
+def test_the_models_text_cannot_act_on_the_page(html: str) -> None:
+    assert "<script>alert" not in html
+    assert "\u202e" not in html
+    shown = "".join(_parse(html).text)
+    assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left␇ & <b>go</b> \U0001f916' in shown
+
+
+@given(st.text(st.characters(), max_size=200))
+def test_any_text_is_one_inert_run_of_characters(text: str) -> None:
+    escaped = page.text_html(text)
+    parser = _parse(f"<pre>{escaped}</pre>")
+    assert [tag for tag, _ in parser.tags] == ["pre"]
+    escaped.encode("utf-8")
+
+
+def test_long_text_is_cut_and_says_so() -> None:
+    assert page.text_html("x" * 1000, limit=10) == "xxxxxxxxxx … (1000 characters in all)"
+
+
+def test_every_picture_decodes(html: str) -> None:
+    pictures = [attributes["src"] for tag, attributes in _parse(html).tags if tag == "img"]
+    assert len(pictures) == 4 + len(synthetic_run.generations(12.0))
+    for uri in pictures:
+        assert uri is not None
+        data = np.frombuffer(run_data.jpeg_bytes({"data": uri.split(",", 1)[1]}), np.uint8)
+        assert cv2.imdecode(data, cv2.IMREAD_COLOR) is not None
+
+
+def test_contact_sheet_shows_the_frame_at_the_anchor(run_dir: Path, html: str) -> None:
+    second = synthetic_run.generations(12.0)[1]
+    expected = synthetic_run.jpeg((second["anchor_ns"] - synthetic_run.START_NS) / 1e9)
+    assert page.image_uri(expected, "jpeg") in html
+    assert "generation 1 · seen at 2.9 s · Δt 2.90 s at release" in html
+
+
+def test_untrained_weights_are_said_plainly(html: str) -> None:
+    assert "The weights are untrained" in html
+
+
+def test_trained_weights_are_not_called_untrained(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path, 6.0, trained=True)
+    write_report(RunFiles(tmp_path, tmp_path / "artifacts"), wall_s=1.0)
+    assert "untrained" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@given(st.integers(0, 60), st.integers(2, 12))
+def test_spread_takes_the_first_the_last_and_no_more_than_asked(items: int, count: int) -> None:
+    chosen = spread([{"n": n} for n in range(items)], count)
+    numbers = [item["n"] for item in chosen]
+    assert len(numbers) == min(items, count) and numbers == sorted(set(numbers))
+    assert not items or (numbers[0], numbers[-1]) == (0, items - 1)
+
+
+# ---- the checks
+
+
+def test_a_good_run_passes_every_check(run_dir: Path) -> None:
+    data = load_run(RunFiles(run_dir, run_dir / "artifacts"))
+    found = {check.name: check for check in checks.acceptance(data)}
+    assert _failed(found) <= {"generations"}  # 12 s at 2.9 s a generation cannot hold ten a minute's share
+    assert found["control_ticks"].limit == 118
+
+
+def test_demo_json_holds_the_checks_and_the_wire(summary: dict[str, Any], run_dir: Path) -> None:
+    assert json.loads((run_dir / "demo.json").read_text()) == summary
+    assert summary["wire"]["last_command_zero"] is True
+    assert summary["wall_s"] == 80.0
+    assert set(summary) >= {"control", "reasoning", "delay_s", "bridge", "wire", "checks", "wall_s"}
+    assert all({"value", "limit", "pass"} <= set(check) for check in summary["checks"].values())
+
+
+def test_delay_is_checked_against_the_frame_not_the_recorded_anchor(tmp_path: Path) -> None:
+    ticks = synthetic_run.tick_records(12.0)
+    for tick in ticks:  # a runner that is consistently wrong: anchor and Δt agree with each other, not with the frame
+        if tick["generation"] is not None:
+            tick["anchor_ns"] += 3_000_000
+            tick["delay_s"] -= 0.003
+    found = _checks_of(tmp_path, ticks=ticks)
+    assert found["delay_error_ms"].value == pytest.approx(3.0)
+    assert not found["delay_error_ms"].passed
+
+
+def test_an_anchor_frame_missing_from_the_log_fails_the_delay_check(tmp_path: Path) -> None:
+    semantics = synthetic_run.generations(12.0)
+    semantics[1]["frames_ns"] = [semantics[1]["anchor_ns"] + 1]
+    found = _checks_of(tmp_path, semantics=semantics)
+    assert not found["delay_error_ms"].passed
+    assert "is not in the log" in found["delay_error_ms"].note
+
+
+def test_a_run_without_any_generation_fails_the_delay_check(tmp_path: Path) -> None:
+    ticks = synthetic_run.tick_records(2.0)
+    assert "delay_error_ms" in _failed(_checks_of(tmp_path, duration_s=2.0, ticks=ticks))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda tick, semantics: tick.update(generation=semantics[0]["generation"]),  # an older one
+        lambda tick, semantics: tick.update(generation=semantics[-1]["generation"]),  # not released yet
+        lambda tick, semantics: tick.update(generation=None),  # none although there is one
+    ],
+)
+def test_only_the_newest_released_generation_counts(
+    tmp_path: Path, spoil: Callable[[dict[str, Any], list[dict[str, Any]]], None]
+) -> None:
+    ticks, semantics = synthetic_run.tick_records(12.0), synthetic_run.generations(12.0)
+    tick = next(t for t in ticks if t["generation"] == 1)
+    spoil(tick, semantics)
+    assert _checks_of(tmp_path, ticks=ticks)["stale_generation_ticks"].value == 1
+
+
+def test_motion_before_the_first_generation_fails(tmp_path: Path) -> None:
+    ticks = synthetic_run.tick_records(12.0)
+    ticks[0]["command"] = [0.1, 0.0, 0.0]
+    assert "motion_before_first_generation" in _failed(_checks_of(tmp_path, ticks=ticks))
+
+
+def test_ticks_missing_in_the_log_fail(tmp_path: Path) -> None:
+    assert "ticks_missing_in_log" in _failed(_checks_of(tmp_path, ticks=synthetic_run.tick_records(12.0)[:-3]))
+
+
+def test_slow_ticks_fail(tmp_path: Path) -> None:
+    ticks = synthetic_run.tick_records(12.0)
+    for tick in ticks[:3]:
+        tick["duration_ms"] = 140.0
+    assert "tick_p99_ms" in _failed(_checks_of(tmp_path, ticks=ticks))
+
+
+def test_a_path_without_commands_does_not_count_as_walking(tmp_path: Path) -> None:
+    trace = [line for line in synthetic_run.trace_lines(12.0) if line.get("name") != "Move"]
+    found = _checks_of(tmp_path, trace=trace)
+    assert found["moved_under_command_m"].value == 0.0 and not found["moved_under_command_m"].passed
+
+
+def test_path_under_command_is_the_ground_truth(tmp_path: Path) -> None:
+    value = _checks_of(tmp_path)["moved_under_command_m"].value
+    assert value == pytest.approx(synthetic_run.SPEED_MPS * 9.0, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("last", "zero"),
+    [
+        (("Move", {"x": 0.0, "y": 0.0, "z": 0.0}), True),
+        (("StopMove", ""), True),
+        (("Move", {"x": 0.0, "y": 0.0, "z": 0.2}), False),
+        (("Move", "not json"), False),
+    ],
+)
+def test_last_command_is_read_from_the_wire(tmp_path: Path, last: tuple[str, Any], zero: bool) -> None:
+    trace = synthetic_run.trace_lines(12.0)
+    trace.insert(-1, synthetic_run.wire(trace[-1]["t_ns"] - 1, *last))
+    trace.insert(-1, {**synthetic_run.wire(trace[-1]["t_ns"] - 1, "GetImageSample", ""), "service": "videohub"})
+    assert _checks_of(tmp_path, trace=trace)["last_command_zero"].value is zero
+
+
+# ---- reading
+
+
+def test_odometry_is_laid_on_the_world_at_the_first_tick(run_dir: Path) -> None:
+    data = load_run(RunFiles(run_dir, run_dir / "artifacts"))
+    stamps_ns, odometry = run_data.odometry_in_world(data)
+    truth = run_data.truth_at(data.trace, stamps_ns)
+    assert odometry[0] == pytest.approx(truth[0])
+    drift_m = odometry[-1, 0] - truth[-1, 0]
+    assert drift_m == pytest.approx(0.002 * 119, abs=0.01)  # what the synthetic odometry adds per tick
+
+
+def test_velocity_is_turned_into_the_body_frame(tmp_path: Path) -> None:
+    pose = {"kind": "pose", "x": 0, "y": 0, "z": 0.3, "theta": math.pi / 2, "vx": 0.0, "vy": 0.7, "wz": 0.1, "mode": 3}
+    lines = [synthetic_run.SCENE, {"t_ns": 1, **pose}, {"t_ns": 2, **pose}]
+    path = tmp_path / "trace.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert run_data.load_trace(path).velocity[0] == pytest.approx([0.7, 0.0, 0.1])
+
+
+def test_a_trace_cut_in_its_last_line_is_read(run_dir: Path, tmp_path: Path) -> None:
+    text = (run_dir / "hil_trace.jsonl").read_text()
+    (tmp_path / "cut.jsonl").write_text(text[:-40])
+    trace = run_data.load_trace(tmp_path / "cut.jsonl")
+    assert trace.end == {} and len(trace.pose) > 100
+
+
+def test_a_damaged_trace_line_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bad.jsonl").write_text('{"kind": "scene"}\nnonsense\n{"kind": "pose"}\n')
+    with pytest.raises(ReportError, match=r"bad\.jsonl:2: expected one JSON object"):
+        run_data.load_trace(tmp_path / "bad.jsonl")
+
+
+@pytest.mark.parametrize("name", ["flight.mcap", "hil_trace.jsonl", "run.json", "hil.json", "artifacts/manifest.json"])
+def test_a_missing_file_is_named_in_one_line(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    synthetic_run.write_run(tmp_path, 1.0)
+    (tmp_path / name).unlink()
+    assert demo_report.main([str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert Path(name).name in error and error.count("\n") == 1
+
+
+def test_the_command_prints_the_reports_path_and_fails_with_a_failed_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    synthetic_run.write_run(tmp_path, 2.0)
+    assert demo_report.main([str(tmp_path)]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "report.html")
+    assert "FAIL" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -1,0 +1,199 @@
+"""The demo's acceptance checks, recomputed from the flight log and the robot's own trace, not copied from results.
+
+Each function looks at one property; `acceptance` lists them all. Limits that depend on time are scaled from the
+60 s demo to the run's duration.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from tools.report.run_data import FlightLog, Record, RunData, Trace
+
+DELTA_T_TOLERANCE_MS = 1.0
+TICKS_PER_60_S = 590
+GENERATIONS_PER_60_S = 10
+TICK_P99_LIMIT_MS = 100.0
+MOVED_LIMIT_M = 1.0
+
+# A generation is stamped ready, then swapped in by another thread: a tick within this time may still see the old one.
+SWAP_RACE_NS = 10_000_000
+
+MOTION_COMMANDS = frozenset({"Move", "StopMove", "Damp", "StandDown"})
+
+
+@dataclass(frozen=True)
+class Check:
+    """One acceptance check: `value` against `limit` (text such as "≥ 590" is in `rule`)."""
+
+    name: str
+    title: str
+    value: float | int | bool | None
+    limit: float | int | bool
+    rule: str
+    unit: str
+    passed: bool
+    note: str = ""
+
+    def as_json(self) -> Record:
+        """The check as it stands in demo.json."""
+        return {"value": self.value, "limit": self.limit, "pass": self.passed, "note": self.note}
+
+
+def _at_least(name: str, title: str, value: float | int, limit: float | int, unit: str = "", note: str = "") -> Check:
+    return Check(name, title, value, limit, "≥", unit, value >= limit, note)
+
+
+def _at_most(
+    name: str, title: str, value: float | int | None, limit: float | int, unit: str = "", note: str = ""
+) -> Check:
+    return Check(name, title, value, limit, "≤", unit, value is not None and value <= limit, note)
+
+
+def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
+    """Per tick with a semantic state: |recorded Δt − (now − capture stamp of the anchor frame)| in ms, and problems.
+
+    The capture stamp is the log time of the camera frame the generation names as its newest, not the anchor the
+    runner subtracted; a frame or generation that is not in the log is a problem, since nothing can be shown then.
+    """
+    newest_frame_ns = {s["generation"]: s["frames_ns"][-1] for s in log.semantics if s["frames_ns"]}
+    errors_ms: list[float] = []
+    problems: list[str] = []
+    for tick in log.ticks:
+        if tick["generation"] is None:
+            continue
+        anchor_ns = newest_frame_ns.get(tick["generation"])
+        if anchor_ns is None:
+            problems.append(f"tick {tick['tick']}: generation {tick['generation']} is not in the log")
+        elif anchor_ns not in log.frame_stamps_ns:
+            problems.append(f"tick {tick['tick']}: anchor frame {anchor_ns} is not in the log")
+        elif tick["delay_s"] is None:
+            problems.append(f"tick {tick['tick']}: uses a generation but records no Δt")
+        else:
+            errors_ms.append(abs(tick["delay_s"] * 1e3 - (tick["now_ns"] - anchor_ns) / 1e6))
+    return errors_ms, problems
+
+
+def stale_generation_ticks(log: FlightLog) -> int:
+    """Ticks that used a generation before its release, or an old (or no) one although a newer was released."""
+    ready_ns = [s["ready_ns"] for s in log.semantics]
+    index_of = {s["generation"]: index for index, s in enumerate(log.semantics)}
+    wrong = 0
+    for tick in log.ticks:
+        used = -1 if tick["generation"] is None else index_of.get(tick["generation"], -2)
+        newest = bisect_right(ready_ns, tick["now_ns"]) - 1
+        surely_released = bisect_right(ready_ns, tick["now_ns"] - SWAP_RACE_NS) - 1
+        if not surely_released <= used <= newest:
+            wrong += 1
+    return wrong
+
+
+def motion_without_semantic_state(log: FlightLog) -> int:
+    """Ticks that commanded motion although no generation had been released yet."""
+    return sum(1 for tick in log.ticks if tick["generation"] is None and any(tick["command"]))
+
+
+def moved_under_command_m(trace: Trace) -> float:
+    """Ground-truth path length, in 1 s steps, over the seconds in which a non-zero Move was on the wire.
+
+    Steps of 1 s keep the body's sway while trotting in place out of the sum.
+    """
+    moving_ns = np.array([w["t_ns"] for w in trace.wire if w["name"] == "Move" and any(move_velocity(w))], np.int64)
+    total_m = 0.0
+    edges_ns = np.arange(trace.pose_ns[0], trace.pose_ns[-1] + 1, 1_000_000_000)
+    index = np.searchsorted(trace.pose_ns, edges_ns)
+    for step in range(len(edges_ns) - 1):
+        if np.any((moving_ns >= edges_ns[step]) & (moving_ns < edges_ns[step + 1])):
+            total_m += float(np.linalg.norm(trace.pose[index[step + 1], :2] - trace.pose[index[step], :2]))
+    return total_m
+
+
+def move_velocity(request: Record) -> tuple[float, float, float]:
+    """(vx, vy, wz) of a Move request as it came over the wire; NaN (so: not zero) where it is not readable."""
+    parameter = request["parameter"]
+    try:
+        fields = json.loads(parameter) if isinstance(parameter, str) else parameter
+        return float(fields["x"]), float(fields["y"]), float(fields["z"])
+    except (ValueError, KeyError, TypeError):
+        return math.nan, math.nan, math.nan
+
+
+def last_motion_command(trace: Trace) -> tuple[str, bool]:
+    """Name of the last motion request on the wire and whether it asks for zero velocity."""
+    for request in reversed(trace.wire):
+        if request["name"] in MOTION_COMMANDS:
+            return request["name"], request["name"] != "Move" or not any(move_velocity(request))
+    return "none", False
+
+
+def acceptance(data: RunData) -> list[Check]:
+    """All acceptance checks of the demo, in the order of the report."""
+    log, scale = data.log, data.duration_s / 60.0
+    control, reasoning = data.results["edge-run"]["control"], data.results["edge-run"]["reasoning"]
+    errors_ms, problems = delay_errors_ms(log)
+    command, is_zero = last_motion_command(data.trace)
+    says_zero = bool(data.trace.end.get("wire", {}).get("last_command_zero", False))
+    tick_ms = [tick["duration_ms"] for tick in log.ticks]
+    return [
+        _at_least("control_ticks", "Control ticks", control["ticks"], int(TICKS_PER_60_S * scale)),
+        _at_most(
+            "ticks_missing_in_log",
+            "Control ticks that the flight log lacks",
+            abs(control["ticks"] - len(log.ticks)),
+            0,
+        ),
+        _at_most(
+            "tick_p99_ms",
+            "Control tick, 99th percentile",
+            round(float(np.percentile(tick_ms, 99)), 3),
+            TICK_P99_LIMIT_MS,
+            "ms",
+        ),
+        _at_least("generations", "VLM generations", reasoning["generations"], int(GENERATIONS_PER_60_S * scale)),
+        Check(
+            "delay_error_ms",
+            "Δt against the capture stamp of the camera frame, worst tick",
+            round(max(errors_ms), 6) if errors_ms else None,
+            DELTA_T_TOLERANCE_MS,
+            "≤",
+            "ms",
+            bool(errors_ms) and not problems and max(errors_ms) <= DELTA_T_TOLERANCE_MS,
+            f"{len(problems)} ticks cannot be checked; first: {problems[0]}" if problems else f"{len(errors_ms)} ticks",
+        ),
+        _at_most(
+            "stale_generation_ticks",
+            "Ticks that did not use the newest released generation",
+            stale_generation_ticks(log),
+            0,
+        ),
+        _at_most(
+            "motion_before_first_generation",
+            "Ticks that commanded motion before the first generation",
+            motion_without_semantic_state(log),
+            0,
+        ),
+        Check(
+            "moved_under_command_m",
+            "Ground-truth path while commanded",
+            round(moved_under_command_m(data.trace), 3),
+            MOVED_LIMIT_M,
+            ">",
+            "m",
+            moved_under_command_m(data.trace) > MOVED_LIMIT_M,
+        ),
+        Check(
+            "last_command_zero",
+            "Last motion command on the wire is zero velocity",
+            is_zero and says_zero,
+            True,
+            "=",
+            "",
+            is_zero and says_zero,
+            f"last: {command}",
+        ),
+    ]

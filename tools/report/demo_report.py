@@ -1,0 +1,266 @@
+"""Write the demo's report: one self-contained HTML page and demo.json, from the files of one run.
+
+    python -m tools.report.demo_report out/demo
+
+reads flight.mcap, hil_trace.jsonl, run.json, bridge.json, hil.json, export.json and artifacts/manifest.json in that
+folder and writes report.html and demo.json beside them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tools.report import figures, page
+from tools.report.checks import Check, acceptance
+from tools.report.machine import machine_facts
+from tools.report.numbers import Number, headline, numbers
+from tools.report.run_data import Record, ReportError, RunData, load_flight_log, load_frames, load_json, load_trace
+
+SHEET_FRAMES = 12
+_FRAME_WIDTH_PX = 480
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """Where the files of one demo run lie."""
+
+    out: Path
+    artifacts: Path
+
+    @property
+    def flight_log(self) -> Path:
+        """Recorded by edge-run."""
+        return self.out / "flight.mcap"
+
+    @property
+    def trace(self) -> Path:
+        """Written by edge-hil."""
+        return self.out / "hil_trace.jsonl"
+
+    @property
+    def report(self) -> Path:
+        """The page."""
+        return self.out / "report.html"
+
+    @property
+    def summary(self) -> Path:
+        """The acceptance numbers."""
+        return self.out / "demo.json"
+
+    def result(self, command: str) -> Path:
+        """JSON result of one command (`edge-run` → run.json)."""
+        return self.out / f"{command.removeprefix('edge-')}.json"
+
+    def of_a_run(self) -> list[Path]:
+        """Everything one run writes: removed before the next, so that a failed run never shows an old result."""
+        results = [self.result(command) for command in ("edge-run", "edge-hil", "edge-bridge")]
+        return [self.flight_log, self.trace, self.report, self.summary, *results]
+
+
+def load_run(files: RunFiles) -> RunData:
+    """Read all files of a run; ReportError names the one that is missing or damaged."""
+    results = {command: load_json(files.result(command)) for command in ("edge-run", "edge-hil", "edge-bridge")}
+    if files.result("edge-export").exists():
+        results["edge-export"] = load_json(files.result("edge-export"))
+    manifest = load_json(files.artifacts / "manifest.json")
+    return RunData(load_flight_log(files.flight_log), load_trace(files.trace), results, manifest)
+
+
+def write_report(files: RunFiles, *, wall_s: float) -> Record:
+    """Write report.html and demo.json; returns what demo.json holds. Raises ReportError."""
+    data = load_run(files)
+    try:
+        checks = acceptance(data)
+        summary = _summary(data, checks, wall_s)
+        html = page.document("TIC-VLA edge: demo run", _body(data, checks, wall_s))
+    except (KeyError, TypeError, IndexError) as error:
+        raise ReportError(f"{files.out}: a record of the run lacks or misshapes a field: {error!r}") from error
+    files.report.write_text(html, encoding="utf-8")
+    files.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    return summary
+
+
+def _summary(data: RunData, checks: Sequence[Check], wall_s: float) -> Record:
+    run = data.results["edge-run"]
+    return {
+        **{key: run[key] for key in ("control", "reasoning", "delay_s", "bridge")},
+        "wire": data.trace.end.get("wire", data.results["edge-hil"].get("wire", {})),
+        "checks": {check.name: check.as_json() for check in checks},
+        "duration_s": data.duration_s,
+        "wall_s": round(wall_s, 1),
+    }
+
+
+def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
+    failed = [check for check in checks if not check.passed]
+    verdict = f"{len(failed)} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed"
+    scene = data.trace.scene
+    run = data.log.run
+    parts = [
+        "<h1>TIC-VLA edge: the whole loop on a simulated Go2</h1>",
+        f'<p><span class="verdict {"bad" if failed else "good"}">{verdict}</span></p>',
+        f"<p>Instruction: <b>{page.text_html(str(run.get('instruction', 'not recorded')))}</b></p>",
+        f'<p class="quiet">Scene “{page.text_html(str(scene["name"]))}”, {data.results["edge-hil"]["people"]} people, '
+        f"seed {data.results['edge-hil']['seed']}, {data.duration_s:.1f} s of real time. The runner knows only the "
+        "robot's protocol; the paths and speeds called true come from the simulator.</p>",
+        _untrained_notice(data),
+        page.tiles(headline(data)),
+        "<h2>Where the robot walked</h2>",
+        page.figure(
+            figures.top_down(data),
+            "Top-down picture of the path among walls, objects and people",
+            "Ground truth from the simulator in the world frame. The dashed line is what the runner believed from "
+            "the robot's odometry.",
+        ),
+        "<h2>What the camera saw and what the VLM said</h2>",
+        '<p class="quiet">Each picture is the newest frame the generation was given (its anchor); below it the '
+        "VLM's output, as it came.</p>",
+        _contact_sheet(data),
+        "<h2>Time</h2>",
+        page.figure(
+            figures.time_line(data),
+            "Time line of delay, forward speed and turn rate",
+            "Δt rises between generations and falls when a newer one is released. Shaded: ticks that did not drive "
+            "(no semantic state yet, stale input or stopping).",
+        ),
+        '<div class="pair">',
+        page.figure(
+            figures.tick_histogram(np.array([tick["duration_ms"] for tick in data.log.ticks], float)),
+            "Histogram of control tick durations",
+            "Work done in every control tick; the loop runs at 10 Hz.",
+        ),
+        page.figure(
+            figures.delay_histogram(
+                np.array([t["delay_s"] for t in data.log.ticks if t["delay_s"] is not None], float)
+            ),
+            "Histogram of the delay",
+            "How old the semantic state was when the action expert used it.",
+        ),
+        "</div>",
+        "<h2>Checks</h2>",
+        _check_table(checks),
+        "<h2>Numbers</h2>",
+        _number_table(numbers(data, wall_s)),
+        "<h2>Machine</h2>",
+        page.table(("what", "value"), [(page.text_html(k), page.text_html(v)) for k, v in machine_facts().items()]),
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _untrained_notice(data: RunData) -> str:
+    model = data.manifest.get("model", {})
+    if not isinstance(model, dict) or model.get("trained") is not False:
+        return ""
+    return (
+        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed). The robot walks where random '
+        "numbers send it and does not find the vending machine yet; the text under the pictures is noise. What this "
+        "run shows is that the loop works: timing, delays, protocol and stop.</p>"
+    )
+
+
+def _contact_sheet(data: RunData) -> str:
+    chosen = spread(data.log.semantics, SHEET_FRAMES)
+    if not chosen:
+        return "<p>No generation was released in this run.</p>"
+    frames = load_frames(data.log.path, {s["frames_ns"][-1] for s in chosen if s["frames_ns"]})
+    return f'<div class="sheet">{"".join(_card(data, s, frames) for s in chosen)}</div>'
+
+
+def spread(items: Sequence[Record], count: int) -> list[Record]:
+    """Up to `count` items, evenly over the sequence, always with the first and the last."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
+
+
+def _card(data: RunData, semantic: Record, frames: dict[int, bytes]) -> str:
+    anchor_ns, generation = semantic["anchor_ns"], semantic["generation"]
+    jpeg = frames.get(semantic["frames_ns"][-1] if semantic["frames_ns"] else -1)
+    if jpeg is None:
+        picture = "<p>(the frame is not in the flight log)</p>"
+    else:
+        uri = page.image_uri(_shrink(jpeg), "jpeg")
+        picture = f'<img src="{uri}" alt="Camera frame of generation {generation:d}">'
+    released_s = (semantic["ready_ns"] - anchor_ns) / 1e9
+    waypoints = semantic["waypoints"]
+    points = "no waypoints in the text" if not waypoints else f"{len(waypoints)} waypoints"
+    return (
+        f'<figure>{picture}<div class="meta">generation {generation:d} · seen at '
+        f"{(anchor_ns - data.log.start_ns) / 1e9:.1f} s · Δt {released_s:.2f} s at release · "
+        f"{semantic['new_tokens']:d} tokens · {points}</div>"
+        f'<pre class="vlm">{page.text_html(semantic["text"]) or "(empty)"}</pre></figure>'
+    )
+
+
+def _shrink(jpeg: bytes) -> bytes:
+    """A frame at most 480 px wide, so that the page stays small; a frame that does not decode is left as it is."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None or image.shape[1] <= _FRAME_WIDTH_PX:
+        return jpeg
+    height = round(image.shape[0] * _FRAME_WIDTH_PX / image.shape[1])
+    small = cv2.resize(image, (_FRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
+
+
+def _check_table(checks: Sequence[Check]) -> str:
+    rows = []
+    for check in checks:
+        mark = '<span class="pass">pass</span>' if check.passed else '<span class="fail">FAIL</span>'
+        limit = f"{check.rule} {_words(check.limit)} {check.unit}".strip()
+        value = f"{_words(check.value)} {check.unit}".strip()
+        rows.append((mark, page.text_html(check.title), value, limit, "measured", page.text_html(check.note)))
+    head = ("", "check", "value", "required", "kind", "note")
+    return page.table(head, rows, numeric=frozenset({2, 3}))
+
+
+def _number_table(items: Sequence[Number]) -> str:
+    rows = [(page.text_html(n.title), page.text_html(n.value), n.kind, page.text_html(n.source)) for n in items]
+    return page.table(("number", "value", "kind", "source"), rows, numeric=frozenset({1}))
+
+
+def _words(value: float | int | bool | None) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.report.demo_report",
+        description="Write the report of a demo run again from its files.",
+        epilog="example: python -m tools.report.demo_report out/demo",
+    )
+    parser.add_argument("out", type=Path, help="folder of the run, as written by python -m tools.demo")
+    parser.add_argument("--artifacts", type=Path, help="artifact directory (default: OUT/artifacts)")
+    parser.add_argument("--json", metavar="FILE", help="also write demo.json's content here; - is stdout")
+    args = parser.parse_args(argv)
+    files = RunFiles(args.out, args.artifacts or args.out / "artifacts")
+    try:
+        wall_s = float(load_json(files.summary)["wall_s"]) if files.summary.exists() else 0.0
+        summary = write_report(files, wall_s=wall_s)
+    except ReportError as error:
+        print(f"demo_report: {error}", file=sys.stderr)
+        return 2
+    text = json.dumps(summary, indent=2)
+    if args.json == "-":
+        print(text)
+    elif args.json:
+        Path(args.json).write_text(text + "\n", encoding="utf-8")
+    if args.json != "-":
+        print(files.report)
+    return 0 if all(check["pass"] for check in summary["checks"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

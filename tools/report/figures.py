@@ -1,0 +1,227 @@
+"""The report's pictures: RunData in, PNG bytes out. Drawn with matplotlib's object interface (no global state)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+
+from tools.report.run_data import Array, Record, RunData, odometry_in_world
+
+INK = "#1d2733"
+MUTED = "#6b7785"
+TRUTH = "#1f6f8b"
+COMMAND = "#d1603d"
+WALL = "#46525e"
+PERSON = "#8a5fbf"
+_DPI = 160
+_DEADLINE_MS = 100.0
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _tidy(axes: Axes) -> None:
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.spines["left"].set_color(MUTED)
+    axes.spines["bottom"].set_color(MUTED)
+    axes.tick_params(colors=INK, labelsize=8)
+    axes.grid(color="#e4e8ec", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def top_down(data: RunData) -> bytes:
+    """The path among walls, objects and people, seen from above; colour of the path is time."""
+    footprints = data.trace.scene["footprints"]
+    corners = np.concatenate([np.asarray(f["polygon"], float) for f in footprints] + [data.trace.pose[:, :2]])
+    low, high = corners.min(axis=0) - 0.3, corners.max(axis=0) + 0.3
+    size = high - low
+    width_in = 11.0
+    height_in = float(np.clip(width_in * size[1] / size[0] + 1.6, 3.4, 12.0))
+    figure = _figure(width_in, height_in)
+    axes = figure.add_subplot()
+    _draw_footprints(axes, footprints, middle_y=float(low[1] + high[1]) / 2)
+    _draw_people(axes, data.trace.people)
+    time_s = (data.trace.pose_ns - data.log.start_ns) / 1e9
+    path = _draw_path(axes, data.trace.pose, time_s)
+    _, odometry = odometry_in_world(data)
+    axes.plot(odometry[:, 0], odometry[:, 1], color=COMMAND, linewidth=1.0, linestyle=(0, (4, 2)), zorder=6)
+    _draw_start_goal(axes, data.trace.scene, data.trace.pose[-1])
+    axes.set_aspect("equal")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_xlabel("x in m", fontsize=9)
+    axes.set_ylabel("y in m", fontsize=9)
+    _tidy(axes)
+    bar = figure.colorbar(path, ax=axes, location="bottom", aspect=60, shrink=0.6, pad=0.02)
+    bar.set_label("true path, coloured by time since the first control tick in s", fontsize=8, color=INK)
+    bar.ax.tick_params(labelsize=8)
+    figure.legend(handles=_top_down_legend(), loc="outside upper center", fontsize=8, frameon=False, ncols=7)
+    return _png(figure)
+
+
+def _top_down_legend() -> list[Line2D]:
+    return [
+        Line2D([], [], color=TRUTH, linewidth=3, label="true path"),
+        Line2D([], [], color=COMMAND, linestyle=(0, (4, 2)), label="odometry, laid on at the first tick"),
+        Line2D([], [], color=PERSON, linewidth=1.2, label="people (dot: at the end)"),
+        Line2D([], [], color="#2c8c4a", marker="o", linestyle="", markersize=8, label="start"),
+        Line2D([], [], color="#b8860b", marker="*", linestyle="", markersize=11, label="goal"),
+        Line2D([], [], color=INK, marker="X", linestyle="", markersize=8, label="end"),
+    ]
+
+
+def _draw_footprints(axes: Axes, footprints: Sequence[Record], middle_y: float) -> None:
+    for footprint in footprints:
+        polygon = np.asarray(footprint["polygon"], float)
+        is_wall = footprint["kind"] == "wall"
+        axes.add_patch(
+            Polygon(polygon, closed=True, facecolor=WALL if is_wall else "#d8c9a8", edgecolor=INK, linewidth=0.6)
+        )
+        if not is_wall:
+            _label(axes, str(footprint["label"]), polygon, middle_y)
+
+
+def _label(axes: Axes, text: str, polygon: Array, middle_y: float) -> None:
+    centre = polygon.mean(axis=0)
+    # Towards the middle of the picture: objects stand along walls, and text over a wall cannot be read.
+    up = 1 if centre[1] < middle_y else -1
+    axes.annotate(
+        text,
+        (centre[0], polygon[:, 1].max() if up > 0 else polygon[:, 1].min()),
+        xytext=(0, 3 * up),
+        textcoords="offset points",
+        ha="center",
+        va="bottom" if up > 0 else "top",
+        fontsize=7,
+        color=INK,
+        zorder=7,
+    )
+
+
+def _draw_people(axes: Axes, people: Sequence[Array]) -> None:
+    if not people or not len(people[0]):
+        return
+    tracks = np.stack([poses for poses in people if len(poses) == len(people[0])])
+    for person in range(tracks.shape[1]):
+        axes.plot(tracks[:, person, 0], tracks[:, person, 1], color=PERSON, linewidth=1.2, alpha=0.55, zorder=3)
+        axes.plot(*tracks[-1, person, :2], color=PERSON, marker="o", markersize=6, alpha=0.9, zorder=3)
+
+
+def _draw_path(axes: Axes, pose: Array, time_s: Array) -> LineCollection:
+    points = pose[:, :2]
+    path = LineCollection(
+        np.stack([points[:-1], points[1:]], axis=1).tolist(), cmap="viridis", linewidth=3.0, zorder=5, capstyle="round"
+    )
+    path.set_array(time_s[:-1])
+    axes.add_collection(path)
+    return path
+
+
+def _draw_start_goal(axes: Axes, scene: Record, end: Array) -> None:
+    x_m, y_m, theta = scene["start"]
+    axes.plot(x_m, y_m, marker="o", color="#2c8c4a", markersize=9, markeredgecolor="white", zorder=8)
+    axes.plot(*scene["goal"], marker="*", color="#b8860b", markersize=15, markeredgecolor="white", zorder=8)
+    axes.plot(end[0], end[1], marker="X", color=INK, markersize=9, markeredgecolor="white", zorder=9)
+    axes.annotate(
+        "",
+        (x_m + 0.6 * np.cos(theta), y_m + 0.6 * np.sin(theta)),
+        (x_m, y_m),
+        arrowprops={"arrowstyle": "->", "color": "#2c8c4a", "lw": 1.6},
+        zorder=8,
+    )
+
+
+def tick_histogram(durations_ms: Array) -> bytes:
+    """Duration of every control tick with the 100 ms deadline; counts on a log scale, so that one outlier shows."""
+    figure = _figure(5.4, 3.1)
+    axes = figure.add_subplot()
+    p50, p99 = np.percentile(durations_ms, [50, 99])
+    right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
+    axes.hist(durations_ms, bins=np.arange(0, right + 1, right / 70).tolist(), color=TRUTH, log=True)
+    axes.axvline(_DEADLINE_MS, color="#b3261e", linewidth=1.6, label="deadline 100 ms")
+    axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.1f} ms")
+    axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.1f} ms")
+    axes.axvline(durations_ms.max(), color=MUTED, linewidth=1, label=f"max {durations_ms.max():.1f} ms")
+    axes.set_xlim(0, right)
+    axes.set_xlabel("tick duration in ms", fontsize=9)
+    axes.set_ylabel("ticks (log)", fontsize=9)
+    axes.legend(fontsize=8, frameon=False)
+    _tidy(axes)
+    return _png(figure)
+
+
+def delay_histogram(delays_s: Array) -> bytes:
+    """Age Δt of the semantic state over all ticks that had one."""
+    figure = _figure(5.4, 3.1)
+    axes = figure.add_subplot()
+    if len(delays_s):
+        p50, p99 = np.percentile(delays_s, [50, 99])
+        axes.hist(delays_s, bins=40, color=PERSON)
+        axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.2f} s")
+        axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.2f} s")
+        axes.axvline(delays_s.max(), color=MUTED, linewidth=1, label=f"max {delays_s.max():.2f} s")
+        axes.legend(fontsize=8, frameon=False)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("Δt = now − capture of the anchor frame, in s", fontsize=9)
+    axes.set_ylabel("ticks", fontsize=9)
+    _tidy(axes)
+    return _png(figure)
+
+
+def time_line(data: RunData) -> bytes:
+    """Δt, forward speed and turn rate over the run; ticks that did not drive are shaded."""
+    figure = _figure(11.0, 6.2)
+    delay, speed, turn = figure.subplots(3, 1, sharex=True)
+    ticks = data.log.ticks
+    tick_s = (np.array([t["now_ns"] for t in ticks], np.int64) - data.log.start_ns) / 1e9
+    pose_s = (data.trace.pose_ns - data.log.start_ns) / 1e9
+    driven = (pose_s >= tick_s[0] - 1) & (pose_s <= tick_s[-1] + 2)
+    command = np.array([t["command"] for t in ticks], float)
+
+    delay.plot(tick_s, [np.nan if t["delay_s"] is None else t["delay_s"] for t in ticks], color=PERSON, linewidth=1.3)
+    delay.set_ylabel("Δt in s", fontsize=9)
+    delay.set_ylim(bottom=0)
+    for axes, true, axis, unit in ((speed, 0, 0, "forward, m/s"), (turn, 2, 2, "turn rate, rad/s")):
+        axes.plot(pose_s[driven], data.trace.velocity[driven, true], color=TRUTH, linewidth=1.0, label="true")
+        axes.step(tick_s, command[:, axis], where="post", color=COMMAND, linewidth=1.2, label="commanded")
+        axes.set_ylabel(unit, fontsize=9)
+        axes.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
+    turn.set_xlabel("time since the first control tick in s", fontsize=9)
+    for axes in (delay, speed, turn):
+        for start_s, end_s in _spans(tick_s, [t["reason"] != "ok" for t in ticks]):
+            axes.axvspan(start_s, end_s, color="#f3e3c3", alpha=0.7, linewidth=0)
+        _tidy(axes)
+    return _png(figure)
+
+
+def _spans(time_s: Array, flags: Sequence[bool]) -> list[tuple[float, float]]:
+    """Runs of True as (start, end) times."""
+    spans: list[tuple[float, float]] = []
+    begin: float | None = None
+    for at_s, flag in zip(time_s, flags, strict=True):
+        if flag and begin is None:
+            begin = float(at_s)
+        if not flag and begin is not None:
+            spans.append((begin, float(at_s)))
+            begin = None
+    if begin is not None:
+        spans.append((begin, float(time_s[-1])))
+    return spans

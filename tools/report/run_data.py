@@ -1,0 +1,183 @@
+"""Everything a report knows about one run: flight log, ground-truth trace and the results of the commands.
+
+All stamps are monotonic ns of one machine, so the runner's ticks and the simulated robot's truth share one axis.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.recording import RecordingError, jpeg_bytes, read_messages
+
+Record = dict[str, Any]
+Array = NDArray[np.float64]
+
+
+class ReportError(ValueError):
+    """A file of the run is missing or is not what it should be; one clear line."""
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """What the runner recorded; `frame_stamps_ns` are the log times of all recorded camera frames."""
+
+    path: Path
+    run: Record
+    ticks: list[Record]
+    semantics: list[Record]
+    frame_stamps_ns: frozenset[int]
+
+    @property
+    def start_ns(self) -> int:
+        """Zero of all time axes: the first tick."""
+        return int(self.ticks[0]["now_ns"])
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the simulated robot's side saw: ground truth and the requests that arrived on the wire."""
+
+    scene: Record
+    pose_ns: NDArray[np.int64]
+    """[n] stamps of the ground-truth poses."""
+    pose: Array
+    """[n, 3] x, y (m), theta (rad, unwrapped) in the world frame."""
+    velocity: Array
+    """[n, 3] forward and leftward speed in the body frame (m/s) and yaw rate (rad/s)."""
+    people_ns: NDArray[np.int64]
+    people: list[Array]
+    """One [people, 3] array of x, y (m), heading (rad) per stamp."""
+    wire: list[Record]
+    end: Record
+
+
+@dataclass(frozen=True)
+class RunData:
+    """One run, complete. `results` holds the JSON result per command name, `manifest` the artifact's manifest."""
+
+    log: FlightLog
+    trace: Trace
+    results: dict[str, Record]
+    manifest: Record
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the driven part as the runner measured it."""
+        return float(self.results["edge-run"]["duration_s"])
+
+
+def load_json(path: Path) -> Record:
+    """One JSON object from a file; ReportError names the file otherwise."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ReportError(f"{path} is missing; expected the JSON result of the run") from None
+    except (OSError, ValueError) as error:
+        raise ReportError(f"{path} cannot be read as JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise ReportError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def load_flight_log(path: Path) -> FlightLog:
+    """The recorded run without the pictures' bytes (see `load_frames`)."""
+    run: Record = {}
+    ticks: list[Record] = []
+    semantics: list[Record] = []
+    stamps: set[int] = set()
+    try:
+        for topic, stamp_ns, payload in read_messages(path):
+            if topic == "/tick":
+                ticks.append(payload)
+            elif topic == "/semantic":
+                semantics.append(payload)
+            elif topic == "/camera":
+                stamps.add(stamp_ns)
+            elif topic == "/run":
+                run = payload
+    except FileNotFoundError:
+        raise ReportError(f"{path} is missing; expected the flight log written by edge-run --record") from None
+    except (OSError, RecordingError) as error:
+        raise ReportError(str(error)) from None
+    if not ticks:
+        raise ReportError(f"{path} holds no /tick record: the runner ended before its first control tick")
+    return FlightLog(path, run, ticks, sorted(semantics, key=lambda s: s["ready_ns"]), frozenset(stamps))
+
+
+def load_frames(path: Path, stamps_ns: set[int]) -> dict[int, bytes]:
+    """JPEG bytes of the camera frames with these stamps; a second pass, so that a long log never sits in memory."""
+    return {
+        stamp_ns: jpeg_bytes(payload)
+        for topic, stamp_ns, payload in read_messages(path)
+        if topic == "/camera" and stamp_ns in stamps_ns
+    }
+
+
+def load_trace(path: Path) -> Trace:
+    """Ground truth of edge-hil; a last line that was cut off is ignored, anything else wrong is a ReportError."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise ReportError(f"{path} is missing; expected the trace written by edge-hil --trace") from None
+    by_kind: dict[str, list[Record]] = {"scene": [], "pose": [], "people": [], "wire": [], "end": []}
+    for number, line in enumerate(lines, start=1):
+        try:
+            record = json.loads(line)
+            by_kind.setdefault(record["kind"], []).append(record)
+        except (ValueError, KeyError, TypeError):
+            if number == len(lines):
+                break
+            raise ReportError(f"{path}:{number}: expected one JSON object with a 'kind', found {line[:60]!r}") from None
+    if not by_kind["scene"] or not by_kind["pose"]:
+        raise ReportError(f"{path} holds no scene or no pose record: the simulation ended before it started")
+    poses = by_kind["pose"]
+    theta = np.unwrap([float(p["theta"]) for p in poses])
+    return Trace(
+        scene=by_kind["scene"][0],
+        pose_ns=np.array([p["t_ns"] for p in poses], np.int64),
+        pose=np.column_stack([[float(p["x"]) for p in poses], [float(p["y"]) for p in poses], theta]),
+        velocity=_body_velocity(poses, theta),
+        people_ns=np.array([p["t_ns"] for p in by_kind["people"]], np.int64),
+        people=[np.asarray(p["poses"], float).reshape(-1, 3) for p in by_kind["people"]],
+        wire=by_kind["wire"],
+        end=by_kind["end"][-1] if by_kind["end"] else {},
+    )
+
+
+def _body_velocity(poses: list[Record], theta: Array) -> Array:
+    """World-frame vx, vy turned into the body frame, [n, 3]."""
+    vx, vy, wz = (np.array([float(p[key]) for p in poses]) for key in ("vx", "vy", "wz"))
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.column_stack([cos * vx + sin * vy, -sin * vx + cos * vy, wz])
+
+
+def truth_at(trace: Trace, stamps_ns: NDArray[np.int64]) -> Array:
+    """Ground-truth pose [n, 3] at these stamps, linear between the samples (theta is unwrapped)."""
+    base = trace.pose_ns[0]
+    at, samples = (stamps_ns - base).astype(float), (trace.pose_ns - base).astype(float)
+    return np.column_stack([np.interp(at, samples, trace.pose[:, axis]) for axis in range(3)])
+
+
+def odometry_in_world(data: RunData) -> tuple[NDArray[np.int64], Array]:
+    """The runner's odometry path laid onto the world at its first pose: stamps [n] and poses [n, 3].
+
+    `T_world_odom = T_world_base(t0) · T_odom_base(t0)⁻¹`; the distance that grows afterwards is odometry drift.
+    """
+    ticks = [tick for tick in data.log.ticks if tick["pose"] is not None]
+    stamps_ns = np.array([tick["now_ns"] for tick in ticks], np.int64)
+    if not ticks:
+        return stamps_ns, np.zeros((0, 3))
+    odom = np.array([tick["pose"] for tick in ticks], float)
+    start = truth_at(data.trace, stamps_ns[:1])[0]
+    turn = start[2] - odom[0, 2]
+    cos, sin = math.cos(turn), math.sin(turn)
+    delta = odom[:, :2] - odom[0, :2]
+    world = delta @ np.array([[cos, sin], [-sin, cos]]) + start[:2]
+    return stamps_ns, np.column_stack([world, odom[:, 2] + turn])
