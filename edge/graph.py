@@ -15,6 +15,10 @@ Array = npt.NDArray[np.generic]
 _ORT_TYPES = {"tensor(float)": "float", "tensor(int64)": "int64", "tensor(uint8)": "uint8"}
 
 
+class GraphError(RuntimeError):
+    """ONNX Runtime failed while running a graph."""
+
+
 class Graph:
     """A session on the CPU with a stated number of threads.
 
@@ -51,6 +55,9 @@ class Graph:
         self.output_names = [t.name for t in contract.outputs]
 
     def run(self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None) -> list[Array]:
-        """Outputs (all, or those named) for named inputs."""
-        result: list[Array] = self._session.run(outputs, feeds)
+        """Outputs (all, or those named) for named inputs; raises GraphError."""
+        try:
+            result: list[Array] = self._session.run(outputs, feeds)
+        except Exception as error:
+            raise GraphError(f"{self.name}: {str(error).splitlines()[0]}") from error
         return result

@@ -58,7 +58,7 @@ class LanguageModel:
     def generate(
         self, segments: Sequence[Segment], *, max_new_tokens: int, cancelled: Callable[[], bool]
     ) -> Generation:
-        """Run one generation; raises CancelledError between calls, ContextOverflowError when the prompt does not fit."""
+        """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt."""
         prompt_tokens = sum(len(segment.ids) for segment in segments)
         room = self._runtime.max_context - prompt_tokens
         if room < 0:

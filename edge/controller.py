@@ -1,0 +1,113 @@
+"""From a planned trajectory to a velocity command: the point 1 s ahead, an arc to it, limits, slew (paper appendix B).
+
+Pure: no clock, no thread, no I/O. Whatever is missing, old or not finite gives zero velocity in the same step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.geometry import SE2
+from firmware_bridge.config import LimitsConfig
+
+TARGET_TIME_S = 1.0
+TURN_IN_PLACE_M = 0.05
+"""Targets nearer than this have no direction worth steering to: only the heading is followed."""
+MAX_STEP_S = 0.2
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """Limits of the robot and the ages beyond which inputs are not driven by."""
+
+    limits: LimitsConfig
+    step_s: float
+    frame_max_age_ms: float
+    odometry_max_age_ms: float
+
+    def __post_init__(self) -> None:
+        if self.step_s <= 0 or self.frame_max_age_ms <= 0 or self.odometry_max_age_ms <= 0:
+            raise ValueError("controller step and ages must be positive")
+
+
+@dataclass(frozen=True)
+class ControllerInputs:
+    """What one tick knows; ages are None while there is no such input at all."""
+
+    trajectory: npt.NDArray[np.float32] | None
+    """Planned (x m, y m, θ rad) in the current robot frame, [steps, 3]; None before the first semantic state."""
+    frame_age_ms: float | None
+    odometry_age_ms: float | None
+
+
+@dataclass(frozen=True)
+class VelocityCommand:
+    """Body velocity with the target it came from and, when zero was forced, why."""
+
+    vx_mps: float
+    vy_mps: float
+    wz_radps: float
+    target: SE2 | None
+    reason: str
+
+
+def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
+    """Forward speed (m/s) and yaw rate (rad/s) of the circular arc, tangent to x, that meets the target in `time_s`."""
+    distance_m = math.hypot(target.x_m, target.y_m)
+    if distance_m < TURN_IN_PLACE_M:
+        return 0.0, target.theta_rad / time_s
+    bearing = math.atan2(target.y_m, target.x_m)
+    if abs(bearing) > math.pi / 2:
+        # A point behind is turned to, not reversed to: the camera looks forward.
+        return 0.0, math.copysign(math.pi / 2, bearing) / time_s
+    arc_m = distance_m if abs(bearing) < 1e-6 else distance_m * bearing / math.sin(bearing)
+    return arc_m / time_s, 2 * bearing / time_s
+
+
+def _toward(value: float, goal: float, step: float) -> float:
+    return min(max(goal, value - step), value + step)
+
+
+class Controller:
+    """Holds the last command (for the slew limit) and nothing else."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        self._config = config
+        self._vx_mps = 0.0
+        self._wz_radps = 0.0
+        self._last_ns: int | None = None
+
+    def step(self, inputs: ControllerInputs, now_ns: int) -> VelocityCommand:
+        """The command of this tick."""
+        elapsed_s = 0.0 if self._last_ns is None else min(max((now_ns - self._last_ns) / 1e9, 0.0), MAX_STEP_S)
+        self._last_ns = now_ns
+        reason = self._refusal(inputs)
+        if reason is not None or inputs.trajectory is None:
+            self._vx_mps = self._wz_radps = 0.0
+            return VelocityCommand(0.0, 0.0, 0.0, None, reason or "no-semantic-state")
+        index = min(len(inputs.trajectory), max(1, round(TARGET_TIME_S / self._config.step_s))) - 1
+        x, y, theta = (float(value) for value in inputs.trajectory[index])
+        target = SE2(x, y, theta)
+        speed, yaw_rate = arc_to(target, TARGET_TIME_S)
+        limits = self._config.limits
+        speed = min(max(speed, limits.vx_min_mps), limits.vx_max_mps)
+        yaw_rate = min(max(yaw_rate, -limits.wz_max_radps), limits.wz_max_radps)
+        self._vx_mps = _toward(self._vx_mps, speed, limits.accel_mps2 * elapsed_s)
+        self._wz_radps = _toward(self._wz_radps, yaw_rate, limits.alpha_radps2 * elapsed_s)
+        return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
+
+    def _refusal(self, inputs: ControllerInputs) -> str | None:
+        config = self._config
+        if inputs.frame_age_ms is None or not 0 <= inputs.frame_age_ms <= config.frame_max_age_ms:
+            return "stale-frame"
+        if inputs.odometry_age_ms is None or not 0 <= inputs.odometry_age_ms <= config.odometry_max_age_ms:
+            return "stale-odometry"
+        if inputs.trajectory is None:
+            return "no-semantic-state"
+        if inputs.trajectory.ndim != 2 or not np.isfinite(inputs.trajectory).all():
+            return "bad-output"
+        return None
