@@ -201,3 +201,13 @@ class Go2:
             body_height_m=self._position[2],
             commanded=self.sport.commanded,
         )
+
+
+def place_go2(client: int, body: int, joints: list[int], state: Array) -> None:
+    """Put a loaded Go2 into the pose of a render state (base frame, not centre of mass; then the joints)."""
+    position, quaternion = tuple(float(v) for v in state[:3]), tuple(float(v) for v in state[3:7])
+    arm = rotation_matrix(quaternion) @ BASE_COM_M
+    centre = [position[axis] + float(arm[axis]) for axis in range(3)]
+    pybullet.resetBasePositionAndOrientation(body, centre, quaternion, physicsClientId=client)
+    for joint, angle in zip(joints, state[7:19], strict=True):
+        pybullet.resetJointState(body, joint, float(angle), physicsClientId=client)

@@ -32,7 +32,7 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True)
 class Footprint:
-    """Outline of a wall or object on the floor: label, kind and polygon [(x, y), ...] in world m, for top-down pictures."""
+    """Outline of a wall or object on the floor: polygon [(x, y), ...] in world m, for top-down pictures."""
 
     label: str
     kind: str
@@ -84,7 +84,10 @@ class Box:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A thing: `position_m` is the middle of its underside, its front looks along `heading_rad`; size depth, width, height."""
+    """A thing: `position_m` is the middle of its underside, its front looks along `heading_rad`.
+
+    `size_m` is depth (front to back), width and height.
+    """
 
     label: str
     kind: str
