@@ -199,6 +199,26 @@ def run_result(duration_s: float) -> dict[str, Any]:
     }
 
 
+def write_flight_log(
+    path: Path,
+    duration_s: float,
+    ticks: list[dict[str, Any]] | None = None,
+    semantics: list[dict[str, Any]] | None = None,
+) -> None:
+    """The flight log of edge-run; ticks and generations may be replaced."""
+    recorder = Recorder(path)
+    instruction = "walk down the corridor and stop at the vending machine"
+    recorder.put("/run", START_NS, {"instruction": instruction, "mode": "async", "release_delay": "2"})
+    for tick in range(int(duration_s * 10)):
+        recorder.put("/camera", START_NS + tick * TICK_NS, jpeg(tick / 10))
+    for record in tick_records(duration_s) if ticks is None else ticks:
+        recorder.put("/tick", record["now_ns"], record)
+    for record in generations(duration_s) if semantics is None else semantics:
+        recorder.put("/semantic", record["ready_ns"], record)
+    recorder.put("/result", START_NS, run_result(duration_s))
+    assert recorder.close()
+
+
 def write_run(
     out: Path,
     duration_s: float = 12.0,
@@ -210,17 +230,7 @@ def write_run(
 ) -> None:
     """Write every file of a run into `out`; any part may be replaced."""
     out.mkdir(parents=True, exist_ok=True)
-    recorder = Recorder(out / "flight.mcap")
-    instruction = "walk down the corridor and stop at the vending machine"
-    recorder.put("/run", START_NS, {"instruction": instruction, "mode": "async", "release_delay": "2"})
-    for tick in range(int(duration_s * 10)):
-        recorder.put("/camera", START_NS + tick * TICK_NS, jpeg(tick / 10))
-    for record in tick_records(duration_s) if ticks is None else ticks:
-        recorder.put("/tick", record["now_ns"], record)
-    for record in generations(duration_s) if semantics is None else semantics:
-        recorder.put("/semantic", record["ready_ns"], record)
-    recorder.put("/result", START_NS, run_result(duration_s))
-    assert recorder.close()
+    write_flight_log(out / "flight.mcap", duration_s, ticks, semantics)
     lines = trace_lines(duration_s) if trace is None else trace
     (out / "hil_trace.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (out / "run.json").write_text(json.dumps(run_result(duration_s)))

@@ -120,6 +120,7 @@ def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
             "Ground truth from the simulator in the world frame. The dashed line is what the runner believed from "
             "the robot's odometry.",
         ),
+        _close_up(data),
         "<h2>What the camera saw and what the VLM said</h2>",
         '<p class="quiet">Each picture is the newest frame the generation was given (its anchor); below it the '
         "VLM's output, as it came.</p>",
@@ -166,6 +167,11 @@ def _untrained_notice(data: RunData) -> str:
     )
 
 
+def _close_up(data: RunData) -> str:
+    picture = figures.close_up(data)
+    return "" if picture is None else page.figure(picture, "Close-up of the path", "The same, close to the path.")
+
+
 def _contact_sheet(data: RunData) -> str:
     chosen = spread(data.log.semantics, SHEET_FRAMES)
     if not chosen:
@@ -194,7 +200,7 @@ def _card(data: RunData, semantic: Record, frames: dict[int, bytes]) -> str:
     points = "no waypoints in the text" if not waypoints else f"{len(waypoints)} waypoints"
     return (
         f'<figure>{picture}<div class="meta">generation {generation:d} · seen at '
-        f"{(anchor_ns - data.log.start_ns) / 1e9:.1f} s · Δt {released_s:.2f} s at release · "
+        f"{round((anchor_ns - data.log.start_ns) / 1e9, 1) + 0.0:.1f} s · Δt {released_s:.2f} s at release · "
         f"{semantic['new_tokens']:d} tokens · {points}</div>"
         f'<pre class="vlm">{page.text_html(semantic["text"]) or "(empty)"}</pre></figure>'
     )

@@ -12,6 +12,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import StrMethodFormatter
 
 from tools.report.run_data import Array, Record, RunData, odometry_in_world
 
@@ -21,6 +23,8 @@ TRUTH = "#1f6f8b"
 COMMAND = "#d1603d"
 WALL = "#46525e"
 PERSON = "#8a5fbf"
+OVERHEAD_KINDS = frozenset({"light", "sign"})  # nobody meets them on the floor
+FLAT_KINDS = frozenset({"door", "window", "notice_board"})  # on a wall
 _DPI = 160
 _DEADLINE_MS = 100.0
 
@@ -47,20 +51,36 @@ def _tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def _legend_above(axes: Axes) -> None:
+    axes.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 0.98), ncols=4, borderaxespad=0)
+
+
 def top_down(data: RunData) -> bytes:
-    """The path among walls, objects and people, seen from above; colour of the path is time."""
-    footprints = data.trace.scene["footprints"]
-    corners = np.concatenate([np.asarray(f["polygon"], float) for f in footprints] + [data.trace.pose[:, :2]])
-    low, high = corners.min(axis=0) - 0.3, corners.max(axis=0) + 0.3
+    """The whole scene from above: path among walls, objects and people; colour of the path is time."""
+    corners = np.concatenate([np.asarray(f["polygon"], float) for f in data.trace.scene["footprints"]])
+    corners = np.concatenate([corners, data.trace.pose[:, :2]])
+    return _seen_from_above(data, corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5)
+
+
+def close_up(data: RunData) -> bytes | None:
+    """The same around the path alone; None when the path fills most of the whole picture anyway."""
+    scene = np.concatenate([np.asarray(f["polygon"], float) for f in data.trace.scene["footprints"]])
+    low, high = data.trace.pose[:, :2].min(axis=0) - 1.5, data.trace.pose[:, :2].max(axis=0) + 1.5
+    if np.prod(high - low) > 0.5 * np.prod(np.ptp(scene, axis=0)):
+        return None
+    # Wide rather than tall, and never a strip: the page is wide.
+    lack = np.maximum(0.0, np.array([2.2, 0.35]) * (high - low)[::-1] - (high - low)) / 2
+    return _seen_from_above(data, low - lack, high + lack)
+
+
+def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
     size = high - low
     width_in = 11.0
-    height_in = float(np.clip(width_in * size[1] / size[0] + 1.6, 3.4, 12.0))
-    figure = _figure(width_in, height_in)
+    figure = _figure(width_in, float(np.clip(width_in * size[1] / size[0] + 1.3, 3.0, 12.0)))
     axes = figure.add_subplot()
-    _draw_footprints(axes, footprints, middle_y=float(low[1] + high[1]) / 2)
+    _draw_footprints(axes, data.trace.scene["footprints"], points_per_m=0.92 * width_in * 72 / size[0])
     _draw_people(axes, data.trace.people)
-    time_s = (data.trace.pose_ns - data.log.start_ns) / 1e9
-    path = _draw_path(axes, data.trace.pose, time_s)
+    path = _draw_path(axes, data.trace.pose, (data.trace.pose_ns - data.log.start_ns) / 1e9)
     _, odometry = odometry_in_world(data)
     axes.plot(odometry[:, 0], odometry[:, 1], color=COMMAND, linewidth=1.0, linestyle=(0, (4, 2)), zorder=6)
     _draw_start_goal(axes, data.trace.scene, data.trace.pose[-1])
@@ -88,31 +108,56 @@ def _top_down_legend() -> list[Line2D]:
     ]
 
 
-def _draw_footprints(axes: Axes, footprints: Sequence[Record], middle_y: float) -> None:
-    for footprint in footprints:
-        polygon = np.asarray(footprint["polygon"], float)
-        is_wall = footprint["kind"] == "wall"
-        axes.add_patch(
-            Polygon(polygon, closed=True, facecolor=WALL if is_wall else "#d8c9a8", edgecolor=INK, linewidth=0.6)
-        )
-        if not is_wall:
-            _label(axes, str(footprint["label"]), polygon, middle_y)
+def _draw_footprints(axes: Axes, footprints: Sequence[Record], points_per_m: float) -> None:
+    middle = np.mean(np.concatenate([np.asarray(f["polygon"], float) for f in footprints]), axis=0)
+    label_end_m = {1: -np.inf, -1: -np.inf}  # where the last label on either side ends
+    for footprint in sorted(footprints, key=lambda f: float(np.mean([x for x, _ in f["polygon"]]))):
+        polygon, kind = np.asarray(footprint["polygon"], float), footprint["kind"]
+        if kind in OVERHEAD_KINDS:
+            continue
+        colour = WALL if kind == "wall" else "#9c6b3f" if kind in FLAT_KINDS else "#d8c9a8"
+        axes.add_patch(Polygon(polygon, closed=True, facecolor=colour, edgecolor=INK, linewidth=0.6))
+        if kind == "wall":
+            continue
+        text, centre = str(footprint["label"]), polygon.mean(axis=0)
+        half_m = len(text) * 2.0 / points_per_m
+        up = 1 if centre[1] < middle[1] else -1
+        if kind in FLAT_KINDS:
+            _label_on_wall(axes, text, polygon, middle)
+            continue
+        above_neighbour = centre[0] - half_m < label_end_m[up]
+        label_end_m[up] = centre[0] + half_m
+        at = (centre[0], polygon[:, 1].max() if up > 0 else polygon[:, 1].min())
+        _annotate(axes, text, at, (0, up * (12 if above_neighbour else 3)), 7, INK)
 
 
-def _label(axes: Axes, text: str, polygon: Array, middle_y: float) -> None:
-    centre = polygon.mean(axis=0)
-    # Towards the middle of the picture: objects stand along walls, and text over a wall cannot be read.
-    up = 1 if centre[1] < middle_y else -1
+def _label_on_wall(axes: Axes, text: str, polygon: Array, middle: Array) -> None:
+    """Doors and boards: beyond the wall they are on, so that the room stays free."""
+    centre, size = polygon.mean(axis=0), np.ptp(polygon, axis=0)
+    if size[1] > size[0]:  # on an end wall: there is more room inside
+        inside = 1 if centre[0] < middle[0] else -1
+        _annotate(axes, text, (centre[0], centre[1]), (inside * 4, 0), 6, MUTED)
+        return
+    beyond = 1 if centre[1] > middle[1] else -1
+    _annotate(axes, text, (centre[0], centre[1]), (0, beyond * 10), 6, MUTED)
+
+
+def _annotate(
+    axes: Axes, text: str, at: tuple[float, float], offset_pt: tuple[int, int], size_pt: int, colour: str
+) -> None:
+    dx, dy = offset_pt
     axes.annotate(
         text,
-        (centre[0], polygon[:, 1].max() if up > 0 else polygon[:, 1].min()),
-        xytext=(0, 3 * up),
+        at,
+        xytext=offset_pt,
         textcoords="offset points",
-        ha="center",
-        va="bottom" if up > 0 else "top",
-        fontsize=7,
-        color=INK,
-        zorder=7,
+        ha="center" if dx == 0 else "left" if dx > 0 else "right",
+        va="center" if dy == 0 else "bottom" if dy > 0 else "top",
+        fontsize=size_pt,
+        color=colour,
+        zorder=10,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        annotation_clip=True,
     )
 
 
@@ -155,15 +200,17 @@ def tick_histogram(durations_ms: Array) -> bytes:
     axes = figure.add_subplot()
     p50, p99 = np.percentile(durations_ms, [50, 99])
     right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
-    axes.hist(durations_ms, bins=np.arange(0, right + 1, right / 70).tolist(), color=TRUTH, log=True)
+    axes.hist(durations_ms, bins=np.arange(0, right + 1, max(1.0, right / 200)).tolist(), color=TRUTH, log=True)
     axes.axvline(_DEADLINE_MS, color="#b3261e", linewidth=1.6, label="deadline 100 ms")
     axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.1f} ms")
     axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.1f} ms")
     axes.axvline(durations_ms.max(), color=MUTED, linewidth=1, label=f"max {durations_ms.max():.1f} ms")
     axes.set_xlim(0, right)
     axes.set_xlabel("tick duration in ms", fontsize=9)
+    axes.set_ylim(bottom=0.7)
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.set_ylabel("ticks (log)", fontsize=9)
-    axes.legend(fontsize=8, frameon=False)
+    _legend_above(axes)
     _tidy(axes)
     return _png(figure)
 
@@ -174,11 +221,12 @@ def delay_histogram(delays_s: Array) -> bytes:
     axes = figure.add_subplot()
     if len(delays_s):
         p50, p99 = np.percentile(delays_s, [50, 99])
-        axes.hist(delays_s, bins=40, color=PERSON)
+        # Ticks are 0.1 s apart, so a finer bin would show the comb of the ticks instead of the delay.
+        axes.hist(delays_s, bins=np.arange(0, delays_s.max() + 0.1, 0.1).tolist(), color=PERSON)
         axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.2f} s")
         axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.2f} s")
         axes.axvline(delays_s.max(), color=MUTED, linewidth=1, label=f"max {delays_s.max():.2f} s")
-        axes.legend(fontsize=8, frameon=False)
+        _legend_above(axes)
     axes.set_xlim(left=0)
     axes.set_xlabel("Δt = now − capture of the anchor frame, in s", fontsize=9)
     axes.set_ylabel("ticks", fontsize=9)
@@ -203,7 +251,7 @@ def time_line(data: RunData) -> bytes:
         axes.plot(pose_s[driven], data.trace.velocity[driven, true], color=TRUTH, linewidth=1.0, label="true")
         axes.step(tick_s, command[:, axis], where="post", color=COMMAND, linewidth=1.2, label="commanded")
         axes.set_ylabel(unit, fontsize=9)
-        axes.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
+        _legend_above(axes)
     turn.set_xlabel("time since the first control tick in s", fontsize=9)
     for axes in (delay, speed, turn):
         for start_s, end_s in _spans(tick_s, [t["reason"] != "ok" for t in ticks]):

@@ -36,8 +36,8 @@ class FlightLog:
 
     @property
     def start_ns(self) -> int:
-        """Zero of all time axes: the first tick."""
-        return int(self.ticks[0]["now_ns"])
+        """Zero of all time axes: the start of the first tick."""
+        return int(self.ticks[0]["start_ns"])
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,176 @@
+"""Start, watch and end the processes of a demo. No child outlives its parent, whatever ends the parent."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+_POLL_S = 0.05
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+
+Tick = Callable[[], None]
+"""Called a few times a second while waiting (progress)."""
+
+
+class StepError(RuntimeError):
+    """One step of the demo failed; the text is what the user has to know, log included."""
+
+
+@dataclass
+class Child:
+    """One running step: a process in its own session, its stderr and stdout in a log file."""
+
+    step: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.process.poll() is None
+
+    def failure(self, what: str) -> StepError:
+        """An error naming the step, its log and the log's last lines."""
+        lines = "\n".join(f"    {line}" for line in tail(self.log)) or "    (the log is empty)"
+        return StepError(f"step '{self.step}' failed: {what}; its log {self.log} ends with\n{lines}")
+
+
+@dataclass
+class Children:
+    """All processes of a demo, ended in reverse order of their start when the block is left."""
+
+    log_dir: Path
+    grace_s: float = 5.0
+    _started: list[Child] = field(default_factory=list)
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with uninterrupted():
+            for child in reversed(self._started):
+                self.end(child)
+
+    def start(self, step: str, command: Sequence[str]) -> Child:
+        """Start a step; StepError when its program cannot be started at all."""
+        log = self.log_dir / f"{step}.log"
+        with log.open("wb") as stream:
+            try:
+                process = subprocess.Popen(
+                    list(command),
+                    stdin=subprocess.DEVNULL,
+                    stdout=stream,
+                    stderr=subprocess.STDOUT,
+                    # A session of its own: Ctrl-C reaches the demo alone, which then stops its children in order.
+                    start_new_session=True,
+                    preexec_fn=_end_with_parent,  # one system call; nothing in it can meet a lock
+                )
+            except OSError as error:
+                raise StepError(f"step '{step}' failed: {command[0]} cannot be started: {error}") from error
+        child = Child(step, process, log)
+        self._started.append(child)
+        return child
+
+    def wait_until(self, child: Child, ready: Callable[[], bool], timeout_s: float, what: str, tick: Tick) -> None:
+        """Wait until `ready()`; StepError when the child ends before or the time is over."""
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        while not ready():
+            self.check_others(None)
+            if time.monotonic_ns() > deadline_ns:
+                raise child.failure(f"no {what} within {timeout_s:g} s")
+            tick()
+            time.sleep(_POLL_S)
+
+    def wait(self, child: Child, timeout_s: float, tick: Tick) -> int:
+        """Wait for a child's own end and return its exit code; any other child that ends meanwhile is a StepError."""
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        while child.running:
+            self.check_others(child)
+            if time.monotonic_ns() > deadline_ns:
+                raise child.failure(f"still running after {timeout_s:g} s")
+            tick()
+            time.sleep(_POLL_S)
+        return child.process.returncode
+
+    def check_others(self, but: Child | None) -> None:
+        """StepError when a started child other than `but` has ended by itself."""
+        for child in self._started:
+            if child is not but and not child.running:
+                raise child.failure(f"ended too early with exit code {child.process.returncode}")
+
+    def stop(self, child: Child) -> int:
+        """Ask a child to end (SIGINT) and return its exit code; StepError when it has to be killed."""
+        ended_itself = self._interrupt(child)
+        self._started.remove(child)
+        if not ended_itself:
+            raise child.failure(f"did not end within {self.grace_s:g} s of SIGINT and was killed")
+        return child.process.returncode
+
+    def forget(self, child: Child) -> None:
+        """Take a child that has ended by itself, as it should, off the list."""
+        self._started.remove(child)
+
+    def end(self, child: Child) -> None:
+        """End a child without complaint: SIGINT, then SIGKILL to all it started."""
+        self._interrupt(child)
+
+    def _interrupt(self, child: Child) -> bool:
+        ended_itself = True
+        if child.running:
+            child.process.send_signal(signal.SIGINT)
+            try:
+                child.process.wait(self.grace_s)
+            except subprocess.TimeoutExpired:
+                ended_itself = False
+        _kill_session(child.process.pid)  # also what it started and left behind
+        child.process.wait()
+        return ended_itself
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let no further Ctrl-C or SIGTERM break off a clean-up (which takes a few seconds at most)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _kill_session(pid: int) -> None:
+    with suppress(ProcessLookupError, PermissionError):  # nobody of that group is left
+        os.killpg(pid, signal.SIGKILL)  # start_new_session made the child the leader of a group of its own
+
+
+def _end_with_parent() -> None:
+    # Even a SIGKILL of the demo must not leave a robot walking: the kernel then interrupts the children.
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def tail(path: Path, lines: int = 8, limit_bytes: int = 16_384) -> list[str]:
+    """The last non-empty lines of a text file, as far as they can be read."""
+    try:
+        with path.open("rb") as stream:
+            stream.seek(max(0, path.stat().st_size - limit_bytes))
+            text = stream.read().decode("utf-8", "replace")
+    except OSError:
+        return []
+    return [line.rstrip() for line in text.splitlines() if line.strip()][-lines:]

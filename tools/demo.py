@@ -1,0 +1,271 @@
+"""The demo: export the graphs, start a simulated Go2 and the bridge, drive for a minute, write a report.
+
+It only starts the same commands a user would type, in this order, and reads their result files:
+edge-export → edge-hil → edge-bridge → edge-run → report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import firmware_bridge
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
+from tools.children import Child, Children, StepError
+from tools.progress import Progress, TraceTail
+from tools.report.demo_report import RunFiles, write_report
+from tools.report.run_data import Record, ReportError
+
+INSTRUCTION = "walk down the corridor and stop at the vending machine"
+RELEASE_DELAY_S = 2
+ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
+READY_LINE = "edge-hil: ready"
+
+# Run as modules of this interpreter, so that the demo works from any virtual environment, activated or not.
+COMMANDS: Mapping[str, Sequence[str]] = {
+    "edge-export": (sys.executable, "-m", "export.cli"),
+    "edge-hil": (sys.executable, "-m", "sim_hil.hil"),
+    "edge-bridge": (sys.executable, "-m", "firmware_bridge.bridge"),
+    "edge-run": (sys.executable, "-m", "edge.runner"),
+}
+
+EXPORT_TIMEOUT_S = 1800.0
+READY_TIMEOUT_S = 90.0
+BRIDGE_TIMEOUT_S = 30.0
+STARTUP_TIMEOUT_S = 120.0
+LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last words are in the trace
+
+EXAMPLES = """examples:
+  python -m tools.demo --out out/demo
+  python -m tools.demo --out out/crowd --duration 120 --seed 3 --people 8
+
+exit codes: 0 done, 1 a step or an acceptance check failed, 2 bad arguments, 130 interrupted
+"""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What to run: times in s, `domain` the DDS domain all processes meet in."""
+
+    out: Path
+    artifacts: Path
+    duration_s: float
+    seed: int
+    people: int
+    domain: int
+
+    def __post_init__(self) -> None:
+        if not 5.0 <= self.duration_s <= 86_400.0:
+            raise ValueError(f"--duration must be 5 to 86400 s, found {self.duration_s:g}")
+        if not 0 <= self.seed < 2**31 or self.people < 0:
+            raise ValueError(f"--seed and --people must not be negative, found {self.seed} and {self.people}")
+        if not 0 <= self.domain <= 232:
+            raise ValueError(f"--domain must be 0 to 232 (DDS), found {self.domain}")
+
+    @property
+    def files(self) -> RunFiles:
+        """Where the run's files go."""
+        return RunFiles(self.out, self.artifacts)
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"demo: {line}\n")
+    sys.stderr.flush()
+
+
+def run_demo(
+    options: DemoOptions,
+    commands: Mapping[str, Sequence[str]] = COMMANDS,
+    report: Callable[..., Record] = write_report,
+) -> Record:
+    """Run every step and return what demo.json holds. Raises StepError or ReportError; ends all its processes."""
+    started_ns = time.monotonic_ns()
+    log_dir = options.out / "log"
+    log_dir.mkdir(parents=True, exist_ok=True)
+    for old in options.files.of_a_run():
+        old.unlink(missing_ok=True)
+    with Children(log_dir) as children, socket_dir() as socket_folder:
+        _export(options, commands["edge-export"], children)
+        _drive(options, commands, children, socket_folder / "bridge.sock")
+    _say("writing the report")
+    return report(options.files, wall_s=(time.monotonic_ns() - started_ns) / 1e9)
+
+
+def _export(options: DemoOptions, command: Sequence[str], children: Children) -> None:
+    """Build the artifacts unless good ones are there."""
+    artifacts = str(options.artifacts)
+    if options.artifacts.exists():
+        child = children.start("edge-export-verify", [*command, "verify", artifacts])
+        if _run_to_end(children, child, f"checking the artifacts in {artifacts}") == 0:
+            _say(f"artifacts in {artifacts} verified, not exported again")
+            return
+        _say(f"artifacts in {artifacts} do not verify (see {child.log}), exporting again")
+        if options.artifacts == options.out / "artifacts":
+            shutil.rmtree(options.artifacts)  # ours; edge-export itself decides about any other directory
+    result = str(options.files.result("edge-export"))
+    arguments = ["--target", "cpu", "--model", "nano", "--out", artifacts, "--json", result]
+    child = children.start("edge-export", [*command, *arguments])
+    code = _run_to_end(children, child, "exporting the graphs")
+    if code != 0:
+        raise child.failure(f"exit code {code}")
+
+
+def _run_to_end(children: Children, child: Child, what: str) -> int:
+    with Progress(lambda elapsed_s: f"demo: {what}, {elapsed_s:.0f} s") as progress:
+        code = children.wait(child, EXPORT_TIMEOUT_S, progress.tick)
+    children.forget(child)
+    return code
+
+
+def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, socket: Path) -> None:
+    """Robot, bridge, runner; then stop them in the order that lets each write its result."""
+    files, domain = options.files, ["--domain", str(options.domain)]
+    common = ["--robot", str(ROBOT_FILE), "--socket", str(socket), *domain]
+    hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
+    with Progress(lambda elapsed_s: f"demo: starting the simulated robot, {elapsed_s:.0f} s") as progress:
+        children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
+    bridge_result = ["--json", str(files.result("edge-bridge"))]
+    bridge = children.start("edge-bridge", [*commands["edge-bridge"], *common, *bridge_result])
+    with Progress(lambda elapsed_s: f"demo: starting the bridge, {elapsed_s:.0f} s") as progress:
+        children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", progress.tick)
+    run = children.start("edge-run", [*commands["edge-run"], *common, *_run_arguments(options)])
+    trace = TraceTail(files.trace)
+
+    def describe(elapsed_s: float) -> str:
+        trace.update()
+        return (
+            f"demo: driving, {elapsed_s:.0f} s ({options.duration_s:.0f} s and start-up) · "
+            f"{trace.moves} commands received by the robot · {trace.walked_m:.1f} m walked"
+        )
+
+    with Progress(describe) as progress:
+        code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
+    if code != 0:
+        raise run.failure(f"exit code {code}")
+    children.forget(run)
+    _stop(children, bridge)
+    time.sleep(LAST_COMMANDS_S)
+    children.check_others(None)
+    _stop(children, hil)
+
+
+def _stop(children: Children, child: Child) -> None:
+    code = children.stop(child)
+    if code not in (EXIT_DONE, EXIT_INTERRUPTED):
+        raise child.failure(f"exit code {code} when stopped")
+
+
+def _hil_arguments(options: DemoOptions) -> list[str]:
+    files = options.files
+    # A backstop only: the demo stops the robot itself.
+    longest_s = options.duration_s + READY_TIMEOUT_S + BRIDGE_TIMEOUT_S + STARTUP_TIMEOUT_S
+    return [
+        *("--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--interface", "lo"),
+        *("--people", str(options.people), "--seed", str(options.seed), "--duration", str(longest_s)),
+        *("--trace", str(files.trace), "--json", str(files.result("edge-hil"))),
+    ]
+
+
+def _run_arguments(options: DemoOptions) -> list[str]:
+    files = options.files
+    return [
+        *("--artifacts", str(options.artifacts), "--instruction", INSTRUCTION, "--mode", "async"),
+        *("--duration", str(options.duration_s), "--release-delay", str(RELEASE_DELAY_S)),
+        *("--record", str(files.flight_log), "--json", str(files.result("edge-run"))),
+    ]
+
+
+def _says_ready(log: Path) -> bool:
+    return READY_LINE in log.read_text(encoding="utf-8", errors="replace")
+
+
+@contextmanager
+def socket_dir() -> Iterator[Path]:
+    """A folder of its own with a short path: a Unix socket's path may have 107 bytes, `--out` may be longer."""
+    folder = Path(tempfile.mkdtemp(prefix="tic-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
+    """A DDS domain in 1..90 whose UDP ports nobody on this machine uses (RTPS: 250 ports from 7400 + 250 · domain)."""
+    used: set[int] = set()
+    for table in udp_tables:
+        try:
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                used.add((int(line.split()[1].rsplit(":", 1)[1], 16) - 7400) // 250)
+        except OSError:
+            continue  # not Linux, or no IPv6
+    # From a different place in every process: two demos started together then rarely want the same one.
+    candidates = [1 + (os.getpid() + i) % 90 for i in range(90)]
+    for domain in candidates:
+        if domain not in used:
+            return domain
+    raise ValueError("no free DDS domain between 1 and 90; name one with --domain")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line of the demo."""
+    p = argparse.ArgumentParser(
+        "python -m tools.demo",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for all results (default: out/demo)")
+    p.add_argument("--artifacts", type=Path, metavar="DIR", help="artifact directory (default: OUT/artifacts)")
+    p.add_argument("--duration", type=float, default=60.0, metavar="S", help="time to drive in s (default: 60)")
+    p.add_argument("--seed", type=int, default=0, help="seed of the simulated world (default: 0)")
+    p.add_argument("--people", type=int, default=4, help="people walking about (default: 4)")
+    p.add_argument("--domain", type=int, help="DDS domain (default: one that is free)")
+    p.add_argument("--json", metavar="FILE|-", help="also write demo.json's content here; - is stdout")
+    return p
+
+
+def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        domain = free_domain() if args.domain is None else args.domain
+        artifacts = args.artifacts or args.out / "artifacts"
+        options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain)
+    except (ValueError, OSError) as error:
+        _say(str(error))
+        return EXIT_BAD_INPUT
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        summary = run_demo(options, commands)
+        write_result(args.json, summary)
+    except KeyboardInterrupt:
+        _say("interrupted, all processes ended")
+        return EXIT_INTERRUPTED
+    except (StepError, ReportError, OSError) as error:
+        _say(str(error))
+        return EXIT_CHECK_FAILED
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    failed = [name for name, check in summary["checks"].items() if not check["pass"]]
+    for name in failed:
+        _say(f"check {name} failed: {json.dumps(summary['checks'][name])}")
+    (sys.stderr if args.json == "-" else sys.stdout).write(f"{options.files.report}\n")
+    return EXIT_CHECK_FAILED if failed else EXIT_DONE
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())
