@@ -194,7 +194,7 @@ def run_result(duration_s: float) -> dict[str, Any]:
         "bridge": {"commands": 510, "last_command": [0.0, 0.0, 0.0], "zero_after_stop": True},
         "delay_error_ms": {"max": 0.0},
         "faults": [],
-        "duration_s": duration_s,
+        "duration_s": duration_s + 0.8,
         "peak_rss_bytes": 512 * 2**20,
     }
 
@@ -208,7 +208,8 @@ def write_flight_log(
     """The flight log of edge-run; ticks and generations may be replaced."""
     recorder = Recorder(path)
     instruction = "walk down the corridor and stop at the vending machine"
-    recorder.put("/run", START_NS, {"instruction": instruction, "mode": "async", "release_delay": "2"})
+    delay = {"mean_s": 2.0, "sd_s": 0.0, "seed": 0}
+    recorder.put("/run", START_NS, {"instruction": instruction, "mode": "async", "release_delay": delay})
     for tick in range(int(duration_s * 10)):
         recorder.put("/camera", START_NS + tick * TICK_NS, jpeg(tick / 10))
     for record in tick_records(duration_s) if ticks is None else ticks:
@@ -233,6 +234,7 @@ def write_run(
     write_flight_log(out / "flight.mcap", duration_s, ticks, semantics)
     lines = trace_lines(duration_s) if trace is None else trace
     (out / "hil_trace.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (out / "settings.json").write_text(json.dumps({"duration_s": duration_s, "seed": 7, "people": 2}))
     (out / "run.json").write_text(json.dumps(run_result(duration_s)))
     (out / "hil.json").write_text(json.dumps(hil_result(duration_s)))
     (out / "bridge.json").write_text(json.dumps({"commands": 510}))

@@ -200,10 +200,19 @@ def test_ticks_missing_in_the_log_fail(tmp_path: Path) -> None:
     assert "ticks_missing_in_log" in _failed(_checks_of(tmp_path, ticks=synthetic_run.tick_records(12.0)[:-3]))
 
 
-def test_slow_ticks_fail(tmp_path: Path) -> None:
+def test_a_runner_that_gave_up_early_is_held_to_the_time_it_was_asked_for(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path)
+    (tmp_path / "settings.json").write_text('{"duration_s": 60.0}')
+    data = load_run(RunFiles(tmp_path, tmp_path / "artifacts"))
+    found = {check.name: check for check in checks.acceptance(data)}
+    assert found["control_ticks"].limit == 590 and not found["control_ticks"].passed
+
+
+@pytest.mark.parametrize("part", ["duration_ms", "late_ms"])
+def test_slow_and_late_ticks_fail(tmp_path: Path, part: str) -> None:
     ticks = synthetic_run.tick_records(12.0)
     for tick in ticks[:3]:
-        tick["duration_ms"] = 140.0
+        tick[part] = 140.0
     assert "tick_p99_ms" in _failed(_checks_of(tmp_path, ticks=ticks))
 
 
@@ -267,7 +276,9 @@ def test_a_damaged_trace_line_is_named(tmp_path: Path) -> None:
         run_data.load_trace(tmp_path / "bad.jsonl")
 
 
-@pytest.mark.parametrize("name", ["flight.mcap", "hil_trace.jsonl", "run.json", "hil.json", "artifacts/manifest.json"])
+@pytest.mark.parametrize(
+    "name", ["settings.json", "flight.mcap", "hil_trace.jsonl", "run.json", "hil.json", "artifacts/manifest.json"]
+)
 def test_a_missing_file_is_named_in_one_line(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     synthetic_run.write_run(tmp_path, 1.0)
     (tmp_path / name).unlink()

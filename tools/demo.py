@@ -72,6 +72,16 @@ class DemoOptions:
         if not 0 <= self.domain <= 232:
             raise ValueError(f"--domain must be 0 to 232 (DDS), found {self.domain}")
 
+    def as_json(self) -> Record:
+        """The options for settings.json."""
+        return {
+            "duration_s": self.duration_s,
+            "seed": self.seed,
+            "people": self.people,
+            "domain": self.domain,
+            "artifacts": str(self.artifacts),
+        }
+
     @property
     def files(self) -> RunFiles:
         """Where the run's files go."""
@@ -94,6 +104,8 @@ def run_demo(
     log_dir.mkdir(parents=True, exist_ok=True)
     for old in options.files.of_a_run():
         old.unlink(missing_ok=True)
+    settings = {"instruction": INSTRUCTION, "release_delay_s": RELEASE_DELAY_S, **options.as_json()}
+    write_result(str(options.files.settings), settings)
     with Children(log_dir) as children, socket_dir() as socket_folder:
         _export(options, commands["edge-export"], children)
         _drive(options, commands, children, socket_folder / "bridge.sock")

@@ -2,8 +2,8 @@
 
     python -m tools.report.demo_report out/demo
 
-reads flight.mcap, hil_trace.jsonl, run.json, bridge.json, hil.json, export.json and artifacts/manifest.json in that
-folder and writes report.html and demo.json beside them.
+reads settings.json, flight.mcap, hil_trace.jsonl, run.json, bridge.json, hil.json, export.json and
+artifacts/manifest.json in that folder and writes report.html and demo.json beside them.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ class RunFiles:
     artifacts: Path
 
     @property
+    def settings(self) -> Path:
+        """What the demo was asked for, written before it starts."""
+        return self.out / "settings.json"
+
+    @property
     def flight_log(self) -> Path:
         """Recorded by edge-run."""
         return self.out / "flight.mcap"
@@ -62,7 +67,7 @@ class RunFiles:
     def of_a_run(self) -> list[Path]:
         """Everything one run writes: removed before the next, so that a failed run never shows an old result."""
         results = [self.result(command) for command in ("edge-run", "edge-hil", "edge-bridge")]
-        return [self.flight_log, self.trace, self.report, self.summary, *results]
+        return [self.settings, self.flight_log, self.trace, self.report, self.summary, *results]
 
 
 def load_run(files: RunFiles) -> RunData:
@@ -71,7 +76,8 @@ def load_run(files: RunFiles) -> RunData:
     if files.result("edge-export").exists():
         results["edge-export"] = load_json(files.result("edge-export"))
     manifest = load_json(files.artifacts / "manifest.json")
-    return RunData(load_flight_log(files.flight_log), load_trace(files.trace), results, manifest)
+    log, trace = load_flight_log(files.flight_log), load_trace(files.trace)
+    return RunData(load_json(files.settings), log, trace, results, manifest)
 
 
 def write_report(files: RunFiles, *, wall_s: float) -> Record:
@@ -134,9 +140,9 @@ def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
         ),
         '<div class="pair">',
         page.figure(
-            figures.tick_histogram(np.array([tick["duration_ms"] for tick in data.log.ticks], float)),
+            figures.tick_histogram(data.log.tick_ms),
             "Histogram of control tick durations",
-            "Work done in every control tick; the loop runs at 10 Hz.",
+            "Every control tick, from its deadline to its command sent; the loop runs at 10 Hz.",
         ),
         page.figure(
             figures.delay_histogram(

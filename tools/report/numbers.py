@@ -94,7 +94,7 @@ def _reasoning(data: RunData) -> list[Number]:
         Number("of which decoding, p50", _median(semantics, "decode_ms", "ms"), LOG),
         Number("of which semantic context, p50", _median(semantics, "context_ms", "ms"), LOG),
         Number("prompt tokens / new tokens, p50", _token_counts(semantics), LOG),
-        Number("release delay asked for", f"{data.log.run.get('release_delay', 'not recorded')}", LOG, "setting"),
+        Number("release delay asked for", _release_delay(data), LOG, "setting"),
         Number("release delay applied, p50", _median(semantics, "release_delay_s", "s", 2), LOG),
         Number("Δt p50 / p99 / max", " / ".join(_value(delay_s[key]) for key in ("p50", "p99", "max")) + " s", RUNNER),
         Number("texts with readable waypoints", f"{sum(1 for s in semantics if s['waypoints'])}", LOG),
@@ -142,6 +142,13 @@ def _median(records: Sequence[Record], key: str, unit: str, digits: int = 1) -> 
 def _p99_max(records: Sequence[Record], key: str, unit: str) -> str:
     column = _column(records, key)
     return f"{np.percentile(column, 99):.1f} / {max(column):.1f} {unit}" if column else "none"
+
+
+def _release_delay(data: RunData) -> str:
+    asked = data.log.run.get("release_delay")
+    if not isinstance(asked, dict):
+        return "not recorded"
+    return f"mean {asked['mean_s']:g} s, sd {asked['sd_s']:g} s"
 
 
 def _reasons(ticks: Sequence[Record]) -> str:

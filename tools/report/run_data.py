@@ -35,6 +35,11 @@ class FlightLog:
     frame_stamps_ns: frozenset[int]
 
     @property
+    def tick_ms(self) -> Array:
+        """[ticks] from each tick's deadline to its command sent, in ms: a late wake-up counts."""
+        return np.array([tick["late_ms"] + tick["duration_ms"] for tick in self.ticks], float)
+
+    @property
     def start_ns(self) -> int:
         """Zero of all time axes: the start of the first tick."""
         return int(self.ticks[0]["start_ns"])
@@ -60,8 +65,9 @@ class Trace:
 
 @dataclass(frozen=True)
 class RunData:
-    """One run, complete. `results` holds the JSON result per command name, `manifest` the artifact's manifest."""
+    """One run, complete: `settings` is what was asked for, `results` the JSON result per command name."""
 
+    settings: Record
     log: FlightLog
     trace: Trace
     results: dict[str, Record]
@@ -69,8 +75,8 @@ class RunData:
 
     @property
     def duration_s(self) -> float:
-        """Length of the driven part as the runner measured it."""
-        return float(self.results["edge-run"]["duration_s"])
+        """Driving time that was asked for: a runner that gave up early must not lower its own limits."""
+        return float(self.settings["duration_s"])
 
 
 def load_json(path: Path) -> Record:
