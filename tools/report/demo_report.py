@@ -125,6 +125,7 @@ def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
             "Top-down picture of the path among walls, objects and people",
             "Ground truth from the simulator in the world frame. The dashed line is what the runner believed from "
             "the robot's odometry.",
+            wide=True,
         ),
         _close_up(data),
         "<h2>What the camera saw and what the VLM said</h2>",
@@ -137,6 +138,7 @@ def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
             "Time line of delay, forward speed and turn rate",
             "Δt rises between generations and falls when a newer one is released. Shaded: ticks that did not drive "
             "(no semantic state yet, stale input or stopping).",
+            wide=True,
         ),
         '<div class="pair">',
         page.figure(
@@ -175,7 +177,11 @@ def _untrained_notice(data: RunData) -> str:
 
 def _close_up(data: RunData) -> str:
     picture = figures.close_up(data)
-    return "" if picture is None else page.figure(picture, "Close-up of the path", "The same, close to the path.")
+    return (
+        ""
+        if picture is None
+        else page.figure(picture, "Close-up of the path", "The same, close to the path.", wide=True)
+    )
 
 
 def _contact_sheet(data: RunData) -> str:

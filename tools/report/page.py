@@ -44,7 +44,13 @@ th, td { text-align: left; padding: 7px 10px; border-bottom: 1px solid var(--lin
 th { font-weight: 600; background: #eef1f4; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .pass { color: var(--good); font-weight: 600; } .fail { color: var(--bad); font-weight: 600; }
+@media (max-width: 640px) {
+  .wide { overflow-x: auto; } .wide img { width: 860px; max-width: none; }
+  .sheet { grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); }
+}
 @media print {
+  .sheet { grid-template-columns: repeat(4, 1fr); } .tiles { grid-template-columns: repeat(6, 1fr); }
+  .pair { grid-template-columns: 1fr 1fr; }
   body { background: #fff; font-size: 11pt; } main { max-width: none; padding: 0; }
   figure, .tile, tr { break-inside: avoid; } h2 { break-after: avoid; }
   .verdict, .vlm, th, .notice { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
@@ -78,10 +84,12 @@ def image_uri(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def figure(data: bytes, alt: str, caption: str, kind: str = "png") -> str:
-    """A picture with its caption (both plain text)."""
+def figure(data: bytes, alt: str, caption: str, *, wide: bool = False) -> str:
+    """A PNG with its caption (both plain text); a wide one is scrolled sideways on a phone instead of shrunk."""
+    kind = ' class="wide"' if wide else ""
+    uri = image_uri(data, "png")
     return (
-        f'<figure><img src="{image_uri(data, kind)}" alt="{html.escape(alt)}">'
+        f'<figure{kind}><img src="{uri}" alt="{html.escape(alt)}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
