@@ -88,7 +88,7 @@ class ControlLoop:
     def run(self, epoch_ns: int, end_ns: int | None) -> str | None:
         """Tick at `epoch_ns` plus whole periods until `stop` or `end_ns`; deadlines that were slept over are skipped.
 
-        Returns why the bridge stopped the robot on its own, else None. Raises BridgeUnavailable when the bridge has gone.
+        Returns why the bridge stopped the robot by itself, else None; raises BridgeUnavailable when it has gone.
         """
         deadline_ns = epoch_ns
         while end_ns is None or deadline_ns < end_ns:

@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
+
+from edge.manifest import Artifacts, load_artifacts
 
 
 @pytest.fixture(scope="session")
 def dds_domain() -> int:
     """A DDS domain of this test run's own, so that two runs on one machine never meet (ports stay below 32768)."""
     return 1 + os.getpid() % 90
+
+
+@pytest.fixture(scope="session")
+def artifacts_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The `nano` artifacts, exported once for the whole session by the real command."""
+    from export.cli import main
+
+    out = tmp_path_factory.mktemp("artifacts") / "nano"
+    assert main(["--target", "cpu", "--model", "nano", "--random-weights", "0", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def artifacts(artifacts_dir: Path) -> Artifacts:
+    """The session's artifacts, verified and loaded."""
+    return load_artifacts(artifacts_dir)

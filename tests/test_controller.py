@@ -1,0 +1,137 @@
+"""The controller: an arc to the point 1 s ahead, within limits and slew, and zero whenever something is missing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.controller import Controller, ControllerConfig, ControllerInputs, arc_to
+from edge.geometry import SE2
+from firmware_bridge.config import LimitsConfig
+
+LIMITS = LimitsConfig(
+    vx_min_mps=-0.4, vx_max_mps=0.8, vy_max_mps=0.3, wz_max_radps=1.0, accel_mps2=2.0, alpha_radps2=4.0
+)
+CONFIG = ControllerConfig(LIMITS, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
+TICK_NS = 100_000_000
+
+
+def plan(dx: float, dy: float = 0.0, dtheta: float = 0.0) -> np.ndarray:
+    return np.cumsum(np.tile(np.float32([dx, dy, dtheta]), (30, 1)), axis=0)
+
+
+def fresh(trajectory: np.ndarray | None) -> ControllerInputs:
+    return ControllerInputs(trajectory, frame_age_ms=50.0, odometry_age_ms=20.0)
+
+
+def settled(trajectory: np.ndarray) -> tuple[float, float]:
+    controller = Controller(CONFIG)
+    for tick in range(50):
+        command = controller.step(fresh(trajectory), tick * TICK_NS)
+    return command.vx_mps, command.wz_radps
+
+
+def test_before_the_first_semantic_state_the_command_is_zero() -> None:
+    command = Controller(CONFIG).step(fresh(None), 0)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "no-semantic-state")
+
+
+def test_the_target_is_the_point_one_second_ahead() -> None:
+    command = Controller(CONFIG).step(fresh(plan(0.05)), 0)
+    assert command.target is not None
+    assert command.target.x_m == pytest.approx(0.5)
+
+
+def test_a_straight_plan_is_driven_at_its_own_speed() -> None:
+    assert settled(plan(0.05)) == (pytest.approx(0.5), pytest.approx(0.0))
+
+
+def test_a_point_to_the_left_turns_left() -> None:
+    assert settled(plan(0.05, 0.01))[1] > 0
+
+
+@given(st.floats(0.06, 2.0), st.floats(-1.5, 1.5))
+def test_the_arc_meets_its_target(distance: float, bearing: float) -> None:
+    target = SE2(distance * math.cos(bearing), distance * math.sin(bearing), 0.0)
+    speed, yaw_rate = arc_to(target, 1.0)
+    if abs(yaw_rate) < 1e-9:
+        x, y = speed, 0.0
+    else:
+        radius = speed / yaw_rate
+        x, y = radius * math.sin(yaw_rate), radius * (1 - math.cos(yaw_rate))
+    assert x == pytest.approx(target.x_m, abs=1e-5)
+    assert y == pytest.approx(target.y_m, abs=1e-5)
+
+
+def test_a_point_behind_is_turned_to_in_place() -> None:
+    speed, yaw_rate = arc_to(SE2(-1.0, 0.2, 0.0), 1.0)
+    assert speed == 0.0
+    assert yaw_rate > 0
+
+
+def test_a_plan_that_stays_in_place_only_turns() -> None:
+    speed, yaw_rate = arc_to(SE2(0.01, -0.01, 0.3), 1.0)
+    assert (speed, yaw_rate) == (0.0, pytest.approx(0.3))
+
+
+finite = st.floats(-1e6, 1e6, width=32)
+
+
+@given(
+    st.lists(st.tuples(finite, finite, finite), min_size=30, max_size=30), st.lists(st.integers(0, 10**9), max_size=5)
+)
+def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], gaps_ns: list[int]) -> None:
+    controller = Controller(CONFIG)
+    now_ns = 0
+    for gap_ns in [0, *gaps_ns]:
+        now_ns += gap_ns
+        command = controller.step(fresh(np.float32(points)), now_ns)
+        assert LIMITS.vx_min_mps <= command.vx_mps <= LIMITS.vx_max_mps
+        assert abs(command.wz_radps) <= LIMITS.wz_max_radps
+        assert command.vy_mps == 0.0
+
+
+def test_speed_rises_no_faster_than_the_slew_limit() -> None:
+    controller = Controller(CONFIG)
+    speeds = [controller.step(fresh(plan(0.08)), tick * TICK_NS).vx_mps for tick in range(6)]
+    steps = np.diff([0.0, *speeds])
+    assert max(steps) <= LIMITS.accel_mps2 * 0.1 + 1e-9
+
+
+def test_a_long_pause_does_not_buy_a_jump() -> None:
+    controller = Controller(CONFIG)
+    controller.step(fresh(plan(0.08)), 0)
+    assert controller.step(fresh(plan(0.08)), 3600 * 10**9).vx_mps <= LIMITS.accel_mps2 * 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_an_output_that_is_not_finite_stops_in_the_same_step(bad: float) -> None:
+    controller = Controller(CONFIG)
+    for tick in range(10):
+        controller.step(fresh(plan(0.05)), tick * TICK_NS)
+    poisoned = plan(0.05)
+    poisoned[29, 2] = bad
+    command = controller.step(fresh(poisoned), 10 * TICK_NS)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "bad-output")
+
+
+@pytest.mark.parametrize(
+    ("frame_age_ms", "odometry_age_ms", "reason"),
+    [
+        (None, 20.0, "stale-frame"),
+        (501.0, 20.0, "stale-frame"),
+        (-1.0, 20.0, "stale-frame"),
+        (50.0, None, "stale-odometry"),
+        (50.0, 201.0, "stale-odometry"),
+        (50.0, -1.0, "stale-odometry"),
+    ],
+)
+def test_old_missing_and_future_inputs_stop(
+    frame_age_ms: float | None, odometry_age_ms: float | None, reason: str
+) -> None:
+    command = Controller(CONFIG).step(ControllerInputs(plan(0.05), frame_age_ms, odometry_age_ms), 0)
+    assert (command.vx_mps, command.reason) == (0.0, reason)

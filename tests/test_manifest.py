@@ -1,0 +1,131 @@
+"""Nothing in an artifact directory is opened before all of it has been verified."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.graph import Graph
+from edge.manifest import ArtifactError, load_artifacts
+
+
+@pytest.fixture
+def copy(artifacts_dir: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+
+
+def edit(directory: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    path = directory / "manifest.json"
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(manifest))
+
+
+def test_a_fresh_export_is_accepted(artifacts_dir: Path) -> None:
+    artifacts = load_artifacts(artifacts_dir)
+    assert artifacts.model_name == "nano"
+    assert not artifacts.trained
+
+
+@pytest.mark.parametrize("name", ["vision_encoder.onnx", "language_model.onnx", "tokenizer.json", "report.html"])
+def test_one_flipped_bit_anywhere_is_refused_by_name(copy: Path, name: str) -> None:
+    data = bytearray((copy / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (copy / name).write_bytes(data)
+    with pytest.raises(ArtifactError, match=rf"{name}: sha256"):
+        load_artifacts(copy)
+
+
+def test_a_truncated_file_is_refused(copy: Path) -> None:
+    data = (copy / "action_expert.onnx").read_bytes()
+    (copy / "action_expert.onnx").write_bytes(data[:-1])
+    with pytest.raises(ArtifactError, match=r"action_expert.onnx: \d+ bytes, the manifest says"):
+        load_artifacts(copy)
+
+
+def test_a_missing_file_is_refused(copy: Path) -> None:
+    (copy / "tokenizer.json").unlink()
+    with pytest.raises(ArtifactError, match=r"tokenizer.json: missing"):
+        load_artifacts(copy)
+
+
+def test_a_file_that_is_not_listed_is_refused(copy: Path) -> None:
+    (copy / "weights.pkl").write_bytes(b"\x80\x04")
+    with pytest.raises(ArtifactError, match="not listed"):
+        load_artifacts(copy)
+
+
+def test_a_symlink_is_refused(copy: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.json"
+    shutil.move(copy / "tokenizer.json", outside)
+    (copy / "tokenizer.json").symlink_to(outside)
+    with pytest.raises(ArtifactError, match="not a regular file"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("name", ["../evil.onnx", "/etc/passwd", "a/b", "", ".hidden", "manifest.json"])
+def test_a_listed_path_that_leaves_the_directory_is_refused(copy: Path, name: str) -> None:
+    edit(copy, lambda m: m["files"].update({name: {"bytes": 1, "sha256": "0" * 64}}))
+    with pytest.raises(ArtifactError, match="not a plain name"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_another_schema_version_is_refused(copy: Path, version: object) -> None:
+    edit(copy, lambda m: m.update(schema_version=version))
+    with pytest.raises(ArtifactError, match="schema version"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("section", ["graphs", "files", "runtime", "model", "provenance", "target"])
+def test_a_missing_section_is_refused(copy: Path, section: str) -> None:
+    edit(copy, lambda m: m.pop(section))
+    with pytest.raises(ArtifactError, match=section):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", "[" * 100_000])
+def test_a_manifest_that_is_no_object_is_refused(copy: Path, content: str) -> None:
+    (copy / "manifest.json").write_text(content)
+    with pytest.raises(ArtifactError):
+        load_artifacts(copy)
+
+
+def test_a_directory_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="not a directory"):
+        load_artifacts(tmp_path / "nothing")
+
+
+def test_widths_that_do_not_fit_one_another_are_refused(copy: Path) -> None:
+    edit(copy, lambda m: m["runtime"].update(kv_dim=128))
+    with pytest.raises(ArtifactError, match="last_layer_kv"):
+        load_artifacts(copy)
+
+
+def test_an_unknown_runtime_key_is_refused(copy: Path) -> None:
+    edit(copy, lambda m: m["runtime"].update(max_speed=9))
+    with pytest.raises(ArtifactError, match="runtime has"):
+        load_artifacts(copy)
+
+
+def test_a_graph_that_is_not_what_the_manifest_says_is_refused_when_opened(copy: Path) -> None:
+    swapped = (copy / "semantic_context.onnx").read_bytes()
+    (copy / "action_expert.onnx").write_bytes(swapped)
+    entry = {"bytes": len(swapped), "sha256": hashlib.sha256(swapped).hexdigest()}
+    edit(copy, lambda m: m["files"].update({"action_expert.onnx": entry}))
+    with pytest.raises(ArtifactError, match="not those of the manifest"):
+        Graph(load_artifacts(copy), "action_expert", threads=1)
+
+
+def test_a_file_that_is_no_graph_is_refused_when_opened(copy: Path) -> None:
+    (copy / "action_expert.onnx").write_bytes(b"not a graph")
+    entry = {"bytes": 11, "sha256": hashlib.sha256(b"not a graph").hexdigest()}
+    edit(copy, lambda m: m["files"].update({"action_expert.onnx": entry}))
+    with pytest.raises(ArtifactError, match="cannot open"):
+        Graph(load_artifacts(copy), "action_expert", threads=1)

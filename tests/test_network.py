@@ -1,0 +1,220 @@
+"""The network: shapes of the design, exact splits, causality, and a cache that changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
+from export.model.network import TicVla, build
+from export.model.vision import fold_tokens, pixel_shuffle_v2
+
+NANO = PRESETS["nano"]
+
+
+@pytest.fixture(scope="module")
+def model() -> TicVla:
+    return build(NANO, 0)
+
+
+def frame(seed: int, px: int = 128) -> Tensor:
+    return torch.randint(0, 256, (1, px, px, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+
+
+def no_past(config: TicVlaConfig) -> list[Tensor]:
+    c = config.language
+    return [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
+
+
+def prompt(length: int, images: int = 0) -> Tensor:
+    ids = torch.randint(6, NANO.language.vocab, (1, length), generator=torch.Generator().manual_seed(length))
+    ids[0, 2 : 2 + 16 * images] = NANO.language.img_context_id
+    return ids
+
+
+def act(model: TicVla, kv: Tensor, latency: list[float], seed: int = 1) -> Tensor:
+    keys, values = model.action.context(kv)
+    tokens = model.vision(frame(seed))
+    return model.action(tokens, torch.zeros(1, 3), torch.tensor([latency]), keys, values)
+
+
+def test_the_paper_preset_has_the_numbers_of_the_paper() -> None:
+    c = PRESETS["1b"]
+    assert (c.vision.tokens, c.frame_tokens, c.kv_dim) == (256, 256, 256)
+    assert (c.action.layers, c.action.hidden, c.action.ffn, c.action.steps) == (6, 512, 2048, 30)
+
+
+def test_the_paper_preset_is_the_same_code_with_other_numbers() -> None:
+    with torch.device("meta"):
+        big = TicVla(PRESETS["1b"])
+        count = {n: sum(p.numel() for p in getattr(big, n).parameters()) for n in ("vision", "language")}
+        shapes = big.vision(torch.zeros(1, 448, 448, 3, dtype=torch.uint8)).shape
+    # InternVL3-1B: 304.0 M + 4.48 M vision and projector, 357.9 M decoder and two embeddings of 135.9 M.
+    assert count["vision"] == pytest.approx(308.5e6, rel=0.002)
+    assert count["language"] == pytest.approx(629.7e6, rel=0.002)
+    assert shapes == (1, 256, 896)
+
+
+def test_a_frame_gives_visual_tokens_and_another_frame_other_ones(model: TicVla) -> None:
+    with torch.no_grad():
+        a, b = model.vision(frame(1)), model.vision(frame(2))
+    assert a.shape == (1, 64, 256)
+    assert (a - b).abs().max() > 0.1
+
+
+def test_the_trajectory_has_thirty_poses(model: TicVla) -> None:
+    with torch.no_grad():
+        trajectory = act(model, torch.randn(1, 20, NANO.kv_dim), [1.0, 0.2, 0.0, 0.1])
+    assert trajectory.shape == (1, 30, 3)
+
+
+def test_increments_are_summed_up(model: TicVla) -> None:
+    kv = torch.randn(1, 20, NANO.kv_dim)
+    with torch.no_grad():
+        trajectory = act(model, kv, [1.0, 0.0, 0.0, 0.0])[0]
+    steps = torch.diff(trajectory, dim=0, prepend=torch.zeros(1, 3))
+    assert steps[:, 0].mean() == pytest.approx(NANO.action.initial_step[0], abs=0.02)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_each_number_of_the_latency_metadata_reaches_the_plan(model: TicVla, index: int) -> None:
+    kv = torch.randn(1, 20, NANO.kv_dim)
+    latency = [1.0, 0.2, 0.1, 0.1]
+    changed = list(latency)
+    changed[index] += 1.0
+    with torch.no_grad():
+        assert not torch.equal(act(model, kv, latency), act(model, kv, changed))
+
+
+def variant(**fields: object) -> TicVla:
+    return build(dataclasses.replace(NANO, action=dataclasses.replace(NANO.action, **fields)), 0)
+
+
+def test_without_latency_awareness_the_metadata_changes_nothing() -> None:
+    kv = torch.randn(1, 20, NANO.kv_dim)
+    with torch.no_grad():
+        model = variant(latency_aware=False)
+        assert torch.equal(act(model, kv, [0.0, 0.0, 0.0, 0.0]), act(model, kv, [5.0, 1.0, 1.0, 1.0]))
+
+
+def test_without_motion_offset_only_the_time_counts() -> None:
+    kv = torch.randn(1, 20, NANO.kv_dim)
+    with torch.no_grad():
+        model = variant(motion_offset=False)
+        assert torch.equal(act(model, kv, [2.0, 0.0, 0.0, 0.0]), act(model, kv, [2.0, 1.0, 1.0, 1.0]))
+        assert not torch.equal(act(model, kv, [2.0, 0.0, 0.0, 0.0]), act(model, kv, [3.0, 0.0, 0.0, 0.0]))
+
+
+def test_values_only_does_not_look_at_the_keys() -> None:
+    kv = torch.randn(1, 20, NANO.kv_dim)
+    other = kv.clone()
+    other[..., : NANO.kv_dim // 2] += 1
+    with torch.no_grad():
+        model = variant(semantic_interface="values-only")
+        assert torch.equal(act(model, kv, [1.0, 0, 0, 0]), act(model, other, [1.0, 0, 0, 0]))
+
+
+def test_the_split_semantic_context_is_exact(model: TicVla) -> None:
+    """Cross-attention over [now, semantics] with the semantic half computed apart equals attention over all tokens."""
+    kv, state, latency = torch.randn(1, 20, NANO.kv_dim), torch.zeros(1, 3), torch.tensor([[1.0, 0.3, 0.0, 0.1]])
+    action = model.action
+    with torch.no_grad():
+        tokens = model.vision(frame(1))
+        split = act(model, kv, [1.0, 0.3, 0.0, 0.1])
+        everything = torch.cat([action.now_tokens(tokens, state, latency), action.semantic_tokens(kv)], dim=1)
+        x = action.queries
+        for key_value, layer in zip(action.key_values, action.layers, strict=True):
+            x = layer(x, *key_value(everything))
+        whole = torch.cumsum(action.out(action.head(action.norm(x))), dim=1)
+    assert torch.allclose(split, whole, atol=1e-6)
+
+
+def test_a_cache_changes_nothing(model: TicVla) -> None:
+    ids, tokens = prompt(40, images=1), model.vision(frame(1)).detach()
+    with torch.no_grad():
+        whole, _, kv_whole = model.language.hidden_states(ids, tokens, no_past(NANO))
+        past, parts, kvs = no_past(NANO), [], []
+        for chunk in (ids[:, :25], ids[:, 25:39], ids[:, 39:]):
+            x, past, kv = model.language.hidden_states(chunk, tokens, past)
+            parts.append(x)
+            kvs.append(kv)
+    assert torch.allclose(torch.cat(parts, dim=1), whole, atol=1e-4)
+    assert torch.allclose(torch.cat(kvs, dim=1), kv_whole, atol=1e-4)
+
+
+def test_a_token_cannot_see_the_future(model: TicVla) -> None:
+    ids, tokens = prompt(30), torch.zeros(1, 64, 256)
+    changed = ids.clone()
+    changed[0, 20:] = 7
+    with torch.no_grad():
+        a, _, _ = model.language.hidden_states(ids, tokens, no_past(NANO))
+        b, _, _ = model.language.hidden_states(changed, tokens, no_past(NANO))
+    assert torch.allclose(a[:, :20], b[:, :20], atol=1e-5)
+    assert not torch.allclose(a[:, 20:], b[:, 20:], atol=1e-2)
+
+
+def test_frames_stand_where_their_places_are_and_in_their_order(model: TicVla) -> None:
+    ids = prompt(60, images=2)
+    a, b = model.vision(frame(1)).detach(), model.vision(frame(2)).detach()
+    with torch.no_grad():
+        embedded = model.language.embed_inputs(ids, torch.cat([a, b]))
+        merged = model.language.merge(fold_tokens(torch.cat([a, b]), 2)).reshape(-1, 256)
+        text = model.language.embed(ids[0])
+    assert torch.equal(embedded[0, 2:34], merged)
+    assert torch.equal(embedded[0, :2], text[:2])
+    assert torch.equal(embedded[0, 34:], text[34:])
+
+
+def test_pixel_shuffle_puts_a_square_of_cells_into_one() -> None:
+    cells = torch.arange(16).reshape(1, 4, 4, 1)
+    shuffled = pixel_shuffle_v2(cells, 2)
+    assert shuffled.shape == (1, 2, 2, 4)
+    assert sorted(shuffled[0, 0, 0].tolist()) == [0, 1, 4, 5]
+    assert sorted(shuffled[0, 0, 1].tolist()) == [2, 3, 6, 7]
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
+    a, b, c = build(NANO, 3), build(NANO, 3), build(NANO, 4)
+    assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    assert any(not torch.equal(x, y) for x, y in zip(a.parameters(), c.parameters(), strict=True))
+
+
+def test_dropout_acts_in_training_only(model: TicVla) -> None:
+    kv = torch.randn(1, 200, NANO.kv_dim)
+    model.train()
+    dropped = model.action.semantic_tokens(kv)
+    model.eval()
+    kept = model.action.semantic_tokens(kv)
+    share = (dropped == 0).all(dim=-1).float().mean()
+    assert 0.02 < share < 0.25
+    assert not (kept == 0).all(dim=-1).any()
+
+
+def test_the_value_network_gives_one_number(model: TicVla) -> None:
+    assert model.value(torch.randn(2, 64, 256), torch.zeros(2, 3), torch.zeros(2, 2)).shape == (2,)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"action": {"hidden": 255}},
+        {"action": {"semantic_interface": "telepathy"}},
+        {"action": {"parameterisation": "wishes"}},
+        {"action": {"kv_dropout": 1.0}},
+        {"vision": {"image_px": 100}},
+        {"vision": {"stem_channels": (8, 16)}},
+        {"language": {"kv_heads": 3}},
+        {"language": {"vocab": 4}},
+        {"language": {"token_merge": 3}},
+    ],
+    ids=str,
+)
+def test_numbers_that_contradict_each_other_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ModelConfigError):
+        for section, value in change.items():
+            if isinstance(value, dict):
+                value = dataclasses.replace(getattr(NANO, section), **value)
+            dataclasses.replace(NANO, **{section: value})
