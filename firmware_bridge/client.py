@@ -1,0 +1,104 @@
+"""How the runner commands: a connection to the bridge that never waits once it is made."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+from pathlib import Path
+from typing import Final
+
+from firmware_bridge.link import (
+    MAX_DATAGRAM_BYTES,
+    Arm,
+    BridgeStatus,
+    LinkError,
+    Message,
+    Stop,
+    Velocity,
+    decode,
+    encode,
+)
+
+__all__ = ["BridgeClient", "BridgeStatus", "BridgeUnavailable"]
+
+_HELLO_TIMEOUT_MS: Final = 1000
+
+
+class BridgeUnavailable(RuntimeError):  # noqa: N818 - a state of the world, named as one
+    """No bridge listens, it has another client, or it has gone; one line for the operator."""
+
+
+class BridgeClient:
+    """The one client of an `edge-bridge`.
+
+    Order of use: `arm()`, then `send_velocity` at the control rate from that moment on, zero velocity included, while
+    `poll()` reports "arming" and later "armed". The bridge stops the robot when no good command has come for its
+    deadman time (250 ms), when `stop()` is called, and when this process or its connection goes away; it then needs a
+    new `arm()`. Commands sent while arming keep the deadman quiet but do not move the robot.
+    """
+
+    def __init__(self, socket_path: Path | str) -> None:
+        """Connect and wait up to 1 s for the bridge's greeting. Raises BridgeUnavailable."""
+        self._status: BridgeStatus | None = None
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket.connect(str(socket_path))
+        except OSError as error:
+            self._socket.close()
+            raise BridgeUnavailable(
+                f"no bridge listens at {socket_path} ({error.strerror}); start `edge-bridge --robot FILE.toml`"
+            ) from error
+        self._socket.setblocking(False)
+        poller = select.poll()
+        poller.register(self._socket, select.POLLIN)
+        status = None
+        if poller.poll(_HELLO_TIMEOUT_MS):
+            with contextlib.suppress(BridgeUnavailable):  # closed without a greeting
+                status = self.poll()
+        if status is None:
+            self.close()
+            raise BridgeUnavailable(f"the bridge at {socket_path} has another client or does not answer")
+
+    def arm(self) -> bool:
+        """Ask the bridge to stand the robot up and take commands; follow `poll()`. False when it could not be sent."""
+        return self._send(Arm())
+
+    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
+        """Send one command in the body frame; False when it could not be sent.
+
+        `seq` must increase with every command of this connection; `stamp_ns` is time.monotonic_ns() when the command
+        was computed: the bridge refuses commands older than its deadman, and commands from the future.
+        """
+        return self._send(Velocity(seq, stamp_ns, vx_mps, vy_mps, wz_radps))
+
+    def stop(self) -> bool:
+        """Stop the robot now; the bridge stays stopped until the next `arm()`. False when it could not be sent."""
+        return self._send(Stop())
+
+    def poll(self) -> BridgeStatus | None:
+        """Newest status known, None before the first; raises BridgeUnavailable when the bridge has gone."""
+        while True:
+            try:
+                data = self._socket.recv(MAX_DATAGRAM_BYTES)
+            except BlockingIOError:
+                return self._status
+            except OSError as error:
+                raise BridgeUnavailable(f"the connection to the bridge broke: {error.strerror}") from error
+            if not data:
+                raise BridgeUnavailable("the bridge has closed the connection")
+            with contextlib.suppress(LinkError):
+                message = decode(data)
+                if isinstance(message, BridgeStatus):
+                    self._status = message
+
+    def close(self) -> None:
+        """Disconnect; the bridge stops the robot if it was armed."""
+        self._socket.close()
+
+    def _send(self, message: Message) -> bool:
+        try:
+            self._socket.send(encode(message))
+        except OSError:  # full queue (a hung bridge) or a closed connection: poll() tells which
+            return False
+        return True

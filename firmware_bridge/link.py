@@ -1,0 +1,123 @@
+"""Datagrams between runner and bridge: fixed binary layouts, checked on arrival, no parser to attack.
+
+Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
+  1 arm       empty
+  2 stop      empty
+  3 velocity  seq u64, stamp_ns i64 (time.monotonic_ns of the command), vx, vy m/s, wz rad/s as f64
+  4 status    stamp_ns i64, state u8, zero_after_stop u8, last_seq u64, commands u64, rejected u64,
+              last command 3 x f64, then the reason as UTF-8
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+MAGIC: Final = b"TVEB"
+VERSION: Final = 1
+STATES: Final = ("disarmed", "arming", "armed", "stopped")
+MAX_REASON_BYTES: Final = 400
+MAX_DATAGRAM_BYTES: Final = 512
+
+_ARM, _STOP, _VELOCITY, _STATUS = 1, 2, 3, 4
+_HEADER: Final = struct.Struct("<4sBBH")
+_VELOCITY_BODY: Final = struct.Struct("<Qq3d")
+_STATUS_BODY: Final = struct.Struct("<qBBQQQ3d")
+
+
+class LinkError(ValueError):
+    """Bytes that are no datagram of this link."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Operator's or runner's wish to drive."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Stop now and stay stopped."""
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """One velocity command in the body frame; `stamp_ns` is when it was computed."""
+
+    seq: int
+    stamp_ns: int
+    vx_mps: float
+    vy_mps: float
+    wz_radps: float
+
+
+@dataclass(frozen=True)
+class BridgeStatus:
+    """What the bridge is doing: `commands` velocity commands written to the robot, `last_command` the newest of them.
+
+    `zero_after_stop`: stopped, and a zero velocity has been written since, and nothing else. It is True too when the
+    bridge never commanded the robot at all.
+    """
+
+    stamp_ns: int
+    state: str
+    reason: str
+    last_seq: int
+    commands: int
+    rejected: int
+    last_command: tuple[float, float, float]
+    zero_after_stop: bool
+
+
+Message = Arm | Stop | Velocity | BridgeStatus
+
+
+def encode(message: Message) -> bytes:
+    """Datagram of a message; the reason of a status is cut to what fits."""
+    if isinstance(message, Arm):
+        return _frame(_ARM, b"")
+    if isinstance(message, Stop):
+        return _frame(_STOP, b"")
+    if isinstance(message, Velocity):
+        velocity = (message.vx_mps, message.vy_mps, message.wz_radps)
+        return _frame(_VELOCITY, _VELOCITY_BODY.pack(message.seq, message.stamp_ns, *velocity))
+    reason = message.reason.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", "ignore").encode("utf-8")
+    counters = (message.last_seq, message.commands, message.rejected)
+    state = STATES.index(message.state)
+    body = _STATUS_BODY.pack(message.stamp_ns, state, message.zero_after_stop, *counters, *message.last_command)
+    return _frame(_STATUS, body + reason)
+
+
+def decode(data: bytes) -> Message:
+    """Message of a datagram; raises LinkError for anything that `encode` cannot have made."""
+    if len(data) < _HEADER.size:
+        raise LinkError(f"{len(data)} bytes, shorter than a header")
+    magic, version, kind, length = _HEADER.unpack_from(data)
+    body = data[_HEADER.size :]
+    if (magic, version) != (MAGIC, VERSION) or length != len(body):
+        raise LinkError(f"magic {magic!r}, version {version}, length {length} of {len(body)}")
+    if kind == _ARM and not body:
+        return Arm()
+    if kind == _STOP and not body:
+        return Stop()
+    if kind == _VELOCITY and len(body) == _VELOCITY_BODY.size:
+        return Velocity(*_VELOCITY_BODY.unpack(body))
+    if kind == _STATUS and _STATUS_BODY.size <= len(body) <= _STATUS_BODY.size + MAX_REASON_BYTES:
+        return _decode_status(body)
+    raise LinkError(f"kind {kind} with {len(body)} bytes")
+
+
+def _decode_status(body: bytes) -> BridgeStatus:
+    stamp_ns, state, zero, last_seq, commands, rejected, *velocity = _STATUS_BODY.unpack_from(body)
+    if state >= len(STATES) or zero > 1:
+        raise LinkError(f"state {state}, flag {zero}")
+    try:
+        reason = body[_STATUS_BODY.size :].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise LinkError("reason is not UTF-8") from error
+    vx, vy, wz = velocity
+    return BridgeStatus(stamp_ns, STATES[state], reason, last_seq, commands, rejected, (vx, vy, wz), zero == 1)
+
+
+def _frame(kind: int, body: bytes) -> bytes:
+    return _HEADER.pack(MAGIC, VERSION, kind, len(body)) + body

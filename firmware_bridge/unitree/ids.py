@@ -1,0 +1,61 @@
+"""Unitree services, API ids and error codes we use, as literal tables.
+
+Source: unitreerobotics/unitree_sdk2_python (BSD-3), go2/sport/sport_api.py, go2/video/video_api.py,
+rpc/internal.py; values only.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+SPORT_SERVICE: Final = "sport"
+VIDEO_SERVICE: Final = "videohub"
+SPORT_STATE_TOPIC: Final = "rt/sportmodestate"
+LOW_STATE_TOPIC: Final = "rt/lowstate"
+
+API_VERSION: Final = 1  # every service answers it with its version as bare text
+SERVICE_VERSION: Final = "1.0.0.1"
+
+DAMP: Final = 1001
+BALANCE_STAND: Final = 1002
+STOP_MOVE: Final = 1003
+STAND_UP: Final = 1004
+STAND_DOWN: Final = 1005
+RECOVERY_STAND: Final = 1006
+MOVE: Final = 1008  # {"x","y","z"}: m/s, m/s, rad/s in the body frame; never answered
+GET_IMAGE_SAMPLE: Final = 1001  # of videohub
+
+SPORT_API_NAMES: Final = {
+    DAMP: "Damp",
+    BALANCE_STAND: "BalanceStand",
+    STOP_MOVE: "StopMove",
+    STAND_UP: "StandUp",
+    STAND_DOWN: "StandDown",
+    RECOVERY_STAND: "RecoveryStand",
+    MOVE: "Move",
+}
+# The only ids that ever leave this machine: the same field can ask for a back flip (faults table, "Unitree hazards").
+BRIDGE_ALLOWED: Final = frozenset({MOVE, STOP_MOVE, STAND_UP, RECOVERY_STAND, BALANCE_STAND})
+
+OK: Final = 0
+ERROR_NOT_IMPLEMENTED: Final = 3203
+ERROR_PARAMETER: Final = 3204
+
+# SportModeState_.mode
+MODE_IDLE: Final = 0
+MODE_BALANCE_STAND: Final = 1
+MODE_LOCOMOTION: Final = 3
+MODE_LIE_DOWN: Final = 5
+MODE_JOINT_LOCK: Final = 6
+MODE_DAMPING: Final = 7
+MODE_RECOVERY_STAND: Final = 8
+
+
+def request_topic(service: str) -> str:
+    """DDS topic on which `service` takes its requests."""
+    return f"rt/api/{service}/request"
+
+
+def response_topic(service: str) -> str:
+    """DDS topic on which `service` answers."""
+    return f"rt/api/{service}/response"
