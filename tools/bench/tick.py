@@ -1,0 +1,95 @@
+"""One control tick (encoder + action expert) on one core: the exported graphs, paired with PyTorch in the same run.
+
+    python -m tools.bench.tick --artifacts out/demo/artifacts --json out/bench/tick.json
+
+Prints medians and the ratio; the JSON holds every sample. The two take turns, so that a machine that slows down slows
+both. `--core` pins the process, which makes "one core" literal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, write_result
+from edge.geometry import SE2
+from edge.manifest import ArtifactError, load_artifacts, read_manifest
+from edge.policy import Policy
+from edge.semantic import SemanticState
+from export.model.network import build
+from export.model.weights import preset
+
+HERE = SE2(0.0, 0.0, 0.0)
+
+
+def onnx_tick(directory: Path, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
+    """The runner's own code path."""
+    policy = Policy(load_artifacts(directory), threads=1)
+    keys, values = policy.semantic_context(kv)
+    semantic = SemanticState(0, 0, HERE, 0, kv, keys, values, "", None)
+    return lambda: policy.act(policy.encode(image), (0.4, 0.0, 0.0), 2.0, HERE, semantic)
+
+
+def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
+    """The same network in PyTorch eager mode on one thread."""
+    torch.set_num_threads(1)
+    model = build(preset(model_name), 0)
+    frame, state, latency = torch.from_numpy(image), torch.tensor([[0.4, 0.0, 0.0]]), torch.tensor([[2.0, 0, 0, 0]])
+    with torch.no_grad():
+        keys, values = model.action.context(torch.from_numpy(kv))
+
+    def tick() -> np.ndarray:
+        with torch.no_grad():
+            return model.action(model.vision(frame), state, latency, keys, values).numpy()
+
+    return tick
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p.add_argument("--rounds", type=int, default=100)
+    p.add_argument("--tokens", type=int, default=200, help="tokens of the semantic state (default: 200)")
+    p.add_argument("--core", type=int, default=0, help="processor to pin to (default: 0)")
+    p.add_argument("--json", metavar="FILE|-")
+    args = p.parse_args(argv)
+    os.sched_setaffinity(0, {args.core})
+    rng = np.random.default_rng(0)
+    try:
+        artifacts = load_artifacts(args.artifacts)
+        model_name = read_manifest(args.artifacts)["model"]["name"]
+    except ArtifactError as error:
+        sys.stderr.write(f"{error}\n")
+        return EXIT_BAD_INPUT
+    px = artifacts.runtime.image_px
+    image = rng.integers(0, 256, (1, px, px, 3)).astype(np.uint8)
+    kv = rng.standard_normal((1, args.tokens, artifacts.runtime.kv_dim)).astype(np.float32)
+    ticks = {"onnxruntime": onnx_tick(args.artifacts, image, kv), "torch": torch_tick(model_name, image, kv)}
+    samples: dict[str, list[float]] = {name: [] for name in ticks}
+    for round_index in range(-5, args.rounds):
+        for name, tick in ticks.items():
+            started_ns = time.monotonic_ns()
+            tick()
+            if round_index >= 0:
+                samples[name].append((time.monotonic_ns() - started_ns) / 1e6)
+    medians = {name: statistics.median(values) for name, values in samples.items()}
+    ratio = statistics.median(t / o for o, t in zip(samples["onnxruntime"], samples["torch"], strict=True))
+    result = {"tick_ms_median": medians, "torch_over_onnxruntime": ratio, "samples_ms": samples, "tagged": "measured"}
+    write_result(args.json, result)
+    if args.json != "-":
+        print(f"one core, {args.rounds} rounds, medians: " + ", ".join(f"{n} {m:.1f} ms" for n, m in medians.items()))
+        print(f"PyTorch takes {ratio:.2f} times as long (median of the pairs)")
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
