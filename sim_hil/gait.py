@@ -114,6 +114,16 @@ def _slew(value: float, target: float, step: float) -> float:
     return value + _clip(target - value, -step, step)
 
 
+def _near(value: float, centre: float, reach: float) -> float:
+    """The value, no further than `reach` from the centre."""
+    return _clip(value, centre - reach, centre + reach)
+
+
+def _small(error: float, bound: float) -> float:
+    """The error while it is small, else zero: a large one means being held, and must not be integrated."""
+    return error if abs(error) < bound else 0.0
+
+
 def limit_command(config: GaitConfig, command: Vec3) -> Vec3:
     """Clip (vx, vy, wz) to what this gait can do without falling."""
     low, high = config.vx_limits_mps
@@ -139,12 +149,6 @@ def step_gait(
             walking=True, phase=0.0, lifted=state.feet, heading_rad=body.yaw_rad, integral=(0.0, 0.0), idle_s=0.0
         )
 
-    linear, turn = config.accel_mps2 * dt_s, config.alpha_radps2 * dt_s
-    smooth = (
-        _slew(state.smooth[0], wanted[0], linear),
-        _slew(state.smooth[1], wanted[1], linear),
-        _slew(state.smooth[2], wanted[2], turn),
-    )
     # The body surges and rocks within a step: feedback must see the average over one, not the ripple.
     blend = 1.0 - exp(-dt_s / (0.35 * config.period_s))
     filtered = (
@@ -152,14 +156,23 @@ def step_gait(
         state.filtered[1] + blend * (body.vy_mps - state.filtered[1]),
         state.filtered[2] + blend * (body.yaw_rate_radps - state.filtered[2]),
     )
+    # A robot held by a wall must not push harder and harder: the wish stays near what is achieved, and it eases off as
+    # the body tilts. On a free floor neither limit is ever reached.
+    ease = _clip(1.0 - (abs(body.roll_rad) + abs(body.pitch_rad) - 0.12) / 0.25, 0.0, 1.0)
+    linear, turn = config.accel_mps2 * dt_s, config.alpha_radps2 * dt_s
+    smooth = (
+        _slew(state.smooth[0], _near(wanted[0] * ease, filtered[0], 0.4), linear),
+        _slew(state.smooth[1], _near(wanted[1] * ease, filtered[1], 0.3), linear),
+        _slew(state.smooth[2], _near(wanted[2] * ease, filtered[2], 0.8), turn),
+    )
     error_x, error_y = smooth[0] - filtered[0], smooth[1] - filtered[1]
     integral = (
-        _clip(state.integral[0] + 0.9 * error_x * dt_s, -0.35, 0.35),
-        _clip(state.integral[1] + 0.9 * error_y * dt_s, -0.25, 0.25),
+        _clip(state.integral[0] + 0.9 * _small(error_x, 0.3) * dt_s, -0.25, 0.25),
+        _clip(state.integral[1] + 0.9 * _small(error_y, 0.2) * dt_s, -0.2, 0.2),
     )
     # Heading is followed rather than yaw rate: a straight command then stays straight over any distance. The lag is
     # bounded, so that a robot held by a wall does not spin when it comes free.
-    lag = _clip(_wrap(state.heading_rad + smooth[2] * dt_s - body.yaw_rad), -0.25, 0.25)
+    lag = _clip(_wrap(state.heading_rad + smooth[2] * dt_s - body.yaw_rad), -0.18, 0.18)
     heading = body.yaw_rad + lag
     carry = (
         smooth[0] + integral[0] + 0.15 * error_x,
@@ -246,20 +259,9 @@ def _feet(
         else:
             swing = (own - config.stance_ratio) / (1.0 - config.stance_ratio)
             # Raibert: neutral point from the measured velocity, plus a correction of the velocity error.
-            land_x = (
-                home[0]
-                + filtered[0] * half_stance
-                + 0.10 * (body.vx_mps - smooth[0])
-                - carry[2] * home[1] * half_stance
-            )
-            land_y = (
-                home[1]
-                + filtered[1] * half_stance
-                + 0.12 * (body.vy_mps - smooth[1])
-                + carry[2] * home[0] * half_stance
-            )
-            land_x = _clip(land_x, home[0] - 0.13, home[0] + 0.13)
-            land_y = _clip(land_y, home[1] - 0.08, home[1] + 0.08)
+            step_x = (filtered[0] - carry[2] * home[1]) * half_stance + 0.10 * (body.vx_mps - smooth[0])
+            step_y = (filtered[1] + carry[2] * home[0]) * half_stance + 0.12 * (body.vy_mps - smooth[1])
+            land_x, land_y = home[0] + _clip(step_x, -0.13, 0.13), home[1] + _clip(step_y, -0.11, 0.11)
             reach = min(swing / 0.9, 1.0)  # arrive early, so that the foot does not slide on touch-down
             blend = reach - sin(2 * pi * reach) / (2 * pi)
             x, y = lift[0] + (land_x - lift[0]) * blend, lift[1] + (land_y - lift[1]) * blend

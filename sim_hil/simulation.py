@@ -55,7 +55,8 @@ class Simulation:
         # The floor reaches beyond the walls, so that nothing can ever fall off the world.
         ground = Box(((x0 + x1) / 2, (y0 + y1) / 2, -0.5), (1.0, 0.0), (x1 - x0 + 10, y1 - y0 + 10, 1.0))
         self._floor = self._static(ground, friction=0.9)
-        self._labels = {self._static(box, friction=0.4): label for label, box in scene.obstacles()}
+        # Slippery sides: with friction, a foot that brushes a wall climbs it and the robot topples over its own leg.
+        self._labels = {self._static(box, friction=0.1): label for label, box in scene.obstacles()}
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_HEIGHT_M, physicsClientId=client
         )
