@@ -1,0 +1,277 @@
+"""`edge-hil`: the simulated robot on the other end of a real protocol, in real time.
+
+One loop: wait on the bus until the next 4 ms batch is due, answer requests, step the physics to where real time is,
+publish. The camera renders in its own process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from firmware_bridge.config import ConfigError, DdsConfig
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.dds import Bus, DdsError
+from sim_hil.scene import Scene, SceneError, load_scene, scene_names
+from sim_hil.simulation import Simulation
+from sim_hil.trace import TraceWriter
+from sim_hil.unitree import sport
+from sim_hil.unitree.camera_process import CameraProcess, CameraProcessError
+from sim_hil.unitree.service import Received, ServiceServer
+from sim_hil.unitree.state import OdometryFrame, StatePublishers
+
+BATCH_NS: Final = 4_000_000
+MAX_LAG_NS: Final = 200_000_000  # behind by more than this, the simulated world falls behind instead of racing
+POSE_HZ: Final = 10
+PEOPLE_HZ: Final = 5
+_STEPS_PER_S: Final = round(1 / Simulation.DT_S)
+_STEP_NS: Final = 1_000_000_000 // _STEPS_PER_S
+
+EPILOG: Final = """examples:
+  edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
+  edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
+exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the camera process died or the trace could not be written;
+2 bad arguments"""
+
+
+class Go2Hil:
+    """A simulated Go2 answering the Unitree protocol. Raises DdsError, CameraProcessError, ValueError at the start."""
+
+    def __init__(self, scene: Scene, args: argparse.Namespace, dds: DdsConfig, trace: TraceWriter | None) -> None:
+        self._scene = scene
+        self._args = args
+        self._trace = trace
+        self._simulation = Simulation(scene, people=args.people, seed=args.seed, **({"gui": True} if args.gui else {}))
+        try:
+            self._bus = Bus(dds)
+            self._camera = CameraProcess(
+                scene.name,
+                people=args.people,
+                seed=args.seed,
+                size=args.camera,
+                dds=dds,
+                state_length=len(self._simulation.render_state()),
+            )
+        except BaseException:
+            self._simulation.close()
+            raise
+        self._sport = ServiceServer(self._bus, ids.SPORT_SERVICE)
+        self._robot_state = ServiceServer(self._bus, sport.ROBOT_STATE_SERVICE)
+        self._motion_switcher = ServiceServer(self._bus, sport.MOTION_SWITCHER_SERVICE)
+        servers = (self._sport, self._robot_state, self._motion_switcher)
+        self._waitset = self._bus.waitset(*(server.reader for server in servers))
+        self._publishers = StatePublishers(self._bus, OdometryFrame(scene.start), _STEPS_PER_S)
+        self._log = sport.CommandLog()
+        self._steps = 0
+        self._lost_ns = 0
+        self._video_frames = 0
+        self._path_m = 0.0
+        self._last_xy: tuple[float, float] | None = None
+        self.summary: dict[str, object] = {}
+
+    def start(self) -> None:
+        """Wait for the camera and write the trace's first line. Raises CameraProcessError."""
+        self._camera.show(self._simulation.render_state())
+        self._camera.wait_ready()
+        footprints = [
+            {"label": f.label, "kind": f.kind, "polygon": [list(map(float, corner)) for corner in f.polygon]}
+            for f in self._scene.footprints()
+        ]
+        start, goal = list(self._scene.start), list(self._scene.goal_xy)
+        self._note("scene", name=self._scene.name, start=start, goal=goal, footprints=footprints)
+
+    def run(self, stop: list[int], duration_s: float | None) -> None:
+        """Simulate in real time until a signal number appears in `stop`. Raises CameraProcessError."""
+        begin_ns = schedule_ns = next_ns = time.monotonic_ns()
+        end_ns = None if duration_s is None else begin_ns + int(duration_s * 1e9)
+        try:
+            while not stop and (end_ns is None or time.monotonic_ns() < end_ns):
+                left_ns = next_ns - time.monotonic_ns()
+                if left_ns > 0:
+                    self._waitset.wait(left_ns)  # wakes up early for a request
+                self._serve()
+                now_ns = time.monotonic_ns()
+                if now_ns < next_ns:
+                    continue
+                lag_ns = now_ns - schedule_ns - self._steps * _STEP_NS
+                if lag_ns > MAX_LAG_NS:
+                    schedule_ns += lag_ns - MAX_LAG_NS
+                for _ in range(min(lag_ns, MAX_LAG_NS) // _STEP_NS):
+                    self._step()
+                self._camera.show(self._simulation.render_state())
+                next_ns = max(next_ns + BATCH_NS, now_ns)
+        finally:
+            self._summarise((time.monotonic_ns() - begin_ns) / 1e9)
+
+    def close(self) -> None:
+        """End the camera process and the simulation."""
+        self._camera.close()
+        self._simulation.close()
+
+    def _serve(self) -> None:
+        for request in self._sport.serve(lambda api, text: sport.handle_sport(self._simulation, api, text)):
+            self._heard(request)
+        for request in self._robot_state.serve(sport.handle_robot_state):
+            self._heard(request)
+        for request in self._motion_switcher.serve(sport.handle_motion_switcher):
+            self._heard(request)
+        for event in self._camera.events():
+            if event["event"] == "frame":
+                self._video_frames += 1
+            elif event["event"] == "request":
+                t_ns, api_id, parameter = event["t_ns"], event["api_id"], event["parameter"]
+                assert isinstance(t_ns, int) and isinstance(api_id, int) and isinstance(parameter, str)
+                self._heard(Received(t_ns, ids.VIDEO_SERVICE, api_id, parameter, 0, noreply=False))
+
+    def _heard(self, request: Received) -> None:
+        self._log.note(request)
+        if self._trace is not None:
+            self._trace.put(
+                request.received_ns,
+                "wire",
+                service=request.service,
+                api_id=request.api_id,
+                name=sport.api_name(request.service, request.api_id),
+                parameter=request.parameter,
+            )
+
+    def _step(self) -> None:
+        self._simulation.step()
+        self._steps += 1
+        step = self._steps
+        due = self._publishers.due(step)
+        if due:
+            self._publishers.publish(due, self._simulation.truth())
+        if step % (_STEPS_PER_S // POSE_HZ) == 0:
+            self._note_pose()
+        if step % (_STEPS_PER_S // PEOPLE_HZ) == 0:
+            self._note("people", poses=[[float(v) for v in row] for row in self._simulation.people()])
+
+    def _note_pose(self) -> None:
+        truth = self._simulation.truth()
+        x, y, z = (float(v) for v in truth.position_m)
+        theta = float(truth.rpy_rad[2])
+        vx_world, vy_world = float(truth.velocity_world_mps[0]), float(truth.velocity_world_mps[1])
+        if self._last_xy is not None:
+            self._path_m += math.hypot(x - self._last_xy[0], y - self._last_xy[1])
+        self._last_xy = (x, y)
+        wz = float(truth.gyro_radps[2])
+        self._note("pose", x=x, y=y, z=z, theta=theta, vx=vx_world, vy=vy_world, wz=wz, mode=truth.mode)
+
+    def _note(self, kind: str, **fields: object) -> None:
+        if self._trace is not None:
+            self._trace.put(time.monotonic_ns(), kind, **fields)
+
+    def _summarise(self, duration_s: float) -> None:
+        self.summary = {
+            "robot": self._args.robot,
+            "scene": self._scene.name,
+            "seed": self._args.seed,
+            "people": self._args.people,
+            "duration_s": round(duration_s, 3),
+            "real_time_factor": round(self._steps * Simulation.DT_S / duration_s, 4) if duration_s > 0 else 0.0,
+            "wire": self._log.summary(),
+            "path_m": round(self._path_m, 3),
+            "fell": self._simulation.fell,
+            "collisions": sorted(self._simulation.collided_with()),
+            "video_frames": self._video_frames,
+            "state_hz": round(self._publishers.sport_states_sent / duration_s, 2) if duration_s > 0 else 0.0,
+        }
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """A list that receives the number of every SIGINT and SIGTERM."""
+    received: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, _frame: received.append(signum))
+    yield received
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """`WxH` in pixels; raises argparse.ArgumentTypeError."""
+    width, times, height = text.partition("x")
+    if not (times and width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected WxH such as 320x240, found {text!r}")
+    if not (32 <= int(width) <= 1920 and 32 <= int(height) <= 1080):
+        raise argparse.ArgumentTypeError(f"expected 32x32 to 1920x1080, found {text}")
+    return int(width), int(height)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="edge-hil",
+        description="A simulated robot that answers its maker's protocol, in real time.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--robot", required=True, choices=("go2",), help="which robot")
+    parser.add_argument("--scene", required=True, metavar="NAME", help=f"one of: {', '.join(scene_names())}")
+    parser.add_argument("--protocol", required=True, choices=("unitree",), help="what it speaks")
+    parser.add_argument("--people", type=int, default=0, metavar="N", help="walking people (default 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the people (default 0)")
+    parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
+    parser.add_argument("--domain", type=int, default=0, metavar="N", help="DDS domain (default 0)")
+    parser.add_argument("--interface", default="lo", help="network interface (default lo)")
+    parser.add_argument("--camera", type=parse_size, default=(320, 240), metavar="WxH", help="default 320x240")
+    parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    parser.add_argument("--gui", action="store_true", help="show the physics in a window")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; see EPILOG for the exit codes."""
+    args = _parser().parse_args(argv)
+    try:
+        if args.gui and not os.environ.get("DISPLAY"):
+            raise ConfigError("--gui: expected a display, DISPLAY is not set; run without --gui or on a desktop")
+        if args.duration is not None and not 0 < args.duration < math.inf:
+            raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
+        dds = DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ())
+        scene = load_scene(args.scene)
+        trace = None if args.trace is None else TraceWriter(args.trace)
+        with stop_signals() as stop:
+            hil = Go2Hil(scene, args, dds, trace)
+            code = _run(hil, stop, args, dds)
+    except (ConfigError, SceneError, DdsError, ValueError, OSError) as error:
+        sys.stderr.write(f"edge-hil: {error}\n")
+        return 2
+    if trace is not None:
+        trace.close(time.monotonic_ns(), **hil.summary)
+        if trace.error is not None:
+            sys.stderr.write(f"edge-hil: trace {args.trace} is incomplete: {trace.error}\n")
+            code = 1
+    text = json.dumps(hil.summary, indent=2) + "\n"
+    if args.json == "-":
+        sys.stdout.write(text)
+    elif args.json:
+        Path(args.json).write_text(text, encoding="utf-8")
+    return code
+
+
+def _run(hil: Go2Hil, stop: list[int], args: argparse.Namespace, dds: DdsConfig) -> int:
+    try:
+        hil.start()
+        sys.stderr.write(f"edge-hil: ready, domain {dds.domain} on {dds.interface}\n")
+        sys.stderr.flush()
+        hil.run(stop, args.duration)
+    except CameraProcessError as error:
+        sys.stderr.write(f"edge-hil: {error}\n")
+        return 1
+    finally:
+        hil.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,74 @@
+"""One float64 array shared with another process: the newest value, never a torn one, and nobody ever waits.
+
+The memory is an anonymous file passed down as a descriptor, so nothing is left behind by a process that is killed.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import zlib
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+_HEADER: Final = struct.Struct("<QI")  # sequence number (0: nothing yet), CRC-32 of sequence and data
+_TRIES: Final = 100
+
+
+def _crc(sequence: int, data: bytes) -> int:
+    return zlib.crc32(data, sequence & 0xFFFFFFFF)
+
+
+class SnapshotWriter:
+    """The writing end; `fd` goes to the reader's process."""
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        self._sequence = 0
+        size = _HEADER.size + 8 * length
+        self.fd = os.memfd_create("edge-hil-pose")
+        os.ftruncate(self.fd, size)
+        self._memory = mmap.mmap(self.fd, size)
+
+    def write(self, values: NDArray[np.float64]) -> None:
+        """Replace the value. Raises ValueError for another length."""
+        if values.shape != (self._length,):
+            raise ValueError(f"snapshot holds {self._length} numbers, got shape {values.shape}")
+        data = values.astype("<f8").tobytes()
+        self._sequence += 1
+        self._memory[:] = _HEADER.pack(self._sequence, _crc(self._sequence, data)) + data
+
+    def close(self) -> None:
+        """Release the memory and the descriptor."""
+        self._memory.close()
+        os.close(self.fd)
+
+
+class SnapshotReader:
+    """The reading end, of the descriptor it was given."""
+
+    def __init__(self, fd: int, length: int) -> None:
+        size = _HEADER.size + 8 * length
+        found = os.fstat(fd).st_size
+        if found != size:
+            raise ValueError(f"shared memory has {found} bytes, {length} numbers need {size}")
+        self._memory = mmap.mmap(fd, size, prot=mmap.PROT_READ)
+
+    def read(self) -> NDArray[np.float64] | None:
+        """The newest whole value; None before the first. A copy caught half-written fails its CRC and is repeated."""
+        for _ in range(_TRIES):
+            content = bytes(self._memory[:])
+            sequence, crc = _HEADER.unpack_from(content)
+            if sequence == 0:
+                return None
+            data = content[_HEADER.size :]
+            if _crc(sequence, data) == crc:
+                return np.frombuffer(data, dtype="<f8").astype(np.float64)
+        raise RuntimeError(f"no consistent snapshot in {_TRIES} tries; is the writer alive?")
+
+    def close(self) -> None:
+        """Release the memory."""
+        self._memory.close()

@@ -1,0 +1,223 @@
+"""The simulated Go2's state topics: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from cyclonedds.pub import DataWriter
+
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.crc import low_state_crc
+from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
+from firmware_bridge.unitree.idl import (
+    BmsState_,
+    IMUState_,
+    LowState_,
+    MotorState_,
+    PathPoint_,
+    SportModeState_,
+    TimeSpec_,
+)
+from sim_hil.go2 import RobotTruth
+
+SPORT_STATE_HZ: Final = 50
+LOW_STATE_HZ: Final = 500
+LF_HZ: Final = 20  # the maker names no number; owners report 15 to 20
+_MATCH_CHECK_HZ: Final = 10
+_MOTORS: Final = 20
+_MOTORS_USED: Final = 12
+_FOOT_RAISE_M: Final = 0.09  # the maker's sample
+
+
+class OdometryFrame:
+    """The frame a Go2 reports its pose in: where it stood and which way it looked when it was switched on."""
+
+    def __init__(self, start: tuple[float, float, float]) -> None:
+        """`start`: T_world_odom as (x_m, y_m, theta_rad)."""
+        self._x_m, self._y_m, self._theta_rad = start
+        self._cos, self._sin = math.cos(start[2]), math.sin(start[2])
+
+    def rotate(self, vector: Any) -> list[float]:
+        """A world vector [3] in the odometry frame."""
+        x, y, z = (float(v) for v in vector)
+        return [self._cos * x + self._sin * y, self._cos * y - self._sin * x, z]
+
+    def position(self, position_m: Any) -> list[float]:
+        """A world position [3] in the odometry frame."""
+        x, y, z = (float(v) for v in position_m)
+        return self.rotate((x - self._x_m, y - self._y_m, z))
+
+    def rpy(self, rpy_rad: Any) -> list[float]:
+        """Roll, pitch and yaw [3], yaw from the odometry frame in (-pi, pi]."""
+        roll, pitch, yaw = (float(v) for v in rpy_rad)
+        turned = yaw - self._theta_rad
+        return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
+
+    def quaternion(self, wxyz: Any) -> list[float]:
+        """An orientation (w, x, y, z) in the odometry frame."""
+        w, x, y, z = (float(v) for v in wxyz)
+        c, s = math.cos(-self._theta_rad / 2), math.sin(-self._theta_rad / 2)
+        return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+
+
+def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
+    """The IMU part of both messages."""
+    return IMUState_(
+        odometry.quaternion(truth.quaternion_wxyz),
+        truth.gyro_radps.tolist(),
+        truth.accel_mps2.tolist(),
+        odometry.rpy(truth.rpy_rad),
+        temperature=40,  # degrees C; no thermal model
+    )
+
+
+def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame) -> SportModeState_:
+    """`rt/sportmodestate`: position and velocity in the odometry frame, as the maker's MuJoCo simulator has them."""
+    seconds = int(truth.time_s)
+    return SportModeState_(
+        stamp=TimeSpec_(seconds, int((truth.time_s - seconds) * 1e9)),
+        error_code=0,
+        imu_state=imu_state(truth, odometry),
+        mode=truth.mode,
+        progress=0.0,
+        gait_type=truth.gait_type,
+        foot_raise_height=_FOOT_RAISE_M,
+        position=odometry.position(truth.position_m),
+        body_height=truth.body_height_m,
+        velocity=odometry.rotate(truth.velocity_world_mps),
+        yaw_speed=float(truth.gyro_radps[2]),
+        range_obstacle=[0.0] * 4,  # this robot has no range sensor; zero is what the maker's simulator sends
+        foot_force=_foot_force(truth),
+        foot_position_body=truth.foot_position_body_m.ravel().tolist(),
+        foot_speed_body=truth.foot_velocity_body_mps.ravel().tolist(),
+        path_point=[PathPoint_(*([0.0] * 7)) for _ in range(10)],
+    )
+
+
+def _foot_force(truth: RobotTruth) -> list[int]:
+    return [max(-32768, min(32767, round(float(force)))) for force in truth.foot_force_n]
+
+
+class LowStateMessage:
+    """One LowState, refilled for every step: building 20 motors anew 500 times a second would cost too much."""
+
+    def __init__(self) -> None:
+        motors = [
+            MotorState_(
+                mode=1 if index < _MOTORS_USED else 0,
+                **dict.fromkeys(("q", "dq", "ddq", "tau_est", "q_raw", "dq_raw", "ddq_raw"), 0.0),
+                temperature=30,  # degrees C; no thermal model
+                lost=0,
+                reserve=[0, 0],
+            )
+            for index in range(_MOTORS)
+        ]
+        imu = IMUState_([1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3, [0.0] * 3, 40)
+        # No battery model: full, at its nominal 28.8 V.
+        battery = BmsState_(0, 0, 8, 100, 0, 0, b"\x1e\x1e", b"\x1e\x1e", [3600] * 8 + [0] * 7)
+        self.message = LowState_(
+            head=b"\xfe\xef",
+            level_flag=0xFF,
+            frame_reserve=0,
+            sn=[0, 0],
+            version=[0, 0],
+            bandwidth=0,
+            imu_state=imu,
+            motor_state=motors,
+            bms_state=battery,
+            foot_force=[0] * 4,
+            foot_force_est=[0] * 4,
+            tick=0,
+            wireless_remote=bytes(40),
+            bit_flag=0,
+            adc_reel=0.0,
+            temperature_ntc1=30,
+            temperature_ntc2=30,
+            power_v=28.8,
+            power_a=0.0,
+            fan_frequency=[0] * 4,
+            reserve=0,
+            crc=0,
+        )
+
+    def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
+        """The message for this instant, checksum included."""
+        message = self.message
+        message.imu_state = imu_state(truth, odometry)
+        rows = zip(truth.joint_q_rad.tolist(), truth.joint_dq_radps.tolist(), truth.joint_tau_nm.tolist(), strict=True)
+        for motor, (q_rad, dq_radps, tau_nm) in zip(message.motor_state, rows, strict=False):
+            motor.q = motor.q_raw = q_rad
+            motor.dq = motor.dq_raw = dq_radps
+            motor.tau_est = tau_nm
+        message.foot_force = message.foot_force_est = _foot_force(truth)
+        message.tick = round(truth.time_s * 1000) & 0xFFFFFFFF
+        message.crc = low_state_crc(message)
+        return message
+
+
+class _Periodic:
+    """A writer that fires every `every` steps while somebody reads, looked up ten times a second."""
+
+    def __init__(self, writer: DataWriter[Any], every: int, steps_per_s: int, *, always: bool) -> None:
+        self._writer = writer
+        self._always = always
+        self._every = every
+        self._check_every = steps_per_s // _MATCH_CHECK_HZ
+        self._wanted = False
+        self.sent = 0
+
+    def due(self, step: int) -> bool:
+        if self._always:
+            return step % self._every == 0
+        if step % self._check_every == 0:
+            self._wanted = bool(self._writer.get_matched_subscriptions())
+        return self._wanted and step % self._every == 0
+
+    def write(self, message: Any) -> None:
+        try:
+            self._writer.write(message)
+        except DDS_ERRORS:
+            return  # a reader's queue is full: the next sample replaces this one
+        self.sent += 1
+
+
+class StatePublishers:
+    """Publishes what is due at each physics step; low states are computed for a reader only."""
+
+    def __init__(self, bus: Bus, odometry: OdometryFrame, steps_per_s: int) -> None:
+        def periodic(topic: str, kind: Any, rate_hz: int, *, always: bool = False) -> _Periodic:
+            return _Periodic(bus.writer(topic, kind), max(steps_per_s // rate_hz, 1), steps_per_s, always=always)
+
+        self._odometry = odometry
+        self._low_message = LowStateMessage()
+        self._sport = (
+            periodic(ids.SPORT_STATE_TOPIC, SportModeState_, SPORT_STATE_HZ, always=True),  # its rate is reported
+            periodic("rt/lf/sportmodestate", SportModeState_, LF_HZ),
+        )
+        self._low = (
+            periodic(ids.LOW_STATE_TOPIC, LowState_, LOW_STATE_HZ),
+            periodic("rt/lf/lowstate", LowState_, LF_HZ),
+        )
+
+    def due(self, step: int) -> list[_Periodic]:
+        """Which topics want a sample after this physics step; hand the list to `publish`."""
+        return [topic for topic in (*self._sport, *self._low) if topic.due(step)]
+
+    def publish(self, due: list[_Periodic], truth: RobotTruth) -> None:
+        """Write one instant to the topics that are due."""
+        sport = [topic for topic in due if topic in self._sport]
+        if sport:
+            state = sport_mode_state(truth, self._odometry)
+            for topic in sport:
+                topic.write(state)
+        low = [topic for topic in due if topic in self._low]
+        if low:
+            message = self._low_message.fill(truth, self._odometry)
+            for topic in low:
+                topic.write(message)
+
+    @property
+    def sport_states_sent(self) -> int:
+        """Samples written to `rt/sportmodestate`."""
+        return self._sport[0].sent
