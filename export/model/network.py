@@ -12,7 +12,7 @@ from export.model.value import ValueNetwork
 from export.model.vision import VisionEncoder
 
 INIT_STD = 0.02
-HEAD_STD = 1e-3
+HEAD_STD = 3e-4
 
 
 class TicVla(nn.Module):
