@@ -125,6 +125,7 @@ def start_demo(out: Path, runner_mood: str) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, "-c", RUN_WITH_FAKES, str(out), runner_mood],
         cwd=REPOSITORY,
+        env={**os.environ, "TMPDIR": str(out)},  # what a killed demo cannot remove goes with the test's folder
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

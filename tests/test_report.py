@@ -82,7 +82,7 @@ def test_the_models_text_cannot_act_on_the_page(html: str) -> None:
     assert "<script>alert" not in html
     assert "\u202e" not in html
     shown = "".join(_parse(html).text)
-    assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left␇ & <b>go</b> \U0001f916' in shown
+    assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left⟨U+0007⟩ & <b>go</b> \U0001f916' in shown
 
 
 @given(st.text(st.characters(), max_size=200))
@@ -166,6 +166,14 @@ def test_an_anchor_frame_missing_from_the_log_fails_the_delay_check(tmp_path: Pa
     found = _checks_of(tmp_path, semantics=semantics)
     assert not found["delay_error_ms"].passed
     assert "is not in the log" in found["delay_error_ms"].note
+
+
+def test_a_now_outside_its_tick_fails_the_delay_check(tmp_path: Path) -> None:
+    ticks = synthetic_run.tick_records(12.0)
+    ticks[-1]["now_ns"] += 60_000_000  # and a Δt that agrees with it
+    ticks[-1]["delay_s"] += 0.06
+    found = _checks_of(tmp_path, ticks=ticks)
+    assert not found["delay_error_ms"].passed and "outside the tick" in found["delay_error_ms"].note
 
 
 def test_a_run_without_any_generation_fails_the_delay_check(tmp_path: Path) -> None:

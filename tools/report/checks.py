@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.report.run_data import FlightLog, Record, RunData, Trace
+from tools.report.run_data import FlightLog, Record, RunData, Trace, percentile
 
 DELTA_T_TOLERANCE_MS = 1.0
 TICKS_PER_60_S = 590
@@ -59,7 +59,8 @@ def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
     """Per tick with a semantic state: |recorded Δt − (now − capture stamp of the anchor frame)| in ms, and problems.
 
     The capture stamp is the log time of the camera frame the generation names as its newest, not the anchor the
-    runner subtracted; a frame or generation that is not in the log is a problem, since nothing can be shown then.
+    runner subtracted; a frame or generation that is not in the log is a problem, since nothing can be shown then, and
+    so is a `now` outside the tick it belongs to.
     """
     newest_frame_ns = {s["generation"]: s["frames_ns"][-1] for s in log.semantics if s["frames_ns"]}
     errors_ms: list[float] = []
@@ -74,6 +75,8 @@ def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
             problems.append(f"tick {tick['tick']}: anchor frame {anchor_ns} is not in the log")
         elif tick["delay_s"] is None:
             problems.append(f"tick {tick['tick']}: uses a generation but records no Δt")
+        elif not 0 <= tick["now_ns"] - tick["start_ns"] <= tick["duration_ms"] * 1e6:
+            problems.append(f"tick {tick['tick']}: its now lies outside the tick")
         else:
             errors_ms.append(abs(tick["delay_s"] * 1e3 - (tick["now_ns"] - anchor_ns) / 1e6))
     return errors_ms, problems
@@ -149,7 +152,7 @@ def acceptance(data: RunData) -> list[Check]:
         _at_most(
             "tick_p99_ms",
             "Control tick, deadline to command sent, 99th percentile",
-            round(float(np.percentile(log.tick_ms, 99)), 3),
+            round(percentile(log.tick_ms, 99), 3),
             TICK_P99_LIMIT_MS,
             "ms",
         ),

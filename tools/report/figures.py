@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import StrMethodFormatter
 
-from tools.report.run_data import Array, Record, RunData, odometry_in_world
+from tools.report.run_data import Array, Record, RunData, odometry_in_world, percentile
 
 INK = "#1d2733"
 MUTED = "#6b7785"
@@ -66,11 +66,13 @@ def close_up(data: RunData) -> bytes | None:
     """The same around the path alone; None when the path fills most of the whole picture anyway."""
     scene = np.concatenate([np.asarray(f["polygon"], float) for f in data.trace.scene["footprints"]])
     low, high = data.trace.pose[:, :2].min(axis=0) - 1.5, data.trace.pose[:, :2].max(axis=0) + 1.5
-    if np.prod(high - low) > 0.5 * np.prod(np.ptp(scene, axis=0)):
-        return None
     # Wide rather than tall, and never a strip: the page is wide.
     lack = np.maximum(0.0, np.array([2.2, 0.35]) * (high - low)[::-1] - (high - low)) / 2
-    return _seen_from_above(data, low - lack, high + lack)
+    low = np.maximum(low - lack, scene.min(axis=0) - 0.4)
+    high = np.minimum(high + lack, scene.max(axis=0) + 0.4)
+    if np.prod(high - low) > 0.5 * np.prod(np.ptp(scene, axis=0)):
+        return None
+    return _seen_from_above(data, low, high)
 
 
 def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
@@ -82,7 +84,7 @@ def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
     _draw_people(axes, data.trace.people)
     path = _draw_path(axes, data.trace.pose, (data.trace.pose_ns - data.log.start_ns) / 1e9)
     _, odometry = odometry_in_world(data)
-    axes.plot(odometry[:, 0], odometry[:, 1], color=COMMAND, linewidth=1.0, linestyle=(0, (4, 2)), zorder=6)
+    axes.plot(odometry[:, 0], odometry[:, 1], color=COMMAND, linewidth=1.6, linestyle=(0, (4, 3)), zorder=6)
     _draw_start_goal(axes, data.trace.scene, data.trace.pose[-1])
     axes.set_aspect("equal")
     axes.set_xlim(low[0], high[0])
@@ -173,7 +175,7 @@ def _draw_people(axes: Axes, people: Sequence[Array]) -> None:
 def _draw_path(axes: Axes, pose: Array, time_s: Array) -> LineCollection:
     points = pose[:, :2]
     path = LineCollection(
-        np.stack([points[:-1], points[1:]], axis=1).tolist(), cmap="viridis", linewidth=3.0, zorder=5, capstyle="round"
+        np.stack([points[:-1], points[1:]], axis=1).tolist(), cmap="viridis", linewidth=4.0, zorder=5, capstyle="round"
     )
     path.set_array(time_s[:-1])
     axes.add_collection(path)
@@ -198,7 +200,7 @@ def tick_histogram(durations_ms: Array) -> bytes:
     """Duration of every control tick with the 100 ms deadline; counts on a log scale, so that one outlier shows."""
     figure = _figure(5.4, 3.1)
     axes = figure.add_subplot()
-    p50, p99 = np.percentile(durations_ms, [50, 99])
+    p50, p99 = percentile(durations_ms, 50), percentile(durations_ms, 99)
     right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
     axes.hist(durations_ms, bins=np.arange(0, right + 1, max(1.0, right / 200)).tolist(), color=TRUTH, log=True)
     axes.axvline(_DEADLINE_MS, color="#b3261e", linewidth=1.6, label="deadline 100 ms")
@@ -220,7 +222,7 @@ def delay_histogram(delays_s: Array) -> bytes:
     figure = _figure(5.4, 3.1)
     axes = figure.add_subplot()
     if len(delays_s):
-        p50, p99 = np.percentile(delays_s, [50, 99])
+        p50, p99 = percentile(delays_s, 50), percentile(delays_s, 99)
         # Ticks are 0.1 s apart, so a finer bin would show the comb of the ticks instead of the delay.
         axes.hist(delays_s, bins=np.arange(0, delays_s.max() + 0.1, 0.1).tolist(), color=PERSON)
         axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.2f} s")
@@ -248,7 +250,9 @@ def time_line(data: RunData) -> bytes:
     delay.set_ylabel("Δt in s", fontsize=9)
     delay.set_ylim(bottom=0)
     for axes, true, axis, unit in ((speed, 0, 0, "forward, m/s"), (turn, 2, 2, "turn rate, rad/s")):
-        axes.plot(pose_s[driven], data.trace.velocity[driven, true], color=TRUTH, linewidth=1.0, label="true")
+        velocity = data.trace.velocity[driven, true]
+        axes.plot(pose_s[driven], velocity, color=TRUTH, linewidth=0.6, alpha=0.4, label="true")
+        axes.plot(pose_s[driven], _smooth(velocity), color=TRUTH, linewidth=1.4, label="true, mean of 1 s")
         axes.step(tick_s, command[:, axis], where="post", color=COMMAND, linewidth=1.2, label="commanded")
         axes.set_ylabel(unit, fontsize=9)
         _legend_above(axes)
@@ -258,6 +262,12 @@ def time_line(data: RunData) -> bytes:
             axes.axvspan(start_s, end_s, color="#f3e3c3", alpha=0.7, linewidth=0)
         _tidy(axes)
     return _png(figure)
+
+
+def _smooth(values: Array, width: int = 10) -> Array:
+    """Moving mean over `width` samples (1 s of poses): a trotting body sways with every step."""
+    window = np.ones(width)
+    return np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same")
 
 
 def _spans(time_s: Array, flags: Sequence[bool]) -> list[tuple[float, float]]:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from tools.report.checks import moved_under_command_m
-from tools.report.run_data import Record, RunData, odometry_in_world, truth_at
+from tools.report.run_data import Record, RunData, odometry_in_world, percentile, truth_at
 
 RUNNER = "edge-run, its own clock"
 LOG = "flight log"
@@ -97,6 +97,7 @@ def _reasoning(data: RunData) -> list[Number]:
         Number("release delay asked for", _release_delay(data), LOG, "setting"),
         Number("release delay applied, p50", _median(semantics, "release_delay_s", "s", 2), LOG),
         Number("Δt p50 / p99 / max", " / ".join(_value(delay_s[key]) for key in ("p50", "p99", "max")) + " s", RUNNER),
+        Number("Δt given against the instant of the call, worst", _call_error(run), RUNNER),
         Number("texts with readable waypoints", f"{sum(1 for s in semantics if s['waypoints'])}", LOG),
     ]
 
@@ -141,7 +142,7 @@ def _median(records: Sequence[Record], key: str, unit: str, digits: int = 1) -> 
 
 def _p99_max(records: Sequence[Record], key: str, unit: str) -> str:
     column = _column(records, key)
-    return f"{np.percentile(column, 99):.1f} / {max(column):.1f} {unit}" if column else "none"
+    return f"{percentile(np.array(column), 99):.1f} / {max(column):.1f} {unit}" if column else "none"
 
 
 def _release_delay(data: RunData) -> str:
@@ -149,6 +150,11 @@ def _release_delay(data: RunData) -> str:
     if not isinstance(asked, dict):
         return "not recorded"
     return f"mean {asked['mean_s']:g} s, sd {asked['sd_s']:g} s"
+
+
+def _call_error(run: Record) -> str:
+    """What the runner measured itself: time that passed between reading the clock and calling the action expert."""
+    return f"{_value(run.get('delay_error_ms', {}).get('max'))} ms"
 
 
 def _reasons(ticks: Sequence[Record]) -> str:

@@ -61,21 +61,18 @@ _SHOWN_CHARACTERS = 700
 
 
 def text_html(text: str, *, limit: int = _SHOWN_CHARACTERS) -> str:
-    """Untrusted text as inert HTML; what cannot be printed is shown as a visible symbol, not dropped."""
+    """Untrusted text as inert HTML; what cannot be printed is shown by its number, not dropped."""
     shown = "".join(_visible(character) for character in text[:limit])
     more = f" … ({len(text)} characters in all)" if len(text) > limit else ""
     return html.escape(shown, quote=True) + more
 
 
 def _visible(character: str) -> str:
-    code = ord(character)
     if character == "\n":
         return character
-    if code < 0x20:
-        return chr(0x2400 + code)
     # Cc control, Cf format (turns writing direction, joins invisibly), Cs half a surrogate pair, Co, Cn: no glyph
     if unicodedata.category(character) in {"Cc", "Cf", "Cs", "Co", "Cn"}:
-        return f"⟨U+{code:04X}⟩"
+        return f"⟨U+{ord(character):04X}⟩"
     return character
 
 
