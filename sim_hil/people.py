@@ -188,7 +188,7 @@ class People:
         self._advance(me, robot, axis, robot_gap, dt)
 
         speed = hypot(me.vx, me.vy)
-        if pace < 0.3 and speed < 0.25:
+        if speed < 0.2:
             me.blocked_s += dt
             if me.blocked_s > _BLOCKED_S:
                 me.turn_back()

@@ -1,0 +1,218 @@
+"""The simulated Go2 under physics: modes, tracking of commands, stopping, staying up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from math import degrees
+
+import numpy as np
+import pytest
+
+from sim_hil.scene import Scene, load_scene
+from sim_hil.simulation import Simulation, SportAction
+from sim_hil.sport import ERROR_NOT_STANDING
+
+
+@pytest.fixture(scope="module")
+def corridor() -> Scene:
+    return load_scene("corridor")
+
+
+@pytest.fixture
+def open_floor(corridor: Scene) -> Scene:
+    """A floor with nothing on it, to walk freely in any direction."""
+    return replace(corridor, walls=(), objects=(), routes=(), floor_min_m=(-30.0, -30.0), floor_max_m=(30.0, 30.0))
+
+
+@pytest.fixture
+def simulation(open_floor: Scene) -> Iterator[Simulation]:
+    simulation = Simulation(open_floor, people=0, seed=0)
+    yield simulation
+    simulation.close()
+
+
+def _run(simulation: Simulation, seconds: float, command: tuple[float, float, float] | None = None) -> None:
+    for index in range(round(seconds / Simulation.DT_S)):
+        if command is not None and index % 50 == 0:
+            simulation.move(*command)
+        simulation.step()
+
+
+def _stand(simulation: Simulation) -> None:
+    simulation.sport(SportAction.STAND_UP)
+    _run(simulation, 2.0)
+    simulation.sport(SportAction.BALANCE_STAND)
+    _run(simulation, 0.2)
+
+
+def _mean_body_velocity(simulation: Simulation, seconds: float, command: tuple[float, float, float]) -> np.ndarray:
+    """Mean (vx, vy, wz) over `seconds` under a command, from ground truth."""
+    samples = []
+    for _ in range(round(seconds / 0.02)):
+        _run(simulation, 0.02, command)
+        truth = simulation.truth()
+        c, s = np.cos(truth.rpy_rad[2]), np.sin(truth.rpy_rad[2])
+        vx, vy, _ = truth.velocity_world_mps
+        samples.append((c * vx + s * vy, -s * vx + c * vy, truth.gyro_radps[2]))
+    return np.mean(samples, axis=0)
+
+
+def test_robot_starts_lying(simulation: Simulation) -> None:
+    _run(simulation, 0.5)
+    truth = simulation.truth()
+    assert truth.mode == 5
+    assert truth.body_height_m < 0.12
+
+
+def test_stand_up_ends_locked_and_balance_stand_balances(simulation: Simulation) -> None:
+    assert simulation.sport(SportAction.STAND_UP) == 0
+    _run(simulation, 2.0)
+    truth = simulation.truth()
+    assert truth.mode == 6
+    assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
+    assert simulation.sport(SportAction.BALANCE_STAND) == 0
+    _run(simulation, 1.0)
+    truth = simulation.truth()
+    assert truth.mode == 1 and truth.gait_type == 0
+    assert np.abs(truth.rpy_rad[:2]).max() < 0.02
+    assert truth.foot_force_n.sum() == pytest.approx(15.2 * 9.81, rel=0.15)
+    assert truth.accel_mps2 == pytest.approx((0, 0, 9.81), abs=0.4)
+
+
+def test_balance_stand_is_refused_while_lying(simulation: Simulation) -> None:
+    assert simulation.sport(SportAction.BALANCE_STAND) == ERROR_NOT_STANDING
+
+
+@pytest.mark.parametrize("prepare", [(), (SportAction.STAND_UP,), (SportAction.DAMP,)])
+def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tuple[SportAction, ...]) -> None:
+    for action in prepare:
+        simulation.sport(action)
+    _run(simulation, 2.0)
+    before = simulation.truth()
+    _run(simulation, 1.0, (0.5, 0.0, 0.0))
+    after = simulation.truth()
+    assert after.mode == before.mode and after.commanded == (0, 0, 0)
+    assert np.linalg.norm(after.position_m - before.position_m) < 0.01
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.5, 0.8])
+def test_forward_speed_is_tracked_within_a_tenth_and_straight(simulation: Simulation, speed: float) -> None:
+    _stand(simulation)
+    _run(simulation, 1.5, (speed, 0.0, 0.0))
+    truth = simulation.truth()
+    assert truth.mode == 3 and truth.gait_type == 1 and truth.commanded == (speed, 0, 0)
+    yaw = truth.rpy_rad[2]
+    velocity = _mean_body_velocity(simulation, 3.0, (speed, 0.0, 0.0))
+    assert velocity[0] == pytest.approx(speed, rel=0.1)
+    assert abs(velocity[1]) < 0.03
+    assert abs(degrees(simulation.truth().rpy_rad[2] - yaw)) < 3.0
+
+
+@pytest.mark.parametrize("rate", [0.6, -0.6])
+def test_turning_rate_is_tracked_within_a_fifth(simulation: Simulation, rate: float) -> None:
+    _stand(simulation)
+    _run(simulation, 1.0, (0.0, 0.0, rate))
+    velocity = _mean_body_velocity(simulation, 3.0, (0.0, 0.0, rate))
+    assert velocity[2] == pytest.approx(rate, rel=0.2)
+    assert np.abs(velocity[:2]).max() < 0.05
+
+
+def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 1.5, (0.0, 0.2, 0.0))
+    assert simulation.truth().position_m[1] > 0.1
+    _run(simulation, 1.0, (0.0, 0.0, 0.5))
+    assert simulation.truth().rpy_rad[2] > 0.2
+
+
+def test_a_move_is_held_one_second_and_then_the_robot_stands_still(simulation: Simulation) -> None:
+    _stand(simulation)
+    simulation.move(0.5, 0.0, 0.0)
+    _run(simulation, 0.98)
+    assert simulation.truth().commanded == (0.5, 0.0, 0.0)
+    _run(simulation, 0.04)
+    assert simulation.truth().commanded == (0.0, 0.0, 0.0)
+    _run(simulation, 2.5)
+    rest = simulation.truth()
+    assert rest.mode == 1
+    _run(simulation, 1.0)
+    assert np.linalg.norm(simulation.truth().position_m - rest.position_m) < 0.02
+
+
+def test_stop_move_takes_effect_at_once(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 1.0, (0.5, 0.0, 0.0))
+    assert simulation.sport(SportAction.STOP_MOVE) == 0
+    assert simulation.truth().commanded == (0.0, 0.0, 0.0)
+
+
+def test_commands_beyond_the_robots_range_are_clipped_and_do_not_topple_it(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 3.0, (99.0, -99.0, 99.0))
+    assert simulation.truth().commanded == (3.8, -1.0, 4.0)
+    assert not simulation.fell
+
+
+def test_stand_down_lies_down(simulation: Simulation) -> None:
+    _stand(simulation)
+    assert simulation.sport(SportAction.STAND_DOWN) == 0
+    _run(simulation, 2.0)
+    truth = simulation.truth()
+    assert truth.mode == 5 and truth.body_height_m < 0.12
+
+
+def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> None:
+    _stand(simulation)
+    simulation.sport(SportAction.DAMP)
+    _run(simulation, 1.0)
+    truth = simulation.truth()
+    assert truth.mode == 7 and truth.body_height_m < 0.2
+    assert simulation.sport(SportAction.RECOVERY_STAND) == 0
+    _run(simulation, 0.5)
+    assert simulation.truth().mode == 8
+    _run(simulation, 3.0)
+    truth = simulation.truth()
+    assert truth.mode == 1
+    assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
+
+
+def test_walking_into_a_wall_is_noticed_and_does_not_topple_the_robot(corridor: Scene) -> None:
+    simulation = Simulation(replace(corridor, start=(26.0, 0.0, 0.0)), people=0, seed=0)
+    _stand(simulation)
+    _run(simulation, 6.0, (0.5, 0.0, 0.0))
+    assert simulation.collided_with() & {"end wall", "exit door"}
+    assert not simulation.fell
+    simulation.close()
+
+
+def test_velocities_agree_with_positions(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 1.5, (0.5, 0.0, 0.3))
+    before = simulation.truth()
+    velocities = []
+    for _ in range(200):
+        _run(simulation, 0.002)
+        velocities.append(simulation.truth().velocity_world_mps)
+    after = simulation.truth()
+    moved = after.position_m - before.position_m
+    assert moved == pytest.approx(np.mean(velocities, axis=0) * (after.time_s - before.time_s), abs=0.003)
+
+
+def test_feet_carry_the_robot_where_kinematics_says_they_are(simulation: Simulation) -> None:
+    _stand(simulation)
+    truth = simulation.truth()
+    assert truth.foot_position_body_m[:, 2] == pytest.approx(0.022 - truth.body_height_m, abs=0.006)
+    assert np.sign(truth.foot_position_body_m[:, 0]).tolist() == [1, 1, -1, -1]
+    assert np.sign(truth.foot_position_body_m[:, 1]).tolist() == [-1, 1, -1, 1]
+
+
+def test_same_seed_and_calls_give_the_same_motion(corridor: Scene) -> None:
+    ends = []
+    for _ in range(2):
+        simulation = Simulation(corridor, people=3, seed=5)
+        _stand(simulation)
+        _run(simulation, 2.0, (0.6, 0.0, 0.2))
+        ends.append(simulation.render_state())
+        simulation.close()
+    assert np.array_equal(ends[0], ends[1])
