@@ -1,7 +1,7 @@
 """Stands in for one command of the demo: `python fake_step.py ROLE MOOD ARGUMENTS...` behaves as the real one would.
 
 Moods: ok · fails (prints three lines and exits 1) · early (ends while others still need it) · deaf (ignores SIGINT) ·
-slow (never gets ready or never ends by itself).
+slow (never gets ready or never ends by itself) · faulty (a runner that a fault ended: result, flight log and exit 1).
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ def run(mood: str) -> None:
     from tests import synthetic_run
 
     synthetic_run.write_flight_log(Path(value("--record")), DURATION_S)
-    Path(value("--json")).write_text(json.dumps(synthetic_run.run_result(DURATION_S)))
-    time.sleep(0.5 if mood == "ok" else 0)
+    faults = ["the bridge stopped the robot"] if mood == "faulty" else []
+    Path(value("--json")).write_text(json.dumps({**synthetic_run.run_result(DURATION_S), "faults": faults}))
+    sys.exit(1 if faults else 0)
 
 
 if __name__ == "__main__":

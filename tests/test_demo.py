@@ -94,6 +94,17 @@ def test_a_failing_step_is_named_with_its_log_and_last_lines(
     assert left_behind(tmp_path) == []
 
 
+def test_a_run_that_a_fault_ended_is_named_and_still_gets_its_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path, run="faulty") == 1
+    captured = capsys.readouterr()
+    assert "step 'edge-run' failed: a fault ended the run" in captured.err
+    assert "check faults failed" in captured.err and "the bridge stopped the robot" in captured.err
+    assert captured.out == f"{tmp_path / 'report.html'}\n"
+    assert left_behind(tmp_path) == []
+
+
 def test_a_robot_that_ends_while_the_runner_drives_fails_the_demo(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

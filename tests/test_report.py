@@ -198,6 +198,15 @@ def test_only_the_newest_released_generation_counts(
     assert _checks_of(tmp_path, ticks=ticks)["stale_generation_ticks"].value == 1
 
 
+def test_a_fault_of_the_runner_fails_and_is_shown(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path)
+    result = {**synthetic_run.run_result(12.0), "faults": ["the bridge stopped the robot: deadman"]}
+    (tmp_path / "run.json").write_text(json.dumps(result))
+    write_report(RunFiles(tmp_path, tmp_path / "artifacts"), wall_s=1.0)
+    assert "the bridge stopped the robot: deadman" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "demo.json").read_text())["checks"]["faults"]["pass"] is False
+
+
 def test_motion_before_the_first_generation_fails(tmp_path: Path) -> None:
     ticks = synthetic_run.tick_records(12.0)
     ticks[0]["command"] = [0.1, 0.0, 0.0]

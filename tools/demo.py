@@ -156,13 +156,16 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     def describe(elapsed_s: float) -> str:
         trace.update()
         return (
-            f"demo: driving, {elapsed_s:.0f} s ({options.duration_s:.0f} s and start-up) · "
-            f"{trace.moves} commands received by the robot · {trace.walked_m:.1f} m walked"
+            f"demo: driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
+            f"{trace.moves} commands · {trace.walked_m:.1f} m walked"
         )
 
     with Progress(describe) as progress:
         code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
-    if code != 0:
+    if code == EXIT_CHECK_FAILED and files.result("edge-run").exists():
+        # A fault ended the run early. Its report is the way to find out why, and fails by its checks.
+        _say(str(run.failure("a fault ended the run")))
+    elif code != 0:
         raise run.failure(f"exit code {code}")
     children.forget(run)
     _stop(children, bridge)

@@ -141,7 +141,9 @@ def acceptance(data: RunData) -> list[Check]:
     errors_ms, problems = delay_errors_ms(log)
     command, is_zero = last_motion_command(data.trace)
     says_zero = bool(data.trace.end.get("wire", {}).get("last_command_zero", False))
+    faults = data.results["edge-run"]["faults"]
     return [
+        _at_most("faults", "Faults that ended the run", len(faults), 0, note="; ".join(map(str, faults))),
         _at_least("control_ticks", "Control ticks", control["ticks"], int(TICKS_PER_60_S * scale)),
         _at_most(
             "ticks_missing_in_log",
