@@ -148,7 +148,9 @@ def _leg(leg: LegGeometry) -> str:
         (
             f'<link name="{name}_hip_link">{hip}</link><link name="{name}_thigh_link">{thigh}</link>',
             f'<link name="{name}_calf_link">{calf}</link><link name="{name}_foot_link">{foot}</link>',
-            _joint(f"{name}_hip", "revolute", "base", f"{name}_hip_link", (hip_x, hip_y, 0), _motor(0, "1 0 0", limits[0])),
+            _joint(
+                f"{name}_hip", "revolute", "base", f"{name}_hip_link", (hip_x, hip_y, 0), _motor(0, "1 0 0", limits[0])
+            ),
             _joint(
                 f"{name}_thigh", "revolute", f"{name}_hip_link", f"{name}_thigh_link", (0, thigh_y, 0),
                 _motor(1, "0 1 0", limits[1]),

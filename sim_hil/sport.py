@@ -31,6 +31,21 @@ _NO_PUSH: tuple[Vec3, ...] = ((0.0, 0.0, 0.0),) * 4
 _WEIGHT: tuple[Vec3, ...] = ((0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4),) * 4
 
 
+# Self-righting from the back, found by search in simulation. The right legs reach over to the floor beside the trunk and
+# push it onto its left side; the left hips, spread, carry it on to the belly. (seconds, right leg, left leg)
+_RIGHTING: tuple[tuple[float, Vec3, Vec3], ...] = (
+    (0.6, (-0.9, 3.1, -2.7), (1.0, 1.3, -2.7)),
+    (0.2, (-0.9, 3.1, -2.7), (1.0, 1.3, -2.7)),
+    (0.3, (-0.9, 3.1, -0.9), (1.0, 1.3, -2.7)),
+    (0.2, (-0.9, 3.1, -0.9), (1.0, 1.3, -2.7)),
+    (0.4, (0.0, 1.3, -2.7), (1.0, 1.3, -2.0)),
+    (0.2, (0.0, 1.3, -2.7), (1.0, 1.3, -2.0)),
+    (0.5, (0.0, 1.3, -2.7), (0.0, 1.3, -2.7)),
+    (0.3, (0.0, 1.3, -2.7), (0.0, 1.3, -2.7)),
+)
+_RIGHTING_ATTEMPTS = 4
+
+
 class SportAction(Enum):
     """Requests of the sport service that change what the robot is doing."""
 
@@ -78,6 +93,7 @@ class SportController:
         self._command_s = -HOLD_S
         self._targets: tuple[float, ...] = LYING_RAD
         self._latest: Measured | None = None
+        self._attempts = 0
 
     @property
     def mode(self) -> int:
@@ -130,9 +146,20 @@ class SportController:
         elif action is SportAction.RECOVERY_STAND:
             if self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION) and self._motion is None:
                 return 0
-            self._mode = MODE_RECOVERY_STAND
-            self._start(((0.8, LYING_RAD), (1.2, self._standing())), MODE_BALANCE_STAND)
+            self._mode, self._attempts = MODE_RECOVERY_STAND, 0
+            self._recover()
         return 0
+
+    def _recover(self) -> None:
+        """Stand up, or turn over first; a robot that cannot turn over goes limp after a few attempts."""
+        if self._latest is None or self._latest.up > 0.7:
+            self._start(((0.8, LYING_RAD), (1.2, self._standing())), MODE_BALANCE_STAND)
+        elif self._attempts < _RIGHTING_ATTEMPTS:
+            self._attempts += 1
+            frames = tuple((seconds, right + left + right + left) for seconds, right, left in _RIGHTING)
+            self._start(frames, MODE_RECOVERY_STAND)
+        else:
+            self._motion, self._mode = None, MODE_DAMPING
 
     def _forget_command(self) -> None:
         self._command, self._command_s = (0.0, 0.0, 0.0), -HOLD_S
@@ -208,6 +235,8 @@ class SportController:
         self._mode = motion.mode
         if motion.mode == MODE_BALANCE_STAND:
             self._enter_balance()
+        elif motion.mode == MODE_RECOVERY_STAND:
+            self._recover()
         return self._track(measured, begin, 90.0, 2.5, _NO_PUSH)
 
     def _track(

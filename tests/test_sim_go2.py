@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from math import degrees
+from math import degrees, pi
 
 import numpy as np
+import pybullet
 import pytest
 
 from sim_hil.scene import Scene, load_scene
@@ -172,6 +173,21 @@ def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> 
     _run(simulation, 0.5)
     assert simulation.truth().mode == 8
     _run(simulation, 3.0)
+    truth = simulation.truth()
+    assert truth.mode == 1
+    assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
+
+
+@pytest.mark.parametrize("roll", [pi, 1.6, -2.5])
+def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: float) -> None:
+    pybullet.resetBasePositionAndOrientation(
+        simulation._go2.body, (0, 0, 0.3), pybullet.getQuaternionFromEuler((roll, 0, 0.4)), simulation._client
+    )
+    simulation.sport(SportAction.DAMP)
+    _run(simulation, 1.0)
+    assert simulation.fell
+    assert simulation.sport(SportAction.RECOVERY_STAND) == 0
+    _run(simulation, 6.0)
     truth = simulation.truth()
     assert truth.mode == 1
     assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
