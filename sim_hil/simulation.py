@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from sim_hil.gait import GRAVITY_MPS2
 from sim_hil.go2 import Go2, RobotTruth
-from sim_hil.people import PERSON_HEIGHT_M, PERSON_RADIUS_M, RENDER_FIELDS, UPDATE_HZ, People
+from sim_hil.people import PERSON_HEIGHT_M, PERSON_RADIUS_M, RENDER_FIELDS, UPDATE_HZ, People, appearances
+from sim_hil.person_body import PersonBody
 from sim_hil.scene import Box, Scene
 from sim_hil.sport import SportAction
+from sim_hil.world import build_scene
 
 __all__ = ["PERSON_COLLISION_M", "ROBOT_FIELDS", "RobotTruth", "Simulation", "SportAction"]
 
@@ -26,19 +28,23 @@ _CONTACT_EVERY = 5  # steps: contacts last longer than 10 ms
 class Simulation:
     """One deterministic world: the same scene, people, seed and calls give the same motion, step for step.
 
-    Raises ValueError when the scene has no room or no routes for that many people.
+    With `gui` the physics shows in a window (needs a display). Raises ValueError when the scene has no room
+    or no routes for that many people.
     """
 
     DT_S = 0.002
 
-    def __init__(self, scene: Scene, *, people: int, seed: int) -> None:
+    def __init__(self, scene: Scene, *, people: int, seed: int, gui: bool = False) -> None:
         self.scene = scene
+        self._gui = gui
+        self._looks: list[PersonBody] = []
         self._walkers = People(scene, people, seed)
+        self._seed = seed
         self._steps = 0
         self._touched: set[str] = set()
         self._fell = False
         self._folder = tempfile.TemporaryDirectory(prefix="edge-sim-")
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
             self._build(scene)
         except BaseException:
@@ -60,10 +66,15 @@ class Simulation:
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_HEIGHT_M, physicsClientId=client
         )
+        hidden = self._hidden()
         self._person_bodies = [
-            pybullet.createMultiBody(0, shape, physicsClientId=client) for _ in range(len(self._walkers))
+            pybullet.createMultiBody(0, shape, hidden, physicsClientId=client) for _ in range(len(self._walkers))
         ]
         self._labels.update((body, "person") for body in self._person_bodies)
+        if self._gui:
+            folder, looks = Path(self._folder.name), appearances(len(self._walkers), self._seed)
+            build_scene(client, folder, scene)
+            self._looks = [PersonBody(client, folder, look, f"person{i}-") for i, look in enumerate(looks)]
         self._place_people()
         self._go2 = Go2(client, Path(self._folder.name), scene.start, self.DT_S)
 
@@ -72,11 +83,23 @@ class Simulation:
         half = [extent / 2 for extent in box.size_m]
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
         turn = pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0])))
-        body = int(pybullet.createMultiBody(0, shape, -1, box.centre_m, turn, physicsClientId=client))
+        body = int(pybullet.createMultiBody(0, shape, self._hidden(), box.centre_m, turn, physicsClientId=client))
         pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
         return body
 
+    def _hidden(self) -> int:
+        """The visual shape of a collision body: in a window the textured scene is shown in its place."""
+        if not self._gui:
+            return -1
+        return int(
+            pybullet.createVisualShape(
+                pybullet.GEOM_SPHERE, radius=0.001, rgbaColor=(0, 0, 0, 0), physicsClientId=self._client
+            )
+        )
+
     def _place_people(self) -> None:
+        for look, row in zip(self._looks, self._walkers.render_rows(), strict=False):
+            look.pose(row)
         for body, (x, y, _) in zip(self._person_bodies, self._walkers.poses(), strict=True):
             pybullet.resetBasePositionAndOrientation(
                 body, (x, y, PERSON_HEIGHT_M / 2), (0, 0, 0, 1), physicsClientId=self._client

@@ -31,8 +31,8 @@ _NO_PUSH: tuple[Vec3, ...] = ((0.0, 0.0, 0.0),) * 4
 _WEIGHT: tuple[Vec3, ...] = ((0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4),) * 4
 
 
-# Self-righting from the back, found by search in simulation. The right legs reach over to the floor beside the trunk and
-# push it onto its left side; the left hips, spread, carry it on to the belly. (seconds, right leg, left leg)
+# Self-righting from the back, found by search in simulation. The right legs reach over to the floor beside the trunk
+# and push it onto its left side; the left hips, spread, carry it on to the belly. (seconds, right leg, left leg)
 _RIGHTING: tuple[tuple[float, Vec3, Vec3], ...] = (
     (0.6, (-0.9, 3.1, -2.7), (1.0, 1.3, -2.7)),
     (0.2, (-0.9, 3.1, -2.7), (1.0, 1.3, -2.7)),
