@@ -50,6 +50,9 @@ def listen(path: Path) -> socket.socket:
 
     Raises SocketTakenError, or ConfigError when something else is in the way or the directory is not usable.
     """
+    if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+        # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
+        raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         try:
             probe.connect(str(path))
@@ -58,8 +61,7 @@ def listen(path: Path) -> socket.socket:
         except FileNotFoundError:
             pass
         except OSError as error:
-            found = "not a socket" if path.exists() and not stat.S_ISSOCK(path.stat().st_mode) else error.strerror
-            raise ConfigError(f"socket {path}: expected a free path, found: {found}; give another --socket") from error
+            raise ConfigError(f"socket {path}: cannot be used: {error.strerror}; give another --socket") from error
         else:
             raise SocketTakenError(f"another bridge listens at {path}; stop it first, one process commands a robot")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def session(dds_domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict:
         command = [SDK_PYTHON, str(client), str(dds_domain), "lo", str(folder / "frame.jpg")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr + done.stdout
-    print(done.stdout)
+    sys.stdout.write(done.stdout)  # for `pytest -s`
     return json.loads(done.stdout.splitlines()[-1])
 
 

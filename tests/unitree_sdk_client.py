@@ -1,6 +1,6 @@
 """Drives a Go2 with the maker's own Python SDK, unmodified; run by test_interop_unitree_sdk.py under the SDK's python.
 
-usage: unitree_sdk_client.py DOMAIN INTERFACE JPEG_OUT. Prints one JSON object, last on stdout. Imports nothing of ours.
+usage: unitree_sdk_client.py DOMAIN INTERFACE JPEG_OUT. The last line of stdout is one JSON object. Imports nothing of ours.
 """
 
 import json
@@ -93,7 +93,7 @@ def main() -> None:
     time.sleep(2)
     result["low_state_hz"] = round((len(lows) - count_low) / 2, 1)
     result["sport_state_hz"] = round((len(states) - count_state) / 2, 1)
-    print(json.dumps(result))
+    sys.stdout.write(json.dumps(result) + "\n")
 
 
 if __name__ == "__main__":

@@ -64,6 +64,7 @@ class Go2Reader:
         self._listener: Callable[[RobotState], None] | None = None
         self._closing = threading.Event()
         self._bus = bus or Bus(config.dds)
+        self._owns_bus = bus is None
         self._reader = self._bus.reader(SPORT_STATE_TOPIC, SportModeState_)
         self._waitset = self._bus.waitset(self._reader)
         self._video = RpcClient(self._bus, VIDEO_SERVICE)
@@ -89,10 +90,11 @@ class Go2Reader:
         return frame
 
     def close(self) -> None:
-        """Stop the reading thread; the participant leaves the bus when the last user drops it."""
+        """Stop the reading thread and leave the bus, unless it was given. No frame may be under way."""
         self._closing.set()
         self._thread.join()
-        self._listener = None
+        if self._owns_bus:
+            self._bus.close()
 
     def _read_states(self) -> None:
         while not self._closing.is_set():

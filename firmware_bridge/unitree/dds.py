@@ -51,9 +51,12 @@ class Bus:
             self._domain = Domain(config.domain, domain_xml(config))
             self.participant = DomainParticipant(config.domain)
         except DDSException as error:
+            where = f"DDS: cannot join domain {config.domain} on interface {config.interface!r}"
+            if error.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
+                raise DdsError(f"{where}: this process has already opened it; close that Bus or share it") from error
             raise DdsError(
-                f"DDS: cannot join domain {config.domain} on interface {config.interface!r} ({error.msg}); "
-                "check the interface's name with `ip link` and that at most ten programs use the domain"
+                f"{where} ({error.msg}); check the interface's name with `ip link` and that at most ten programs on"
+                " this machine use the domain"
             ) from error
         self._topics: dict[str, Topic[Any]] = {}
 
@@ -73,6 +76,12 @@ class Bus:
         for reader in readers:
             waitset.attach(ReadCondition(reader, _FRESH))
         return waitset
+
+    def close(self) -> None:
+        """Leave the bus now and let this process open the domain again; nothing made by this object works after."""
+        # The binding deletes an entity when Python forgets it, which is too late for the next Bus of this process.
+        # Deleting the domain deletes everything in it; the objects' own attempts later find nothing.
+        self._domain._delete(self._domain._ref)
 
     def _topic(self, name: str, kind: Any) -> Topic[Any]:
         if name not in self._topics:

@@ -1,0 +1,312 @@
+"""`edge-hil` as a peer on the bus: the sport service's rules, and the parts the processes share."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_bridge.config import DdsConfig, load_robot_config
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.client import Go2Reader
+from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
+from sim_hil.sport import SportAction
+from sim_hil.trace import TraceWriter
+from sim_hil.unitree.service import Received
+from sim_hil.unitree.snapshot import SnapshotReader, SnapshotWriter
+from sim_hil.unitree.sport import CommandLog, handle_sport, parse_move
+from sim_hil.unitree.state import OdometryFrame
+from tests.processes import GO2_SIM, REPOSITORY, Running, hil_arguments, read_trace, running, wait_for
+
+
+class Recorder:
+    """A robot that notes what the sport service makes of a request."""
+
+    def __init__(self) -> None:
+        self.did: list[object] = []
+
+    def sport(self, action: SportAction) -> int:
+        self.did.append(action)
+        return 0
+
+    def move(self, *velocity: float) -> None:
+        self.did.append(velocity)
+
+
+class TestSportRules:
+    @pytest.mark.parametrize(
+        ("api_id", "action"),
+        [(1001, "DAMP"), (1002, "BALANCE_STAND"), (1003, "STOP_MOVE"), (1004, "STAND_UP"), (1005, "STAND_DOWN"),
+         (1006, "RECOVERY_STAND")],
+    )  # fmt: skip
+    def test_each_id_is_its_action(self, api_id: int, action: str) -> None:
+        robot = Recorder()
+        assert handle_sport(robot, api_id, "") == (0, "")
+        assert robot.did == [SportAction[action]]
+
+    @pytest.mark.parametrize("api_id", [0, 1007, 1009, 1016, 1030, 2043, 9999])
+    def test_anything_else_is_not_implemented(self, api_id: int) -> None:
+        robot = Recorder()
+        assert handle_sport(robot, api_id, "{}") == (3203, "")
+        assert robot.did == []
+
+    def test_move_takes_three_numbers(self) -> None:
+        robot = Recorder()
+        assert handle_sport(robot, 1008, '{"x": 0.5, "y": 0, "z": -1}') == (0, "")
+        assert robot.did == [(0.5, 0.0, -1.0)]
+
+    @pytest.mark.parametrize(
+        "text",
+        ["", "nonsense", "[]", "3", "null", '{"x":1,"y":2}', '{"x":1,"y":2,"z":"3"}', '{"x":1,"y":2,"z":NaN}',
+         '{"x":1,"y":2,"z":1e999}', '{"x":true,"y":0,"z":0}', '{"x":1,"y":2,"z":null}', "[" * 4000],
+    )  # fmt: skip
+    def test_a_bad_move_is_a_parameter_error_and_moves_nothing(self, text: str) -> None:
+        robot = Recorder()
+        assert handle_sport(robot, 1008, text) == (3204, "")
+        assert robot.did == []
+
+    @given(st.text(max_size=200))
+    def test_no_text_breaks_the_parser(self, text: str) -> None:
+        assert parse_move(text) is None or len(parse_move(text) or ()) == 3
+
+    @given(*[st.floats(-100, 100)] * 3)
+    def test_the_bridges_parameter_is_understood(self, vx: float, vy: float, wz: float) -> None:
+        assert parse_move(move_parameter(vx, vy, wz)) == (vx, vy, wz)
+
+
+class TestCommandLog:
+    @staticmethod
+    def after(*requests: tuple[int, str]) -> dict[str, object]:
+        log = CommandLog()
+        for api_id, parameter in requests:
+            log.note(Received(0, ids.SPORT_SERVICE, api_id, parameter, 0, noreply=True))
+        return log.summary()
+
+    def test_moves_are_counted_and_the_last_is_kept(self) -> None:
+        summary = self.after((1008, '{"x":1,"y":0,"z":0}'), (1008, '{"x":0,"y":0,"z":0}'))
+        assert (summary["commands"], summary["last_move"], summary["last_command_zero"]) == (2, [0.0, 0.0, 0.0], True)
+
+    def test_a_moving_robot_is_not_at_zero(self) -> None:
+        assert self.after((1008, '{"x":0,"y":0,"z":0.1}'))["last_command_zero"] is False
+
+    def test_stop_move_after_a_move_is_zero(self) -> None:
+        summary = self.after((1008, '{"x":1,"y":0,"z":0}'), (1003, ""))
+        assert (summary["last_command"], summary["last_command_zero"]) == ("StopMove", True)
+
+    def test_a_move_that_nobody_can_read_does_not_count_as_zero(self) -> None:
+        assert self.after((1008, "?"))["last_command_zero"] is False
+
+
+class TestOdometryFrame:
+    starts = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-math.pi, math.pi))
+
+    @given(starts)
+    def test_it_starts_at_zero(self, start: tuple[float, float, float]) -> None:
+        frame = OdometryFrame(start)
+        assert frame.position((start[0], start[1], 0.3)) == pytest.approx([0, 0, 0.3], abs=1e-9)
+        assert frame.rpy((0.1, 0.2, start[2]))[2] == pytest.approx(0, abs=1e-9)
+        half = start[2] / 2
+        quaternion = frame.quaternion((math.cos(half), 0.0, 0.0, math.sin(half)))
+        assert quaternion == pytest.approx([1, 0, 0, 0], abs=1e-9)
+
+    @given(starts, st.floats(-5, 5))
+    def test_walking_straight_ahead_is_along_x(self, start: tuple[float, float, float], distance: float) -> None:
+        x, y, theta = start
+        ahead = (x + distance * math.cos(theta), y + distance * math.sin(theta), 0.3)
+        assert OdometryFrame(start).position(ahead) == pytest.approx([distance, 0, 0.3], abs=1e-9)
+
+
+class TestSnapshot:
+    def test_the_newest_value_is_read(self) -> None:
+        writer = SnapshotWriter(5)
+        reader = SnapshotReader(writer.fd, 5)
+        assert reader.read() is None
+        for value in range(3):
+            writer.write(np.full(5, float(value)))
+        assert reader.read().tolist() == [2.0] * 5
+        reader.close()
+        writer.close()
+
+    def test_a_torn_value_is_never_returned(self) -> None:
+        writer = SnapshotWriter(2)
+        reader = SnapshotReader(writer.fd, 2)
+        writer.write(np.array((1.0, 2.0)))
+        writer._memory[-8:] = np.array(3.0).tobytes()  # the next value, half-written
+        with pytest.raises(RuntimeError, match="no consistent snapshot"):
+            reader.read()
+        reader.close()
+        writer.close()
+
+    def test_another_length_is_refused(self) -> None:
+        writer = SnapshotWriter(3)
+        with pytest.raises(ValueError, match="shape"):
+            writer.write(np.zeros(4))
+        with pytest.raises(ValueError, match="bytes"):
+            SnapshotReader(writer.fd, 4)
+        writer.close()
+
+
+def test_the_trace_ends_with_the_summary_and_keeps_the_order(tmp_path: Path) -> None:
+    trace = TraceWriter(tmp_path / "t.jsonl")
+    for index in range(100):
+        trace.put(index, "pose", x=float(index))
+    trace.close(100, fell=False)
+    lines = read_trace(tmp_path / "t.jsonl")
+    assert [line["t_ns"] for line in lines] == list(range(101))
+    assert lines[-1] == {"t_ns": 100, "kind": "end", "fell": False, "trace_dropped": 0}
+
+
+@pytest.fixture(scope="module")
+def hil(dds_domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Running, Path]]:
+    folder = tmp_path_factory.mktemp("hil")
+    more = ("--people", 2, "--seed", 3, "--trace", folder / "t.jsonl", "--json", folder / "r.json")
+    with running("sim_hil.hil", *hil_arguments(dds_domain, *more), folder=folder) as started:
+        yield started, folder
+
+
+@pytest.fixture(scope="module")
+def bus(dds_domain: int) -> Iterator[Bus]:
+    bus = Bus(DdsConfig(dds_domain, "lo", ("127.0.0.1",)))
+    yield bus
+    bus.close()
+
+
+@pytest.fixture(scope="module")
+def reader(bus: Bus, hil: tuple[Running, Path]) -> Iterator[Go2Reader]:
+    reader = Go2Reader(load_robot_config(GO2_SIM), bus=bus)
+    wait_for(lambda: reader.state() is not None, 5, "the robot's state")
+    yield reader
+    reader.close()
+
+
+class TestRealProcess:
+    """In this order: one edge-hil is used up from the robot's start to its end."""
+
+    def test_it_starts_lying_down_at_the_odometry_origin(self, reader: Go2Reader) -> None:
+        state = reader.state()
+        assert state is not None and state.mode == ids.MODE_LIE_DOWN
+        assert state.T_odom_base == pytest.approx((0, 0, 0), abs=0.05)
+
+    def test_balance_stand_is_refused_while_it_lies(self, bus: Bus, reader: Go2Reader) -> None:
+        with pytest.raises(RpcError) as error:
+            RpcClient(bus, ids.SPORT_SERVICE).call(ids.BALANCE_STAND, timeout_s=3)
+        assert error.value.code == 4202
+
+    def test_an_unknown_api_and_a_bad_move_get_their_codes(self, bus: Bus, reader: Go2Reader) -> None:
+        client = RpcClient(bus, ids.SPORT_SERVICE)
+        for api_id, code in ((1030, 3203), (ids.MOVE, 3204)):
+            with pytest.raises(RpcError) as error:
+                client.call(api_id, "{}", timeout_s=3)
+            assert error.value.code == code
+
+    def test_it_stands_up_and_walks_as_told(self, bus: Bus, reader: Go2Reader) -> None:
+        client = RpcClient(bus, ids.SPORT_SERVICE)
+        client.call(ids.STAND_UP, timeout_s=3)
+        wait_for(lambda: reader.state().mode == ids.MODE_JOINT_LOCK, 5, "standing")
+        client.call(ids.BALANCE_STAND, timeout_s=3)
+        wait_for(lambda: reader.state().mode == ids.MODE_BALANCE_STAND, 5, "balanced")
+        for _ in range(20):
+            client.send(ids.MOVE, move_parameter(0.5, 0.0, 0.0), noreply=True)
+            time.sleep(0.1)
+        state = reader.state()
+        assert state.mode == ids.MODE_LOCOMOTION
+        assert state.T_odom_base[0] > 0.5
+        assert state.vx_mps == pytest.approx(0.5, abs=0.25)
+        client.call(ids.STOP_MOVE, timeout_s=3)
+        wait_for(lambda: reader.state().mode == ids.MODE_BALANCE_STAND, 3, "standing again")
+
+    def test_pictures_are_pictures_and_change_as_it_walks(self, bus: Bus, reader: Go2Reader) -> None:
+        client = RpcClient(bus, ids.SPORT_SERVICE)
+        pictures = []
+        for _ in range(2):
+            pictures.append(cv2.imdecode(np.frombuffer(reader.request_frame(3.0), np.uint8), cv2.IMREAD_COLOR))
+            client.send(ids.MOVE, move_parameter(0.0, 0.0, 0.8), noreply=True)
+            time.sleep(0.9)
+        assert pictures[0].shape == (240, 320, 3)
+        assert float(np.abs(pictures[0].astype(int) - pictures[1]).mean()) > 5
+
+    def test_the_trace_has_what_was_on_the_wire(self, hil: tuple[Running, Path]) -> None:
+        time.sleep(0.2)
+        lines = read_trace(hil[1] / "t.jsonl")
+        assert lines[0]["kind"] == "scene" and lines[0]["name"] == "corridor" and lines[0]["footprints"]
+        wire = [line["name"] for line in lines if line["kind"] == "wire"]
+        assert {"StandUp", "BalanceStand", "Move", "StopMove", "GetImageSample", "1030"} <= set(wire)
+        poses = [line["t_ns"] for line in lines if line["kind"] == "pose"]
+        assert np.diff(poses).mean() == pytest.approx(100e6, rel=0.2)
+        assert all(len(line["poses"]) == 2 for line in lines if line["kind"] == "people")
+
+    def test_it_ends_cleanly_at_sigterm_with_its_result(self, hil: tuple[Running, Path], reader: Go2Reader) -> None:
+        started, folder = hil
+        assert started.end() == 0
+        result = json.loads((folder / "r.json").read_text())
+        assert (result["scene"], result["people"], result["seed"], result["fell"]) == ("corridor", 2, 3, False)
+        assert result["path_m"] > 0.5 and result["video_frames"] == 2
+        assert result["state_hz"] == pytest.approx(50 * result["real_time_factor"], rel=0.05)
+        end = read_trace(folder / "t.jsonl")[-1]
+        assert {key: end[key] for key in result} == result
+
+
+def _camera_pid(hil_pid: int) -> int:
+    children = Path(f"/proc/{hil_pid}/task/{hil_pid}/children").read_text().split()
+    assert len(children) == 1
+    return int(children[0])
+
+
+def _alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def test_a_dead_camera_process_ends_the_robot_and_says_so(dds_domain: int, tmp_path: Path) -> None:
+    with running("sim_hil.hil", *hil_arguments(dds_domain), folder=tmp_path) as started:
+        os.kill(_camera_pid(started.pid), signal.SIGKILL)
+        assert started.process.wait(10) == 1
+        assert "the camera process has died" in started.stderr()
+
+
+def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_path: Path) -> None:
+    with running("sim_hil.hil", *hil_arguments(dds_domain), folder=tmp_path) as started:
+        camera = _camera_pid(started.pid)
+        started.process.kill()
+        started.process.wait()
+        wait_for(lambda: not _alive(camera), 5, "the end of the camera process")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--scene", "moon"], "moon"),
+        (["--people", "100000"], "people"),
+        (["--people", "-1"], "people"),
+        (["--camera", "huge"], "expected WxH"),
+        (["--interface", "nosuch0"], "nosuch0"),
+        (["--duration", "0"], "--duration"),
+        (["--gui"], "DISPLAY"),
+        (["--trace", "/nowhere/t.jsonl"], "/nowhere/t.jsonl"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_exit_status_2(dds_domain: int, arguments: list[str], complaint: str) -> None:
+    defaults = {"--robot": "go2", "--scene": "corridor", "--protocol": "unitree", "--domain": str(dds_domain)}
+    given_flags = set(arguments[::2])
+    command = [word for flag, value in defaults.items() if flag not in given_flags for word in (flag, value)]
+    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-m", "sim_hil.hil", *command, *arguments],
+        cwd=REPOSITORY, capture_output=True, text=True, timeout=30, env=environment, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert complaint in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr

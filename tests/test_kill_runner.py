@@ -1,0 +1,89 @@
+"""The promise of the whole safety chain, measured at the robot: whatever dies, zero velocity within 300 ms.
+
+The real `edge-bridge` between the real `edge-hil` and a minimal runner that is killed while the robot walks. Times are
+edge-hil's own stamps of what came over the wire.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.processes import GO2_SIM, Running, hil_arguments, read_trace, running, wait_for
+
+BOUND_NS = 300_000_000
+
+
+class Rig:
+    """edge-hil and edge-bridge, running; and the robot's own record of what it was told and what it did."""
+
+    def __init__(self, trace: Path, socket: Path, folder: Path) -> None:
+        self.trace = trace
+        self.socket = socket
+        self.folder = folder
+
+    def moves(self) -> list[tuple[int, tuple[float, float, float]]]:
+        """Every Move received: (ns, velocity)."""
+        lines = [line for line in read_trace(self.trace) if line["kind"] == "wire" and line["name"] == "Move"]
+        values = [json.loads(line["parameter"]) for line in lines]
+        return [(line["t_ns"], (v["x"], v["y"], v["z"])) for line, v in zip(lines, values, strict=True)]
+
+    def speed_mps(self) -> float:
+        pose = [line for line in read_trace(self.trace) if line["kind"] == "pose"][-1]
+        return float((pose["vx"] ** 2 + pose["vy"] ** 2) ** 0.5)
+
+    def is_walking(self) -> bool:
+        moves = self.moves()
+        return bool(moves) and any(moves[-1][1]) and self.speed_mps() > 0.3
+
+    def first_lasting_zero_ns(self, since_ns: int) -> int:
+        """When the robot was told zero after `since_ns`, with nothing but zeros after it."""
+        moves = self.moves()
+        last_moving = max(i for i, (_, velocity) in enumerate(moves) if any(velocity))
+        assert last_moving + 1 < len(moves), "no zero velocity was ever received"
+        assert moves[-1][0] > since_ns, "the bridge fell silent"
+        return moves[last_moving + 1][0]
+
+
+@pytest.fixture(scope="module")
+def rig(dds_domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    folder = tmp_path_factory.mktemp("kill")
+    trace, socket = folder / "t.jsonl", folder / "bridge.sock"
+    bridge = ("--robot", GO2_SIM, "--domain", dds_domain, "--socket", socket)
+    with (
+        running("sim_hil.hil", *hil_arguments(dds_domain, "--trace", trace), folder=folder),
+        running("firmware_bridge.bridge", *bridge, folder=folder),
+    ):
+        yield Rig(trace, socket, folder)
+
+
+def walk_then(rig: Rig, number: signal.Signals) -> int:
+    """Let a runner walk the robot, send it `number`; nanoseconds from then to a lasting zero on the wire."""
+    with running("tests.bridge_driver", rig.socket, 0.5, folder=rig.folder) as runner:
+        wait_for(rig.is_walking, 15, "the robot walks")
+        since_ns = time.monotonic_ns()
+        os.kill(runner.pid, number)
+        time.sleep(0.7)
+        _finish(runner)
+        return rig.first_lasting_zero_ns(since_ns) - since_ns
+
+
+def _finish(runner: Running) -> None:
+    runner.process.kill()
+    runner.process.wait()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
+def test_the_robot_is_told_zero_within_300_ms(rig: Rig, number: signal.Signals) -> None:
+    assert walk_then(rig, number) <= BOUND_NS
+
+
+def test_the_robot_comes_to_a_stand(rig: Rig) -> None:
+    walk_then(rig, signal.SIGKILL)
+    wait_for(lambda: rig.speed_mps() < 0.1, 2, "the robot to stand")

@@ -1,0 +1,65 @@
+"""Robot files: every key checked, one clear line for what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from firmware_bridge.config import ConfigError, load_robot_config
+from tests.processes import GO2_SIM
+
+GO2 = GO2_SIM.with_name("go2.toml")
+
+
+def test_simulated_and_real_robot_differ_in_their_addresses_only() -> None:
+    simulated, real = load_robot_config(GO2_SIM), load_robot_config(GO2)
+    assert simulated.dds != real.dds
+    assert replace(simulated, dds=real.dds) == real
+
+
+def test_the_shipped_files_load() -> None:
+    assert load_robot_config(GO2_SIM).dds.interface == "lo"
+    assert load_robot_config(GO2).bridge.deadman_ms == 250
+
+
+def test_a_relative_socket_lies_in_the_runtime_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert load_robot_config(GO2_SIM).bridge.socket == tmp_path / "tic-vla-edge" / "bridge.sock"
+
+
+def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
+    config = load_robot_config(GO2_SIM, socket=tmp_path / "s", domain=7)
+    assert (config.bridge.socket, config.dds.domain) == (tmp_path / "s", 7)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("rate_hz = 50", "rate_hz = 50\nspeed = 1", "unknown key bridge.speed"),
+        ("deadman_ms = 250", "deadman_ms = 251", "bridge.deadman_ms: expected 20..250, found 251"),
+        ("deadman_ms = 250", "deadman_ms = true", "bridge.deadman_ms: expected int, found True"),
+        ("vx_max_mps = 0.8", "vx_max_mps = 4.0", "limits.vx_max_mps: expected 0..3.8, found 4.0"),
+        ("vx_max_mps = 0.8", "vx_max_mps = nan", "limits.vx_max_mps: expected float, found nan"),
+        ("accel_mps2 = 2.0", "", "missing key limits.accel_mps2"),
+        ('interface = "lo"', 'interface = "lo\\"/>"', "dds.interface/peers"),
+        ('protocol = "unitree"', 'protocol = "carrier pigeon"', "protocol: expected one of"),
+        ('velocity_frame = "odom"', 'velocity_frame = "map"', "odometry.velocity_frame"),
+        ("[limits]", "[limits", "cannot be read"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, before: str, after: str, complaint: str) -> None:
+    path = tmp_path / "robot.toml"
+    text = GO2_SIM.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError) as error:
+        load_robot_config(path)
+    assert complaint in str(error.value) and str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_socket_path_the_system_cannot_bind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the system allows 107"):
+        load_robot_config(GO2_SIM, socket=tmp_path / ("x" * 120))
