@@ -128,7 +128,12 @@ def test_a_program_that_does_not_exist_is_named(tmp_path: Path, capsys: pytest.C
     assert "step 'edge-export' failed: /nowhere/edge-export cannot be started" in capsys.readouterr().err
 
 
-RUN_WITH_FAKES = "import sys; from tests.test_demo import run, Path; sys.exit(run(Path(sys.argv[1]), run=sys.argv[2]))"
+RUN_WITH_FAKES = """
+import signal, sys
+from tests.test_demo import run, Path
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job in the background
+sys.exit(run(Path(sys.argv[1]), run=sys.argv[2]))
+"""
 
 
 def start_demo(out: Path, runner_mood: str) -> subprocess.Popen[str]:

@@ -259,7 +259,8 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except (ValueError, OSError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    # SIGINT too: a shell starts background jobs with it ignored, and the children would inherit that.
+    before = {number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         summary = run_demo(options, commands)
         write_result(args.json, summary)
@@ -270,7 +271,8 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         _say(str(error))
         return EXIT_CHECK_FAILED
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     failed = [name for name, check in summary["checks"].items() if not check["pass"]]
     for name in failed:
         _say(f"check {name} failed: {json.dumps(summary['checks'][name])}")
