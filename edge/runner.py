@@ -89,8 +89,11 @@ class RunOptions:
 class Runner:
     """Wires the threads of one run together and takes them down again, the robot first."""
 
-    def __init__(self, artifacts: Artifacts, robot: RobotConfig, options: RunOptions) -> None:
+    def __init__(
+        self, artifacts: Artifacts, robot: RobotConfig, options: RunOptions, say: Callable[[str], None]
+    ) -> None:
         self._artifacts = artifacts
+        self._say = say
         self._robot = robot
         self._options = options
         self._stop = threading.Event()
@@ -129,7 +132,11 @@ class Runner:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(f"{self._options.record}: cannot record ({recorder.error})")
+            # Everything allocated so far lives as long as the process: the collector need not walk it again.
+            gc.collect()
+            gc.freeze()
             last_seq = self._arm(bridge)
+            self._say(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()
             if recorder is not None:
                 recorder.put("/run", started_ns, self._run_record(started_ns))
@@ -226,10 +233,8 @@ class Runner:
         period_ns: int,
     ) -> None:
         """Run both threads until the end; this thread only waits."""
-        # Everything allocated so far lives as long as the process: the collector need not walk it again.
-        gc.collect()
-        gc.freeze()
-        epoch_ns = time.monotonic_ns() + 2 * period_ns
+        # The bridge's deadman is already running: the first command must not wait for a whole period.
+        epoch_ns = time.monotonic_ns() + period_ns // 2
         camera.align(epoch_ns - round(CAMERA_LEAD * period_ns))
         duration_s = self._options.duration_s
         end_ns = None if duration_s is None else epoch_ns + round(duration_s * 1e9)
@@ -415,7 +420,7 @@ def main(argv: list[str] | None = None) -> int:
         _say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
     cv2.setNumThreads(1)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    runner = Runner(artifacts, robot, options)
+    runner = Runner(artifacts, robot, options, _say)
     received: list[int] = []
 
     def on_signal(number: int, _frame: FrameType | None) -> None:

@@ -1,0 +1,176 @@
+"""`edge-run` as a process, with the real bridge and the real simulated robot; the robot's side is the judge."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edge.recording import read_messages
+from tests.processes import GO2_SIM, REPOSITORY, Running, hil_arguments, read_trace, running, wait_for
+
+INSTRUCTION = "walk down the corridor and stop at the vending machine"
+MOVE = 1008
+STOP_BOUND_MS = 300
+
+
+class Robot:
+    """A simulated robot with a bridge in front of it."""
+
+    def __init__(self, folder: Path, domain: int, artifacts: Path) -> None:
+        self.folder = folder
+        self.domain = domain
+        self.artifacts = artifacts
+        self.socket = folder / "b.sock"
+        self.trace = folder / "trace.jsonl"
+
+    def arguments(self, *more: object) -> tuple[object, ...]:
+        where = ("--robot", GO2_SIM, "--socket", self.socket, "--domain", self.domain)
+        return ("--artifacts", self.artifacts, "--instruction", INSTRUCTION, *where, *more)
+
+    def moves(self) -> list[tuple[int, bool]]:
+        """Every velocity command that reached the robot: stamp, and whether it was zero."""
+        records = [r for r in read_trace(self.trace) if r["kind"] == "wire" and r["api_id"] == MOVE]
+        parameters = [
+            json.loads(r["parameter"]) if isinstance(r["parameter"], str) else r["parameter"] for r in records
+        ]
+        return [(r["t_ns"], not any(p.values())) for r, p in zip(records, parameters, strict=True)]
+
+    def is_moving(self) -> bool:
+        moves = self.moves()
+        return bool(moves) and not moves[-1][1]
+
+
+@pytest.fixture
+def robot(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[Robot]:
+    robot = Robot(tmp_path, dds_domain, artifacts_dir)
+    hil = hil_arguments(dds_domain, "--people", 2, "--seed", 1, "--trace", robot.trace)
+    bridge = ("--robot", GO2_SIM, "--socket", robot.socket, "--domain", dds_domain)
+    with (
+        running("sim_hil.hil", *hil, folder=tmp_path),
+        running("firmware_bridge.bridge", *bridge, folder=tmp_path),
+    ):
+        yield robot
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "edge.runner", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=90, cwd=REPOSITORY, check=False)
+
+
+def drive(robot: Robot, *more: object) -> Running:
+    """Context in which edge-run is driving; the robot has been told to move."""
+    return running("edge.runner", *robot.arguments(*more), folder=robot.folder, ready="driving")
+
+
+def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> None:
+    flight = robot.folder / "flight.mcap"
+    done = run(*robot.arguments("--duration", 8, "--release-delay", 1, "--record", flight, "--json", "-"))
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+
+    assert result["faults"] == []
+    assert result["control"]["ticks"] >= 70
+    assert result["reasoning"]["generations"] >= 2
+    assert result["bridge"]["zero_after_stop"] is True
+    moves = robot.moves()
+    assert any(not zero for _, zero in moves)
+    assert moves[-1][1], "the last command on the wire is zero velocity"
+    poses = [r for r in read_trace(robot.trace) if r["kind"] == "pose"]
+    assert poses[-1]["x"] - poses[0]["x"] > 1.0
+
+    records: dict[str, list[dict]] = {}
+    for topic, _, payload in read_messages(flight):
+        records.setdefault(topic, []).append(payload)
+    ticks, states = records["/tick"], {s["generation"]: s for s in records["/semantic"]}
+    assert len(ticks) == result["control"]["ticks"]
+    driven = [t for t in ticks if t["generation"] is not None]
+    first = ticks.index(driven[0])
+    assert all(t["generation"] is not None for t in ticks[first:]), "after the first generation every tick has one"
+    assert all(t["command"] == [0, 0, 0] for t in ticks[:first]), "before it the robot is told to stand still"
+    for tick in driven:
+        state = states[tick["generation"]]
+        assert state["ready_ns"] <= tick["now_ns"]
+        assert tick["delay_s"] == pytest.approx((tick["now_ns"] - state["frames_ns"][-1]) / 1e9, abs=1e-3)
+
+
+def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) -> None:
+    with drive(robot) as runner:
+        wait_for(robot.is_moving, 20, "the robot to be told to move")
+        time.sleep(1.0)
+        runner.process.send_signal(signal.SIGKILL)
+        killed_ns = time.monotonic_ns()
+        runner.process.wait(5)
+    time.sleep(1.0)
+    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= killed_ns]
+    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
+    assert (zero_ns - killed_ns) / 1e6 <= STOP_BOUND_MS
+    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
+
+
+def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead(robot: Robot) -> None:
+    with drive(robot) as runner:
+        wait_for(robot.is_moving, 20, "the robot to be told to move")
+        time.sleep(1.0)
+        runner.process.send_signal(signal.SIGSTOP)
+        frozen_ns = time.monotonic_ns()
+        time.sleep(1.0)
+        runner.process.send_signal(signal.SIGCONT)
+        status = runner.process.wait(20)
+    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= frozen_ns]
+    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
+    assert (zero_ns - frozen_ns) / 1e6 <= STOP_BOUND_MS
+    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
+    assert status == 1, "a run that the bridge had to stop is a failed run"
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_a_signal_ends_the_run_with_the_robot_standing_still(robot: Robot, number: int, status: int) -> None:
+    result = robot.folder / "run.json"
+    with drive(robot, "--json", result) as runner:
+        wait_for(robot.is_moving, 20, "the robot to be told to move")
+        runner.process.send_signal(number)
+        assert runner.process.wait(20) == status
+    assert json.loads(result.read_text())["bridge"]["zero_after_stop"] is True
+    time.sleep(0.2)
+    assert robot.moves()[-1][1], "the last command on the wire is zero velocity"
+
+
+def test_without_a_bridge_it_refuses(tmp_path: Path, artifacts_dir: Path, dds_domain: int) -> None:
+    done = run(*Robot(tmp_path, dds_domain, artifacts_dir).arguments("--duration", 1))
+    assert done.returncode == 3
+    assert "start `edge-bridge" in done.stderr.splitlines()[-1]
+
+
+def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifacts_dir: Path) -> None:
+    broken = tmp_path / "nano"
+    broken.mkdir()
+    for path in artifacts_dir.iterdir():
+        (broken / path.name).write_bytes(path.read_bytes())
+    (broken / "action_expert.onnx").write_bytes((broken / "action_expert.onnx").read_bytes()[:-1] + b"\x55")
+    done = run(*Robot(tmp_path, 1, broken).arguments())
+    assert done.returncode == 3
+    assert len(done.stderr.splitlines()) == 1
+    assert "action_expert.onnx" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("--instruction", " "), "instruction is empty"),
+        (("--duration", "-3"), "--duration"),
+        (("--release-delay", "soon"), "release delay"),
+        (("--robot", "no-such-robot.toml"), "no-such-robot.toml"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+    done = run(*Robot(tmp_path, 1, tmp_path).arguments(*change))
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
