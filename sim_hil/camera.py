@@ -24,7 +24,7 @@ Picture = NDArray[np.uint8]
 CAMERA_POSITION_M = (0.327, 0.0, 0.043)
 CAMERA_PITCH_RAD = radians(2.0)  # downwards
 CAMERA_HFOV_RAD = radians(100.0)
-_NEAR_M, _FAR_M = 0.06, 60.0
+_NEAR_M, _FAR_M = 0.02, 60.0  # near: the nose may touch a wall, which must still be seen
 
 
 class CameraWorld:
