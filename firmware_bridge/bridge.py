@@ -298,12 +298,15 @@ def main(argv: list[str] | None = None) -> int:
     except (ConfigError, DdsError) as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
         return 2
-    if args.json:
-        text = json.dumps(bridge.result(), indent=2) + "\n"
+    text = json.dumps(bridge.result(), indent=2) + "\n"
+    try:
         if args.json == "-":
             sys.stdout.write(text)
-        else:
+        elif args.json:
             Path(args.json).write_text(text, encoding="utf-8")
+    except OSError as error:
+        sys.stderr.write(f"edge-bridge: the result could not be written: {error}\n")
+        return 1
     return 0
 
 

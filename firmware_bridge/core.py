@@ -167,7 +167,6 @@ class BridgeCore:
         if mode == ids.MODE_BALANCE_STAND:
             self._state, self._reason = "armed", "driving"
             self._ever_armed, self._zero_after_stop = True, False
-            self._target, self._last_command = _ZERO, _ZERO
             # The runner streams commands while arming; one that only starts now gets a deadman time to do so.
             self._good_until_ns = max(self._good_until_ns, now_ns + self._deadman_ns)
             self._next_ns = now_ns

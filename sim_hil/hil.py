@@ -39,8 +39,8 @@ _STEP_NS: Final = 1_000_000_000 // _STEPS_PER_S
 EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
-exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the camera process died or the trace could not be written;
-2 bad arguments"""
+exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the camera process died, or trace or result could not be
+written; 2 bad arguments"""
 
 
 class Go2Hil:
@@ -50,7 +50,7 @@ class Go2Hil:
         self._scene = scene
         self._args = args
         self._trace = trace
-        self._simulation = Simulation(scene, people=args.people, seed=args.seed, **({"gui": True} if args.gui else {}))
+        self._simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui)
         try:
             self._bus = Bus(dds)
             self._camera = CameraProcess(
@@ -251,12 +251,20 @@ def main(argv: list[str] | None = None) -> int:
         if trace.error is not None:
             sys.stderr.write(f"edge-hil: trace {args.trace} is incomplete: {trace.error}\n")
             code = 1
-    text = json.dumps(hil.summary, indent=2) + "\n"
-    if args.json == "-":
-        sys.stdout.write(text)
-    elif args.json:
-        Path(args.json).write_text(text, encoding="utf-8")
+    try:
+        _write_result(args.json, hil.summary)
+    except OSError as error:
+        sys.stderr.write(f"edge-hil: the result could not be written: {error}\n")
+        return 1
     return code
+
+
+def _write_result(where: str | None, summary: dict[str, object]) -> None:
+    text = json.dumps(summary, indent=2) + "\n"
+    if where == "-":
+        sys.stdout.write(text)
+    elif where:
+        Path(where).write_text(text, encoding="utf-8")
 
 
 def _run(hil: Go2Hil, stop: list[int], args: argparse.Namespace, dds: DdsConfig) -> int:

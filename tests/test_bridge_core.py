@@ -132,6 +132,14 @@ class TestArming:
         assert bench.status.state == "disarmed"
         assert bench.status.reason == "arm refused: the robot is in mode 5, not standing after 10 s"
 
+    def test_a_new_attempt_starts_from_the_beginning(self) -> None:
+        bench = Bench(mode=ids.MODE_LIE_DOWN)
+        bench.step(Arm())
+        bench.wait(10_100)
+        bench.written.clear()
+        bench.step(Arm())
+        assert bench.calls() == [ids.STAND_UP]
+
     def test_without_the_robots_state_nothing_is_sent_and_it_gives_up(self) -> None:
         bench = Bench(mode=None)
         bench.step(Arm())
@@ -187,8 +195,19 @@ class TestArmed:
         bench.command()
         bench.now_ns += 190 * MS
         before = len(bench.moves())
-        bench.wait(0)
-        assert len(bench.moves()) - before == 1
+        bench.wait(25)
+        assert len(bench.moves()) - before == 2
+
+    def test_arming_again_changes_nothing(self) -> None:
+        bench = Bench().arm()
+        bench.drive(1000)
+        bench.step(Arm())
+        bench.wait(20)
+        assert bench.status.state == "armed"
+        assert bench.moves()[-1].vx_mps == 0.5
+
+    def test_zero_after_stop_is_not_claimed(self) -> None:
+        assert not Bench().arm().status.zero_after_stop
 
     def test_speeding_up_is_limited(self) -> None:
         bench = Bench().arm()

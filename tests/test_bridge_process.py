@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import io
 import json
 import os
 import signal
@@ -9,6 +11,7 @@ import stat
 import subprocess
 import sys
 import time
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -198,3 +201,24 @@ def test_the_bridge_imports_neither_numpy_nor_anything_that_learns() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_bridge_process_stays_small_enough_to_be_read_in_an_afternoon() -> None:
+    ours = "[m.__file__ for name, m in sys.modules.items() if name.startswith('firmware_bridge')]"
+    code = f"import firmware_bridge.bridge, sys; print(*{ours})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert sum(lines_of_code(Path(name).read_text()) for name in done.stdout.split()) < 1000
+
+
+def lines_of_code(source: str) -> int:
+    """Lines that hold code: no blank lines, comments or docstrings."""
+    documentation = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node, clean=False):
+            documentation |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    skipped = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    code = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in skipped:
+            code |= set(range(token.start[0], token.end[0] + 1))
+    return len(code - documentation)

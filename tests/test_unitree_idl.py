@@ -10,14 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_bridge.unitree import idl
+from firmware_bridge.unitree import idl, idl_low
 from firmware_bridge.unitree.crc import LOW_STATE_LAYOUT, crc32_mpeg2, crc_of_words, low_state_crc
 from firmware_bridge.unitree.rpc import make_request
 from sim_hil.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
 from tests.fake_go2 import standing
 
-TYPES = [kind for kind in vars(idl).values() if isinstance(kind, type) and issubclass(kind, idl.IdlStruct)]
-TYPES.remove(idl.IdlStruct)
+TYPES = [
+    kind
+    for kind in {**vars(idl), **vars(idl_low)}.values()
+    if isinstance(kind, type) and issubclass(kind, idl.IdlStruct) and kind is not idl.IdlStruct
+]
 
 
 def bitwise_crc(data: bytes) -> int:
@@ -89,7 +92,7 @@ def test_low_state_layout_is_the_c_struct_less_its_crc() -> None:
 
 def test_low_state_crc_depends_on_every_motor_and_survives_the_wire() -> None:
     message = LowStateMessage().fill(standing(joint_q_rad=np.linspace(-1, 1, 12)), OdometryFrame((0.0, 0.0, 0.0)))
-    received = idl.LowState_.deserialize(message.serialize())
+    received = idl_low.LowState_.deserialize(message.serialize())
     assert low_state_crc(received) == received.crc
     seen = {received.crc}
     for motor in received.motor_state:

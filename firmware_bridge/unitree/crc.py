@@ -10,7 +10,7 @@ import struct
 import zlib
 from typing import Final
 
-from firmware_bridge.unitree.idl import LowState_
+from firmware_bridge.unitree.idl_low import LowState_
 
 _REVERSED_BITS: Final = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _MOTORS: Final = 20

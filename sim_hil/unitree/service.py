@@ -41,8 +41,10 @@ class ServiceServer:
     def __init__(self, bus: Bus, service: str) -> None:
         self.service = service
         self.malformed = 0
-        # Best effort, so that writers of any reliability match.
-        self.reader: DataReader[Any] = bus.reader(ids.request_topic(service), Request_, depth=_QUEUE_DEPTH)
+        # Reliable, as the writers of every known client are: the request that a client sends in the instant in which
+        # it is still being discovered is delivered, not lost.
+        topic = ids.request_topic(service)
+        self.reader: DataReader[Any] = bus.reader(topic, Request_, depth=_QUEUE_DEPTH, reliable=True)
         self._writer = bus.writer(ids.response_topic(service), Response_, depth=_QUEUE_DEPTH)
 
     def requests(self) -> Iterator[Received]:

@@ -10,15 +10,8 @@ from cyclonedds.pub import DataWriter
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.crc import low_state_crc
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
-from firmware_bridge.unitree.idl import (
-    BmsState_,
-    IMUState_,
-    LowState_,
-    MotorState_,
-    PathPoint_,
-    SportModeState_,
-    TimeSpec_,
-)
+from firmware_bridge.unitree.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_
+from firmware_bridge.unitree.idl_low import BmsState_, LowState_, MotorState_
 from sim_hil.go2 import RobotTruth
 
 SPORT_STATE_HZ: Final = 50
