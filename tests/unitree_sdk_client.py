@@ -1,6 +1,6 @@
 """Drives a Go2 with the maker's own Python SDK, unmodified; run by test_interop_unitree_sdk.py under the SDK's python.
 
-usage: unitree_sdk_client.py DOMAIN INTERFACE JPEG_OUT. The last line of stdout is one JSON object. Imports nothing of ours.
+usage: unitree_sdk_client.py DOMAIN INTERFACE JPEG_OUT. The last line on stdout is JSON. Imports nothing of ours.
 """
 
 import json
