@@ -54,6 +54,7 @@ class Recorder:
         self._queue: deque[tuple[str, int, Payload]] = deque()
         self._queued_bytes = 0
         self._dropped: Counter[str] = Counter()
+        self._unsaved: Counter[str] = Counter()  # taken from the queue since the last flush
         self._error: str | None = None
         self._closing = threading.Event()
         self._file: IO[bytes] | None = None
@@ -74,7 +75,11 @@ class Recorder:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Records per topic that were given to `put` and are not in the file."""
+        """Records per topic that were given to `put` and are not known to be on disk.
+
+        While `error` is None that is what was refused or could not be encoded. An error adds what was queued and
+        what was written since the last flush, of which the file may still hold a part: never fewer than are missing.
+        """
         with self._lock:
             return dict(self._dropped)
 
@@ -109,6 +114,7 @@ class Recorder:
             item = self._queue.popleft()
             if isinstance(item[2], bytes):
                 self._queued_bytes -= len(item[2])
+            self._unsaved[item[0]] += 1
             return item
 
     def _fail(self, message: str) -> None:
@@ -118,10 +124,18 @@ class Recorder:
                 self._dropped[topic] += 1
             self._queue.clear()
             self._queued_bytes = 0
+            self._dropped.update(self._unsaved)
+            self._unsaved.clear()
 
-    def _count_drop(self, topic: str) -> None:
+    def _drop_taken(self, topic: str) -> None:
         with self._lock:
-            self._dropped[topic] += 1
+            if self._unsaved[topic] > 0:  # otherwise _fail has counted it
+                self._unsaved[topic] -= 1
+                self._dropped[topic] += 1
+
+    def _all_saved(self) -> None:
+        with self._lock:
+            self._unsaved.clear()
 
     def _run(self) -> None:
         assert self._file is not None
@@ -146,7 +160,7 @@ class Recorder:
                     data = encode(payload, stamp_ns)
                 except (TypeError, ValueError, RecursionError):
                     # One record JSON cannot hold must not end the recording of all others.
-                    self._count_drop(topic)
+                    self._drop_taken(topic)
                     continue
                 log.add(topic, stamp_ns, data, image=isinstance(payload, bytes))
                 if time.monotonic_ns() - flushed_ns >= _FLUSH_PERIOD_NS:
@@ -156,9 +170,11 @@ class Recorder:
                 log.flush()
                 if os.fstat(stream.fileno()).st_nlink == 0:
                     raise OSError("the file was removed while recording")
+                self._all_saved()
                 flushed_ns = now_ns
             if closing and not self._queue:
                 log.finish()
+                self._all_saved()
                 return
             if not self._queue:
                 self._closing.wait(_POLL_S)
