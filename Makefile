@@ -1,7 +1,9 @@
 # `make demo` and `make test` install what they need into .venv and start from nothing but python3, gcc and make.
 PYTHON ?= python3
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check
+comma := ,
+# pip's log is kept, not shown: it is long, and of use only when an install fails.
+install = $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt -e ".[$(1)]" > .venv/install.log 2>&1 || { tail -n 15 .venv/install.log >&2; echo "make: the install failed; the whole log is in .venv/install.log" >&2; exit 1; }
 SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
@@ -19,13 +21,13 @@ help:
 
 # Stamps are newer than what they were installed from: a second run installs nothing.
 .venv/.demo-installed: pyproject.toml constraints.txt | .venv/bin/python
-	@echo "installing the demo's packages into .venv (once)" >&2
-	$(PIP) install --quiet -c constraints.txt -e ".[export,sim]"
+	@echo "make: installing the demo's packages into .venv, once; log: .venv/install.log" >&2
+	@$(call install,export$(comma)sim)
 	@touch $@
 
 .venv/.test-installed: .venv/.demo-installed
-	@echo "installing the test packages into .venv (once)" >&2
-	$(PIP) install --quiet -c constraints.txt -e ".[export,sim,dev]"
+	@echo "make: installing the test packages into .venv, once; log: .venv/install.log" >&2
+	@$(call install,export$(comma)sim$(comma)dev)
 	@touch $@
 
 demo: .venv/.demo-installed

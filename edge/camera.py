@@ -74,6 +74,7 @@ class CameraPoller:
             requested_ns = time.monotonic_ns()
             try:
                 jpeg = self._request(self._timeout_s)
+                arrived_ns = time.monotonic_ns()
                 pixels = decode_frame(jpeg, self._image_px)
             except CameraError as error:
                 self.failures += 1
@@ -81,6 +82,6 @@ class CameraPoller:
                 continue
             # The protocol carries no capture stamp: the answer's arrival less the camera's latency, and never before
             # the request, since both known robots sample when asked.
-            stamp_ns = max(requested_ns, time.monotonic_ns() - self._latency_ns)
+            stamp_ns = max(requested_ns, arrived_ns - self._latency_ns)
             self.newest = Frame(stamp_ns, pixels, jpeg)
             self.frames += 1

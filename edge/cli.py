@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,18 @@ EXIT_CHECK_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_REFUSED = 3
 EXIT_INTERRUPTED = 130
+
+
+def check_result_target(where: str | None) -> None:
+    """Refuse, before a long run, a place that its result cannot be written to; raises OSError with one clear line."""
+    if where is None or where == "-":
+        return
+    path = Path(where)
+    if not path.name or path.is_dir():
+        raise OSError(f"--json {where!r}: expected a file to write or -")
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise OSError(f"--json {where}: {parent} is not a directory that can be written to")
 
 
 def write_result(where: str | None, result: Mapping[str, Any]) -> None:
@@ -26,5 +39,8 @@ def write_result(where: str | None, result: Mapping[str, Any]) -> None:
     path = Path(where)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -23,6 +23,9 @@ from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
 from firmware_bridge.client import BridgeStatus
 
+BRIDGE_SILENCE_NS = 500_000_000
+"""The bridge reports at 10 Hz; when it has hung there is no point in commanding on."""
+
 
 class CommandSink(Protocol):
     """Where commands go; `BridgeClient` in production."""
@@ -65,7 +68,6 @@ class ControlLoop:
         recorder: Recorder | None,
         period_ns: int,
         step_s: float,
-        first_seq: int,
         stop: threading.Event,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -79,7 +81,8 @@ class ControlLoop:
         self._recorder = recorder
         self._period_ns = period_ns
         self._step_s = step_s
-        self._seq = first_seq
+        self.last_seq = 0
+        """Sequence number of the last command; arming has used some before the first tick."""
         self._stop = stop
         self._clock = clock
         self._tokens: EncodedFrame | None = None
@@ -96,10 +99,13 @@ class ControlLoop:
                 return None
             self.tick(deadline_ns)
             status = self._sink.poll()
+            now_ns = self._clock()
             if status is not None and status.state == "stopped":
                 return status.reason
-            behind = (self._clock() - deadline_ns) // self._period_ns
-            # One that ends after the next deadline has missed its own; those in between never happened.
+            if status is not None and now_ns - status.stamp_ns > BRIDGE_SILENCE_NS:
+                return f"no word from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
+            behind = (now_ns - deadline_ns) // self._period_ns
+            # Deadlines that a late tick has slept over are skipped, not made up for: each counts as a missed tick.
             self.statistics.missed += max(0, behind)
             deadline_ns += self._period_ns * max(1, behind + 1)
         return None
@@ -107,8 +113,7 @@ class ControlLoop:
     def tick(self, deadline_ns: int) -> VelocityCommand:
         """One pass; returns the command it sent."""
         start_ns = self._clock()
-        frame = self._newest_frame()
-        encoded = self._encode(frame)
+        encoded = self._encode(self._newest_frame())
         encoded_ns = self._clock()
         semantic = self._slot.state
         pose = self._history.newest()
@@ -127,13 +132,14 @@ class ControlLoop:
         acted_ns = self._clock()
         inputs = ControllerInputs(
             trajectory=trajectory,
-            frame_age_ms=None if frame is None else (acted_ns - frame.stamp_ns) / 1e6,
+            # Of the frame that was encoded and driven by, which is not the camera's newest when the encoder fails.
+            frame_age_ms=None if encoded is None else (acted_ns - encoded.stamp_ns) / 1e6,
             odometry_age_ms=None if pose is None else (acted_ns - pose.stamp_ns) / 1e6,
         )
         command = self._controller.step(inputs, acted_ns)
-        self._seq += 1
+        self.last_seq += 1
         stamp_ns = self._clock()
-        if not self._sink.send_velocity(self._seq, stamp_ns, command.vx_mps, command.vy_mps, command.wz_radps):
+        if not self._sink.send_velocity(self.last_seq, stamp_ns, command.vx_mps, command.vy_mps, command.wz_radps):
             self.statistics.unsent += 1
         end_ns = self._clock()
         self.statistics.ticks += 1
@@ -151,7 +157,7 @@ class ControlLoop:
                     "late_ms": (start_ns - deadline_ns) / 1e6,
                     "encode_ms": (encoded_ns - start_ns) / 1e6,
                     "act_ms": (acted_ns - now_ns) / 1e6,
-                    "frame_ns": None if frame is None else frame.stamp_ns,
+                    "frame_ns": None if encoded is None else encoded.stamp_ns,
                     "frame_age_ms": inputs.frame_age_ms,
                     "generation": None if delay_s is None or semantic is None else semantic.generation,
                     "anchor_ns": None if delay_s is None or semantic is None else semantic.anchor_ns,

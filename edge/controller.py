@@ -68,8 +68,10 @@ def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
     return arc_m / time_s, 2 * bearing / time_s
 
 
-def _toward(value: float, goal: float, step: float) -> float:
-    return min(max(goal, value - step), value + step)
+def _grow(value: float, goal: float, step: float) -> float:
+    """`goal`, with its magnitude at most `step` above that of `value`: speeding up is limited, slowing down is not."""
+    reached = abs(value) if value * goal > 0 else 0.0
+    return math.copysign(min(abs(goal), reached + step), goal)
 
 
 class Controller:
@@ -94,10 +96,10 @@ class Controller:
         target = SE2(x, y, theta)
         speed, yaw_rate = arc_to(target, TARGET_TIME_S)
         limits = self._config.limits
-        speed = min(max(speed, limits.vx_min_mps), limits.vx_max_mps)
-        yaw_rate = min(max(yaw_rate, -limits.wz_max_radps), limits.wz_max_radps)
-        self._vx_mps = _toward(self._vx_mps, speed, limits.accel_mps2 * elapsed_s)
-        self._wz_radps = _toward(self._wz_radps, yaw_rate, limits.alpha_radps2 * elapsed_s)
+        # Both are scaled by the same factor: limits make the robot slower on its arc, not take another arc.
+        scale = 1 / max(1.0, speed / limits.vx_max_mps, abs(yaw_rate) / limits.wz_max_radps)
+        self._vx_mps = _grow(self._vx_mps, speed * scale, limits.accel_mps2 * elapsed_s)
+        self._wz_radps = _grow(self._wz_radps, yaw_rate * scale, limits.alpha_radps2 * elapsed_s)
         return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
 
     def _refusal(self, inputs: ControllerInputs) -> str | None:

@@ -22,8 +22,7 @@ class GraphError(RuntimeError):
 class Graph:
     """A session on the CPU with a stated number of threads.
 
-    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run, and external data
-    (which would be read from disk unchecked) cannot be reached.
+    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run.
     """
 
     def __init__(self, artifacts: Artifacts, name: str, *, threads: int) -> None:
@@ -34,6 +33,10 @@ class Graph:
         # A spinning worker would take the core that the other thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
+        # Opened from bytes, a graph would read external weights from the working directory: from a folder that is
+        # not there it can read none, and fails to open.
+        nowhere = str(artifacts.directory / "no-external-data")
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", nowhere)
         try:
             self._session = ort.InferenceSession(
                 artifacts.contents[contract.file], sess_options=options, providers=["CPUExecutionProvider"]

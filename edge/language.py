@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from tokenizers import Tokenizer
 
+from edge.geometry import SE2
 from edge.graph import Array, Graph
-from edge.manifest import Artifacts
-from edge.prompt import PromptBuilder, PromptIds, Segment
+from edge.manifest import ArtifactError, Artifacts
+from edge.prompt import InstructionError, PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_TEXT_CHARS
+from edge.ring import EncodedFrame
 
 
 class CancelledError(Exception):
@@ -44,7 +46,10 @@ class LanguageModel:
     def __init__(self, artifacts: Artifacts, *, threads: int = 1) -> None:
         runtime = artifacts.runtime
         self._graph = Graph(artifacts, "language_model", threads=threads)
-        self._tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
+        try:
+            self._tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
+        except Exception as error:
+            raise ArtifactError(f"tokenizer.json: not a tokenizer ({error})") from error
         self._runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
@@ -54,6 +59,19 @@ class LanguageModel:
         self._caches = [t for t in contract.inputs if t.name.startswith("past_key_values.")]
         visual = contract.input("visual_tokens").shape
         self._no_frame = np.zeros((1, *cast(tuple[int, int], visual[1:])), dtype=np.float32)
+
+    def check_instruction(self, instruction: str, frames: int) -> None:
+        """Raise InstructionError unless a prompt with `frames` frames and a full answer fit the model's context."""
+        past = SE2(-99.9, -99.9, 0.0)  # the longest numbers that past motion is told in
+        filler = [
+            EncodedFrame(i, past if i + 1 < frames else SE2(0.0, 0.0, 0.0), self._no_frame) for i in range(frames)
+        ]
+        needed = sum(len(segment.ids) for segment in self.prompt.build(filler, instruction))
+        room = self._runtime.max_context - self._runtime.max_new_tokens
+        if needed > room:
+            raise InstructionError(
+                f"instruction makes a prompt of {needed} tokens, the model has room for {room}: shorten it"
+            )
 
     def generate(
         self, segments: Sequence[Segment], *, max_new_tokens: int, cancelled: Callable[[], bool]

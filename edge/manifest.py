@@ -72,6 +72,13 @@ class RuntimeConfig:
     img_end_id: int
     img_context_id: int
 
+    def __post_init__(self) -> None:
+        for name in ("image_px", "frame_tokens", "kv_dim", "max_context", "max_new_tokens", "tick_period_ms", "step_s"):
+            if getattr(self, name) <= 0:
+                raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {getattr(self, name)}")
+        if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
+            raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
+
 
 @dataclass(frozen=True)
 class Artifacts:

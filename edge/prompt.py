@@ -43,6 +43,8 @@ def check_instruction(text: str) -> str:
     line = " ".join(text.split())
     if not line:
         raise InstructionError("instruction is empty: expected a sentence such as 'walk to the vending machine'")
+    if any("\ud800" <= character <= "\udfff" for character in line):
+        raise InstructionError("instruction is not valid UTF-8 text")
     if len(line) > MAX_INSTRUCTION_CHARS:
         raise InstructionError(f"instruction has {len(line)} characters, at most {MAX_INSTRUCTION_CHARS} are read")
     return line

@@ -19,7 +19,7 @@ class ReleaseDelayError(ValueError):
 
 @dataclass(frozen=True)
 class ReleaseDelay:
-    """A constant (`low_s == mean_s == high_s`) or a gamma distribution cut to [low_s, high_s], seeded."""
+    """A constant (`sd_s` 0) or a gamma distribution of that mean and deviation cut to [low_s, high_s], seeded."""
 
     mean_s: float
     sd_s: float = 0.0
@@ -31,6 +31,8 @@ class ReleaseDelay:
         values = (self.mean_s, self.sd_s, self.low_s, self.high_s)
         if not all(math.isfinite(v) and v >= 0 for v in values):
             raise ReleaseDelayError(f"release delay values must be finite and not negative, found {values}")
+        if self.sd_s != 0 and not 1e-3 <= self.sd_s <= MAX_DELAY_S:
+            raise ReleaseDelayError(f"expected sd_s 0 or between 0.001 and {MAX_DELAY_S} s, found {self.sd_s}")
         if not self.low_s <= self.mean_s <= self.high_s <= MAX_DELAY_S:
             raise ReleaseDelayError(f"expected low ≤ mean ≤ high ≤ {MAX_DELAY_S} s, found {values}")
 

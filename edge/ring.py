@@ -32,10 +32,6 @@ class TokenRing:
         self._slots[self._count % len(self._slots)] = frame
         self._count += 1
 
-    def newest(self) -> EncodedFrame | None:
-        """The last frame put, or None."""
-        return self._slots[(self._count - 1) % len(self._slots)] if self._count else None
-
     def select(self, offsets_s: Sequence[float], tolerance_s: float = 0.5) -> list[EncodedFrame]:
         """Frames at the newest stamp minus each offset, oldest first; those not there yet are left out.
 

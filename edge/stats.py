@@ -12,4 +12,4 @@ def percentiles(samples: Sequence[float], *points: str) -> dict[str, float | Non
     if not samples:
         return dict.fromkeys(points)
     quantiles = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
-    return {p: round(float(np.percentile(samples, quantiles[p], method="higher")), 4) for p in points}
+    return {p: round(float(np.percentile(samples, quantiles[p], method="inverted_cdf")), 4) for p in points}

@@ -71,25 +71,38 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 def build_artifacts(export: Export, out: Path, progress: Progress) -> dict[str, Any]:
     """Write `out`, return its manifest; raises GateError, ArtifactError or OSError and then leaves nothing behind."""
     partial = out.with_name(out.name + ".partial")
-    if out.exists():
-        # Checked again here because building takes long: an existing directory is replaced only if it is one of ours.
-        read_manifest(out)
+    _check_replaceable(out)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
         manifest = _write_directory(export, partial, progress)
         _sync(partial)
+        _check_replaceable(out)  # once more: building took its time
+        retired = out.with_name(out.name + ".old.partial")
+        shutil.rmtree(retired, ignore_errors=True)
         if out.exists():
-            retired = out.with_name(out.name + ".old.partial")
-            shutil.rmtree(retired, ignore_errors=True)
             out.rename(retired)
+        try:
             partial.rename(out)
-            shutil.rmtree(retired)
-        else:
-            partial.rename(out)
+        except BaseException:
+            if retired.exists():
+                retired.rename(out)
+            raise
+        _sync_one(out.parent)
+        shutil.rmtree(retired, ignore_errors=True)
         return manifest
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _check_replaceable(out: Path) -> None:
+    """An existing directory is replaced only if it is an artifact directory with nothing of the user's beside it."""
+    if not out.exists():
+        return
+    listed = {MANIFEST_NAME, *read_manifest(out)["files"]}
+    others = sorted(path.name for path in out.iterdir() if path.name not in listed)
+    if others:
+        raise ArtifactError(f"{out / others[0]}: not ours, so {out} is not replaced; name another directory")
 
 
 def _write_directory(export: Export, directory: Path, progress: Progress) -> dict[str, Any]:
@@ -160,11 +173,15 @@ def check_directory(
 
 def _sync(directory: Path) -> None:
     for path in [*directory.iterdir(), directory]:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        _sync_one(path)
+
+
+def _sync_one(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def report_html(manifest: Mapping[str, Any]) -> str:
@@ -197,6 +214,8 @@ def verify_directory(
     """Hashes, contract and parity of an existing directory once more; raises ArtifactError or GateError."""
     load_artifacts(directory)
     manifest = read_manifest(directory)
+    if not isinstance(manifest["provenance"], dict):
+        raise ArtifactError(f"{directory / MANIFEST_NAME}: provenance must be an object")
     export = rebuild(manifest)
     if weights_sha256(export.model) != manifest["provenance"].get("weights_sha256"):
         raise ArtifactError(f"{directory}: was made from other weights than {export.info.origin}; pass --checkpoint")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import resource
 import sys
 import time
@@ -11,7 +12,7 @@ from typing import Any
 
 import torch
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
 from edge.manifest import ArtifactError
 from export.artifacts import Export, GateError, build_artifacts, verify_directory
 from export.model.network import build
@@ -27,6 +28,10 @@ EXAMPLES = """examples:
 
 exit codes: 0 done, 1 a graph is not the same model, 2 bad arguments or input, 130 interrupted
 """
+
+
+class UsageError(ValueError):
+    """Arguments that do not go together."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -67,9 +72,9 @@ def _load(args: argparse.Namespace, target_name: str, model_name: str) -> Export
 
 def _rebuilder(args: argparse.Namespace) -> Any:
     def rebuild(manifest: dict[str, Any]) -> Export:
-        origin = str(manifest["provenance"].get("weights_origin", ""))
-        if args.checkpoint is None and args.random_weights is None and origin.startswith("random seed "):
-            args.random_weights = int(origin.removeprefix("random seed "))
+        seed = re.fullmatch(r"random seed (\d{1,19})", str(manifest["provenance"].get("weights_origin", "")))
+        if args.checkpoint is None and args.random_weights is None and seed is not None:
+            args.random_weights = int(seed[1])
         return _load(args, str(manifest["target"]), str(manifest["model"].get("name")))
 
     return rebuild
@@ -82,11 +87,15 @@ def _say(line: str) -> None:
 def _run(args: argparse.Namespace) -> dict[str, Any]:
     if args.command == "verify":
         if args.directory is None:
-            raise ArtifactError("verify: which directory? expected: edge-export verify DIR")
+            raise UsageError("verify: which directory? expected: edge-export verify DIR")
         manifest = verify_directory(args.directory, _rebuilder(args), _say)
         return _result(manifest)
     if args.out is None:
-        raise ArtifactError("--out is missing: expected a directory to write, e.g. --out out/nano")
+        raise UsageError("--out is missing: expected a directory to write, e.g. --out out/nano")
+    check_result_target(args.json)
+    args.out = args.out.absolute()
+    if not args.out.name:
+        raise UsageError(f"--out {args.out}: expected a directory that can be made")
     export = _load(args, args.target, args.model)
     if not export.info.trained:
         _say(f"weights are untrained ({export.info.origin}): the robot will move, it will not navigate")
@@ -127,12 +136,12 @@ def main(argv: list[str] | None = None) -> int:
     except GateError as error:
         _say(str(error))
         return EXIT_CHECK_FAILED
-    except (ArtifactError, WeightsError, TargetError, OSError) as error:
+    except (UsageError, ArtifactError, WeightsError, TargetError, OSError) as error:
         _say(str(error))
         # An artifact that does not verify is a failed check; anything else here is bad input.
         return EXIT_CHECK_FAILED if args.command == "verify" and isinstance(error, ArtifactError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted; nothing was left behind")
+        _say("interrupted")
         return EXIT_INTERRUPTED
     if args.json != "-":
         for name, graph in result["graphs"].items():

@@ -28,12 +28,17 @@ LIMITS = LimitsConfig(
 class FakePolicy:
     """Walks straight ahead; remembers what it was given and can be told to fail."""
 
-    def __init__(self) -> None:
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
         self.encoded = 0
         self.calls: list[tuple[float, SE2, int]] = []
         self.broken = False
+        self.blind = False
 
     def encode(self, frame: np.ndarray) -> np.ndarray:
+        if self.blind:
+            raise GraphError("vision_encoder: broken")
+        self.bench.now_ns += self.bench.encode_ns
         self.encoded += 1
         return np.zeros((1, 4, 8), dtype=np.float32)
 
@@ -49,7 +54,9 @@ class FakePolicy:
 class FakeSink:
     """Collects commands; says what state the bridge is in."""
 
-    def __init__(self) -> None:
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.silent_ns = 0
         self.commands: list[tuple[int, float, float]] = []
         self.state = "armed"
 
@@ -58,7 +65,7 @@ class FakeSink:
         return True
 
     def poll(self) -> BridgeStatus:
-        return BridgeStatus(0, self.state, "deadman", 0, 0, 0, (0.0, 0.0, 0.0), False)
+        return BridgeStatus(self.bench.now_ns - self.silent_ns, self.state, "deadman", 0, 0, 0, (0.0, 0.0, 0.0), False)
 
 
 class Bench:
@@ -66,9 +73,10 @@ class Bench:
 
     def __init__(self) -> None:
         self.now_ns = 10**12
+        self.encode_ns = 0
         self.frame: Frame | None = None
-        self.policy = FakePolicy()
-        self.sink = FakeSink()
+        self.policy = FakePolicy(self)
+        self.sink = FakeSink(self)
         self.history = PoseHistory()
         self.ring = TokenRing(16)
         self.slot = SemanticSlot()
@@ -85,10 +93,10 @@ class Bench:
             recorder=None,
             period_ns=PERIOD_NS,
             step_s=0.1,
-            first_seq=7,
             stop=self.stop,
             clock=lambda: self.now_ns,
         )
+        self.loop.last_seq = 7
 
     def see(self, x_m: float = 0.0) -> None:
         self.history.put(StampedPose(self.now_ns, SE2(x_m, 0.0, 0.0), 0.4, 0.0, 0.0))
@@ -138,6 +146,14 @@ def test_the_delay_is_now_minus_the_anchor_and_the_offset_is_the_motion_since(be
     assert bench.loop.statistics.delay_error_ms[-1] < 1.0
 
 
+def test_the_delay_is_taken_when_the_action_expert_is_called_not_when_the_tick_began(bench: Bench) -> None:
+    bench.see()
+    bench.think(0)
+    bench.encode_ns = 40_000_000
+    bench.tick()
+    assert bench.policy.calls[-1][0] == pytest.approx(0.040)
+
+
 def test_a_frame_is_encoded_once_however_often_it_is_used(bench: Bench) -> None:
     bench.see()
     bench.tick()
@@ -151,8 +167,7 @@ def test_a_frame_is_encoded_once_however_often_it_is_used(bench: Bench) -> None:
 def test_every_encoded_frame_is_left_for_the_reasoning_thread_with_its_pose(bench: Bench) -> None:
     bench.see(x_m=3.0)
     bench.tick()
-    newest = bench.ring.newest()
-    assert newest is not None
+    (newest,) = bench.ring.select((0.0,))
     assert bench.frame is not None
     assert newest.stamp_ns == bench.frame.stamp_ns
     assert newest.T_odom_base == SE2(3.0, 0.0, 0.0)
@@ -167,6 +182,24 @@ def test_when_the_camera_stops_the_command_becomes_zero(bench: Bench) -> None:
         reasons.append(bench.tick()[1])
     assert reasons[:6] == ["ok"] * 6
     assert reasons[6:] == ["stale-frame"] * 2
+
+
+def test_when_the_encoder_fails_fresh_camera_frames_do_not_keep_the_robot_going(bench: Bench) -> None:
+    bench.see()
+    bench.think(0)
+    bench.tick()
+    bench.policy.blind = True
+    reasons = []
+    for _ in range(7):
+        bench.see()
+        reasons.append(bench.tick()[1])
+    assert reasons[-1] == "stale-frame"
+
+
+def test_a_bridge_that_has_gone_silent_ends_the_loop(bench: Bench) -> None:
+    bench.see()
+    bench.sink.silent_ns = 700_000_000
+    assert bench.loop.run(bench.now_ns, None) == "no word from it for 0.7 s"
 
 
 def test_a_broken_action_expert_stops_the_robot_and_not_the_loop(bench: Bench) -> None:

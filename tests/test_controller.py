@@ -102,6 +102,22 @@ def test_speed_rises_no_faster_than_the_slew_limit() -> None:
     assert max(steps) <= LIMITS.accel_mps2 * 0.1 + 1e-9
 
 
+def test_slowing_down_is_immediate() -> None:
+    controller = Controller(CONFIG)
+    for tick in range(20):
+        controller.step(fresh(plan(0.08)), tick * TICK_NS)
+    assert controller.step(fresh(plan(0.0)), 20 * TICK_NS).vx_mps == 0.0
+
+
+@given(st.floats(0.06, 4.0), st.floats(-1.5, 1.5))
+def test_limits_make_the_robot_slower_on_its_arc_not_take_another(distance: float, bearing: float) -> None:
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    trajectory = np.tile(np.float32([x, y, 0.0]), (30, 1))
+    speed, yaw_rate = settled(trajectory)
+    wanted_speed, wanted_yaw_rate = arc_to(SE2(float(np.float32(x)), float(np.float32(y)), 0.0), 1.0)
+    assert yaw_rate * wanted_speed == pytest.approx(wanted_yaw_rate * speed, abs=1e-6)
+
+
 def test_a_long_pause_does_not_buy_a_jump() -> None:
     controller = Controller(CONFIG)
     controller.step(fresh(plan(0.08)), 0)

@@ -76,14 +76,14 @@ def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> No
     result = json.loads(done.stdout)
 
     assert result["faults"] == []
-    assert result["control"]["ticks"] >= 70
+    assert result["control"]["ticks"] >= 60
     assert result["reasoning"]["generations"] >= 2
     assert result["bridge"]["zero_after_stop"] is True
     moves = robot.moves()
     assert any(not zero for _, zero in moves)
     assert moves[-1][1], "the last command on the wire is zero velocity"
     poses = [r for r in read_trace(robot.trace) if r["kind"] == "pose"]
-    assert poses[-1]["x"] - poses[0]["x"] > 1.0
+    assert poses[-1]["x"] - poses[0]["x"] > 0.5
 
     records: dict[str, list[dict]] = {}
     for topic, _, payload in read_messages(flight):
@@ -148,6 +148,15 @@ def test_without_a_bridge_it_refuses(tmp_path: Path, artifacts_dir: Path, dds_do
     assert "start `edge-bridge" in done.stderr.splitlines()[-1]
 
 
+def test_an_instruction_that_would_not_fit_with_four_frames_is_refused(
+    tmp_path: Path, artifacts_dir: Path, dds_domain: int
+) -> None:
+    robot = Robot(tmp_path, dds_domain, artifacts_dir)
+    done = run(*robot.arguments("--instruction", "0123456789" * 40))
+    assert done.returncode == 2
+    assert "shorten it" in done.stderr
+
+
 def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifacts_dir: Path) -> None:
     broken = tmp_path / "nano"
     broken.mkdir()
@@ -167,6 +176,9 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
         (("--duration", "-3"), "--duration"),
         (("--release-delay", "soon"), "release delay"),
         (("--robot", "no-such-robot.toml"), "no-such-robot.toml"),
+        (("--json", "."), "--json"),
+        (("--record", GO2_SIM), "never overwritten"),
+        (("--record", "no-such-folder/flight.mcap"), "no-such-folder"),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], said: str) -> None:

@@ -98,6 +98,15 @@ def test_a_small_error_in_one_output_fails(model: TicVla, artifacts: Artifacts) 
     assert shifted.verdict == "FAIL"
 
 
+@pytest.mark.parametrize("dead", ["visual_tokens", "state", "latency", "context_keys", "context_values"])
+def test_an_action_expert_that_ignores_one_of_its_inputs_fails(model: TicVla, artifacts: Artifacts, dead: str) -> None:
+    from edge.graph import Graph
+
+    graph = Graph(artifacts, "action_expert", threads=1)
+    result = check_graph(model, graph_specs(model)[3], lambda f: graph.run({**f, dead: np.zeros_like(f[dead])}), GATE)
+    assert result.verdict == "FAIL"
+
+
 def test_not_finite_outputs_fail(model: TicVla, artifacts: Artifacts) -> None:
     from edge.graph import Graph
 
@@ -150,6 +159,34 @@ def test_two_exports_of_the_same_weights_are_byte_identical(artifacts_dir: Path,
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name
 
 
+def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    (out / "flight.mcap").write_bytes(b"evidence")
+    assert main(["--out", str(out)]) == 2
+    assert "flight.mcap" in capsys.readouterr().err
+    assert (out / "flight.mcap").read_bytes() == b"evidence"
+
+
+def test_a_failed_swap_puts_the_old_directory_back(
+    model: TicVla, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == "nano.partial":
+            raise OSError("disk full")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="disk full"):
+        build_artifacts(Export(load_target("cpu"), model, WeightsInfo(False, "")), out, lambda _line: None)
+    assert [p.name for p in tmp_path.iterdir()] == ["nano"]
+    load_artifacts(out)
+
+
 def test_an_existing_directory_that_is_not_ours_is_not_touched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,13 +206,14 @@ def test_an_existing_directory_that_is_not_ours_is_not_touched(
         (["--out", "x", "--random-weights", "-1"], "expected a seed"),
         ([], "--out is missing"),
         (["verify"], "which directory"),
+        (["--out", "/"], "expected a directory"),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(
     arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == (1 if arguments == ["verify"] else 2)
+    assert main(arguments) == 2
     captured = capsys.readouterr()
     assert said in captured.err
     assert len(captured.err.strip().splitlines()) == 1

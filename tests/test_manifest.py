@@ -9,9 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
 
 from edge.graph import Graph
+from edge.language import LanguageModel
 from edge.manifest import ArtifactError, load_artifacts
 
 
@@ -108,6 +110,25 @@ def test_widths_that_do_not_fit_one_another_are_refused(copy: Path) -> None:
         load_artifacts(copy)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tick_period_ms": 0},
+        {"frame_offsets_s": []},
+        {"frame_offsets_s": [1e5]},
+        {"max_context": 0},
+        {"max_new_tokens": -1},
+        {"step_s": "0.1"},
+        {"image_px": True},
+    ],
+    ids=str,
+)
+def test_runtime_values_that_cannot_be_run_are_refused(copy: Path, change: dict[str, Any]) -> None:
+    edit(copy, lambda m: m["runtime"].update(change))
+    with pytest.raises(ArtifactError, match="runtime"):
+        load_artifacts(copy)
+
+
 def test_an_unknown_runtime_key_is_refused(copy: Path) -> None:
     edit(copy, lambda m: m["runtime"].update(max_speed=9))
     with pytest.raises(ArtifactError, match="runtime has"):
@@ -121,6 +142,30 @@ def test_a_graph_that_is_not_what_the_manifest_says_is_refused_when_opened(copy:
     edit(copy, lambda m: m["files"].update({"action_expert.onnx": entry}))
     with pytest.raises(ArtifactError, match="not those of the manifest"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
+
+
+def replace(directory: Path, name: str, data: bytes) -> None:
+    (directory / name).write_bytes(data)
+    entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    edit(directory, lambda m: m["files"].update({name: entry}))
+
+
+def test_weights_outside_the_graph_cannot_be_reached(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    proto = onnx.load(str(copy / "semantic_context.onnx"))
+    onnx.external_data_helper.convert_model_to_external_data(proto, location="planted.bin", size_threshold=0)
+    onnx.save(proto, str(copy.parent / "external.onnx"))
+    replace(copy, "semantic_context.onnx", (copy.parent / "external.onnx").read_bytes())
+    # The file is there, in the working directory, with weights of the right size.
+    monkeypatch.chdir(copy.parent)
+    assert Path("planted.bin").exists()
+    with pytest.raises(ArtifactError, match="cannot open"):
+        Graph(load_artifacts(copy), "semantic_context", threads=1)
+
+
+def test_a_tokenizer_that_is_none_is_refused(copy: Path) -> None:
+    replace(copy, "tokenizer.json", b"{}")
+    with pytest.raises(ArtifactError, match="not a tokenizer"):
+        LanguageModel(load_artifacts(copy))
 
 
 def test_a_file_that_is_no_graph_is_refused_when_opened(copy: Path) -> None:

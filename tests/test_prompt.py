@@ -48,7 +48,7 @@ def test_past_motion_is_told_in_the_newest_frames_coordinates() -> None:
     assert past_motion(FRAMES[:1]) == "none"
 
 
-@pytest.mark.parametrize("bad", ["", "  \n ", "x" * 401])
+@pytest.mark.parametrize("bad", ["", "  \n ", "x" * 401, "go \udcff"])
 def test_an_empty_or_endless_instruction_is_refused(bad: str) -> None:
     with pytest.raises(InstructionError):
         check_instruction(bad)

@@ -53,6 +53,8 @@ def test_what_is_no_delay_is_refused(bad: str) -> None:
         {"schema": 1, "mean_s": True},
         {"schema": 1, "mean_s": 1, "seed": 0.5},
         {"schema": 1, "mean_s": 5, "high_s": 4},
+        {"schema": 1, "mean_s": 5, "sd_s": 1e-200},
+        {"schema": 1, "mean_s": 5, "sd_s": 1e300},
     ],
 )
 def test_a_wrong_profile_is_refused(tmp_path: Path, content: dict[str, object]) -> None:

@@ -33,7 +33,6 @@ def test_at_the_start_fewer_frames_are_used() -> None:
 
 def test_an_empty_ring_selects_nothing() -> None:
     assert TokenRing(8).select(OFFSETS_S) == []
-    assert TokenRing(8).newest() is None
 
 
 def test_a_gap_in_the_frames_leaves_that_frame_out() -> None:

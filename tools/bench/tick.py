@@ -62,12 +62,16 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--core", type=int, default=0, help="processor to pin to (default: 0)")
     p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
-    os.sched_setaffinity(0, {args.core})
     rng = np.random.default_rng(0)
     try:
+        if args.rounds < 1 or not 1 <= args.tokens <= 100_000:
+            raise ArtifactError("--rounds and --tokens must be positive")
+        os.sched_setaffinity(0, {args.core})
         artifacts = load_artifacts(args.artifacts)
         model_name = read_manifest(args.artifacts)["model"]["name"]
-    except ArtifactError as error:
+        if args.tokens > artifacts.runtime.max_context:
+            raise ArtifactError(f"--tokens {args.tokens}: the model reads {artifacts.runtime.max_context}")
+    except (ArtifactError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return EXIT_BAD_INPUT
     px = artifacts.runtime.image_px
