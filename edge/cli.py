@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
@@ -44,3 +45,16 @@ def write_result(where: str | None, result: Mapping[str, Any]) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def run_with_extra(command: str, module: str, extra: str) -> int:
+    """Run `module.main()` of an optional part; without its packages, one line that says how to install them."""
+    try:
+        main = importlib.import_module(module).main
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"{command}: needs the packages of the extra {extra!r} ({error.name} is missing): "
+            f"pip install 'tic-vla-edge[{extra}]'\n"
+        )
+        return EXIT_BAD_INPUT
+    return int(main())

@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
     p.add_argument("--target", default="cpu", help="device to export for (default: cpu)")
     p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
-    p.add_argument("--model", default="nano", help="preset: nano or 1b (default: nano)")
+    p.add_argument("--model", default="nano", help="preset (default: nano; 1b is not exported yet)")
     source = p.add_mutually_exclusive_group()
     source.add_argument("--checkpoint", type=Path, metavar="PATH", help="weights as safetensors (see --save-weights)")
     source.add_argument(
