@@ -57,9 +57,11 @@ def hil(mood: str) -> None:
 
 
 def bridge(mood: str) -> None:
+    from tests import synthetic_run
+
     Path(value("--socket")).touch()
     wait_for_interrupt(mood)
-    Path(value("--json")).write_text(json.dumps({"commands": 1}))
+    Path(value("--json")).write_text(json.dumps(synthetic_run.bridge_result(DURATION_S)))
 
 
 def run(mood: str) -> None:

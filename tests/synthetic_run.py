@@ -21,6 +21,8 @@ TICK_NS = 100_000_000
 THINK_NS = 900_000_000
 RELEASE_NS = 2_000_000_000
 SPEED_MPS = 0.4
+CALL_ERROR_MS = 1.3725
+MACHINE = {"processor": "Synthetic 9000", "cores usable": "3"}
 HOSTILE_TEXT = 'turn </pre><script>alert("x")</script> \u202eleft\u0007 & <b>go</b> \U0001f916'
 
 
@@ -111,6 +113,21 @@ def hil_result(duration_s: float) -> dict[str, Any]:
     }
 
 
+def bridge_result(duration_s: float) -> dict[str, Any]:
+    """JSON result of edge-bridge: every Move that the robot received was written by it."""
+    return {
+        "state": "stopped",
+        "reason": "stopped by the client",
+        "commands": hil_result(duration_s)["wire"]["commands"],
+        "rejected": 0,
+        "last_seq": int(duration_s * 10),
+        "last_command": [0.0, 0.0, 0.0],
+        "zero_after_stop": True,
+        "malformed": {"client": 0, "robot": 0},
+        "failed_writes": 0,
+    }
+
+
 def generations(duration_s: float) -> list[dict[str, Any]]:
     """/semantic records: a generation starts when the last one was released; the first anchor is the first frame."""
     records = []
@@ -178,7 +195,7 @@ def tick_records(duration_s: float) -> list[dict[str, Any]]:
 
 
 def run_result(duration_s: float) -> dict[str, Any]:
-    """JSON result of edge-run."""
+    """JSON result of edge-run; it last asked the bridge before the zero command that the bridge adds by itself."""
     return {
         "control": {
             "ticks": int(duration_s * 10),
@@ -191,8 +208,12 @@ def run_result(duration_s: float) -> dict[str, Any]:
             "generation_ms": {"p50": 900.0, "p99": 905.0, "max": 905.0},
         },
         "delay_s": {"p50": 4.3, "p99": 5.7, "max": 5.8},
-        "bridge": {"commands": 510, "last_command": [0.0, 0.0, 0.0], "zero_after_stop": True},
-        "delay_error_ms": {"max": 0.0},
+        "bridge": {
+            "commands": bridge_result(duration_s)["commands"] - 1,
+            "last_command": [0.0, 0.0, 0.0],
+            "zero_after_stop": True,
+        },
+        "delay_error_ms": {"max": CALL_ERROR_MS},
         "faults": [],
         "duration_s": duration_s + 0.8,
         "peak_rss_bytes": 512 * 2**20,
@@ -234,9 +255,10 @@ def write_run(
     write_flight_log(out / "flight.mcap", duration_s, ticks, semantics)
     lines = trace_lines(duration_s) if trace is None else trace
     (out / "hil_trace.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (out / "settings.json").write_text(json.dumps({"duration_s": duration_s, "seed": 7, "people": 2}))
+    settings = {"duration_s": duration_s, "seed": 7, "people": 2, "artifacts": "artifacts", "machine": MACHINE}
+    (out / "settings.json").write_text(json.dumps(settings))
     (out / "run.json").write_text(json.dumps(run_result(duration_s)))
     (out / "hil.json").write_text(json.dumps(hil_result(duration_s)))
-    (out / "bridge.json").write_text(json.dumps({"commands": 510}))
+    (out / "bridge.json").write_text(json.dumps(bridge_result(duration_s)))
     (out / "artifacts").mkdir(exist_ok=True)
     (out / "artifacts" / "manifest.json").write_text(json.dumps({"model": {"preset": "nano", "trained": trained}}))

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import pytest
 from tools import children, demo
 from tools.children import Children, StepError, tail
 from tools.progress import Progress, TraceTail
+from tools.report.machine import machine_facts
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FAKE = REPOSITORY / "tests" / "fake_step.py"
@@ -38,19 +40,30 @@ def left_behind(out: Path) -> list[str]:
     return found
 
 
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the demo makes its temporary folder during the test."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def socket_folders(folder: Path) -> list[Path]:
+    return list(folder.glob("tic-*"))
+
+
 def run(out: Path, **moods: str) -> int:
     return demo.main(["--out", str(out), "--duration", "6", "--domain", "77"], commands=fakes(**moods))
 
 
 def test_all_steps_give_a_report_whose_path_is_the_last_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, temporary: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(tmp_path / "demo")
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == str(tmp_path / "demo" / "report.html")
     assert (tmp_path / "demo" / "report.html").exists()
     assert json.loads((tmp_path / "demo" / "demo.json").read_text())["wall_s"] > 0
-    assert left_behind(tmp_path) == []
+    assert left_behind(tmp_path) == [] and socket_folders(temporary) == []
 
 
 def test_a_failed_check_is_exit_1_and_still_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,7 +96,7 @@ def test_an_old_report_does_not_survive_a_failed_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("role", "step"), [(role, step) for step, role in ROLES.items()])
 def test_a_failing_step_is_named_with_its_log_and_last_lines(
-    tmp_path: Path, role: str, step: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, temporary: Path, role: str, step: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(tmp_path, **{role: "fails"}) == 1
     captured = capsys.readouterr()
@@ -91,7 +104,7 @@ def test_a_failing_step_is_named_with_its_log_and_last_lines(
     assert str(tmp_path / "log" / f"{step}.log") in captured.err
     assert "    the reason is here" in captured.err
     assert captured.out == ""
-    assert left_behind(tmp_path) == []
+    assert left_behind(tmp_path) == [] and socket_folders(temporary) == []
 
 
 def test_a_run_that_a_fault_ended_is_named_and_still_gets_its_report(
@@ -158,11 +171,12 @@ def start_demo(out: Path, runner_mood: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_every_process_and_exits_130(tmp_path: Path, number: int) -> None:
     process = start_demo(tmp_path, "slow")
+    assert len(socket_folders(tmp_path)) == 1
     process.send_signal(number)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 130
     assert "interrupted, all processes ended" in err and out == ""
-    assert left_behind(tmp_path) == []
+    assert left_behind(tmp_path) == [] and socket_folders(tmp_path) == []
 
 
 def test_even_a_killed_demo_leaves_no_process_behind(tmp_path: Path) -> None:
@@ -201,9 +215,11 @@ def test_a_child_deaf_to_sigint_is_killed_with_all_it_started(tmp_path: Path) ->
 def test_processes_end_in_reverse_order_of_their_start(tmp_path: Path) -> None:
     script = (
         "import sys, time\n"
-        "print('up', flush=True)\n"
-        "try: time.sleep(60)\n"
-        "except KeyboardInterrupt: print(time.monotonic_ns(), flush=True)\n"
+        "try:\n"
+        "    print('up', flush=True)\n"
+        "    time.sleep(60)\n"
+        "except KeyboardInterrupt:\n"
+        "    print(time.monotonic_ns(), flush=True)\n"
     )
     with Children(tmp_path) as running:
         for name in ("robot", "bridge", "runner"):
@@ -233,6 +249,25 @@ def test_bad_arguments_are_one_line_and_exit_2(
     assert demo.main(["--out", str(tmp_path), *arguments], commands=fakes()) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("out", ["file", "file/demo"])
+def test_a_folder_that_cannot_be_made_is_one_line_and_exit_2(
+    tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert run(tmp_path / out) == 2
+    error = capsys.readouterr().err
+    assert f"--out: cannot make the folder {tmp_path / out / 'log'}" in error and error.count("\n") == 1
+
+
+def test_settings_note_the_machine_and_where_the_artifacts_are(tmp_path: Path) -> None:
+    out, elsewhere = tmp_path / "demo", tmp_path / "elsewhere"
+    assert run(out, hil="fails") == 1
+    settings = json.loads((out / "settings.json").read_text())
+    assert settings["artifacts"] == "artifacts" and settings["machine"] == machine_facts()
+    demo.main(["--out", str(out), "--artifacts", str(elsewhere), "--domain", "77"], commands=fakes(hil="fails"))
+    assert json.loads((out / "settings.json").read_text())["artifacts"] == str(elsewhere)
 
 
 def test_a_domain_in_use_is_not_chosen(tmp_path: Path) -> None:

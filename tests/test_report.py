@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.recorder import Recorder
 from tests import synthetic_run
 from tools.report import checks, demo_report, page, run_data
 from tools.report.demo_report import RunFiles, load_run, spread, write_report
@@ -123,6 +124,41 @@ def test_trained_weights_are_not_called_untrained(tmp_path: Path) -> None:
     assert "untrained" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def _row_of(html: str, title: str) -> list[str]:
+    """The cells of the first table row that holds this text."""
+    row = next(row for row in html.split("<tr>") if title in row)
+    return ["".join(_parse(cell).text) for cell in row.split("</tr>")[0].split("</td>")[:-1]]
+
+
+def test_commands_written_are_those_the_bridge_counted(html: str, summary: dict[str, Any]) -> None:
+    written = synthetic_run.bridge_result(12.0)["commands"]
+    assert _row_of(html, "velocity commands written by the bridge")[1] == str(written) == "121"
+    assert _row_of(html, "Move requests received by the robot")[1] == str(written)
+    assert summary["bridge"]["commands"] == written
+
+
+def test_delay_at_the_call_is_shown_beside_the_check_and_not_judged(html: str, summary: dict[str, Any]) -> None:
+    rows = html.split("<h2>Checks</h2>")[1].split("<tr>")
+    check = next(index for index, row in enumerate(rows) if "Δt against the capture stamp" in row)
+    title = "Δt given to the action expert against the instant of its call, worst tick"
+    cells = ["–", title, "1.37 ms", "no check", "measured", "edge-run, its own clock"]
+    assert _row_of("<tr>" + rows[check + 1], title) == cells
+    assert summary["delay_error_ms"] == {"max": synthetic_run.CALL_ERROR_MS}
+    assert summary["checks"]["delay_error_ms"]["value"] < 0.001
+
+
+def test_the_machine_is_the_one_the_run_was_measured_on(html: str) -> None:
+    assert _row_of(html.split("<h2>Machine</h2>")[1], "processor") == ["processor", "Synthetic 9000"]
+
+
+def test_a_run_that_did_not_note_its_machine_gets_no_other(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path, 6.0)
+    (tmp_path / "settings.json").write_text('{"duration_s": 6.0}')
+    write_report(RunFiles(tmp_path, tmp_path / "artifacts"), wall_s=1.0)
+    machine = (tmp_path / "report.html").read_text(encoding="utf-8").split("<h2>Machine</h2>")[1]
+    assert "does not say on which machine" in machine and "processor" not in machine
+
+
 @given(st.integers(0, 60), st.integers(2, 12))
 def test_spread_takes_the_first_the_last_and_no_more_than_asked(items: int, count: int) -> None:
     chosen = spread([{"n": n} for n in range(items)], count)
@@ -139,6 +175,7 @@ def test_a_good_run_passes_every_check(run_dir: Path) -> None:
     found = {check.name: check for check in checks.acceptance(data)}
     assert _failed(found) <= {"generations"}  # 12 s at 2.9 s a generation cannot hold ten a minute's share
     assert found["control_ticks"].limit == 118
+    assert found["moved_under_command_m"].limit == pytest.approx(0.2)
 
 
 def test_demo_json_holds_the_checks_and_the_wire(summary: dict[str, Any], run_dir: Path) -> None:
@@ -225,6 +262,13 @@ def test_a_runner_that_gave_up_early_is_held_to_the_time_it_was_asked_for(tmp_pa
     assert found["control_ticks"].limit == 590 and not found["control_ticks"].passed
 
 
+def test_a_longer_run_need_not_walk_farther_than_the_demo(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path)
+    (tmp_path / "settings.json").write_text('{"duration_s": 600.0}')
+    found = {c.name: c for c in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
+    assert found["moved_under_command_m"].limit == 1.0 and found["control_ticks"].limit == 5900
+
+
 @pytest.mark.parametrize("part", ["duration_ms", "late_ms"])
 def test_slow_and_late_ticks_fail(tmp_path: Path, part: str) -> None:
     ticks = synthetic_run.tick_records(12.0)
@@ -294,7 +338,16 @@ def test_a_damaged_trace_line_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["settings.json", "flight.mcap", "hil_trace.jsonl", "run.json", "hil.json", "artifacts/manifest.json"]
+    "name",
+    [
+        "settings.json",
+        "flight.mcap",
+        "hil_trace.jsonl",
+        "run.json",
+        "hil.json",
+        "bridge.json",
+        "artifacts/manifest.json",
+    ],
 )
 def test_a_missing_file_is_named_in_one_line(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     synthetic_run.write_run(tmp_path, 1.0)
@@ -311,3 +364,86 @@ def test_the_command_prints_the_reports_path_and_fails_with_a_failed_check(
     assert demo_report.main([str(tmp_path)]) == 1
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "report.html")
     assert "FAIL" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_command_takes_the_artifacts_that_the_run_used(tmp_path: Path) -> None:
+    out, elsewhere = tmp_path / "demo", tmp_path / "elsewhere"
+    synthetic_run.write_run(out, 6.0)
+    (out / "artifacts").rename(elsewhere)
+    settings = json.loads((out / "settings.json").read_text())
+    (out / "settings.json").write_text(json.dumps({**settings, "artifacts": str(elsewhere)}))
+    assert demo_report.main([str(out)]) in (0, 1)
+    assert (out / "report.html").exists()
+
+
+def _set(name: str, **fields: Any) -> Callable[[Path], None]:
+    def spoil(out: Path) -> None:
+        (out / name).write_text(json.dumps({**json.loads((out / name).read_text()), **fields}))
+
+    return spoil
+
+
+def _append_bytes(name: str, data: bytes) -> Callable[[Path], None]:
+    return lambda out: (out / name).write_bytes((out / name).read_bytes() + data) and None
+
+
+def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
+    def spoil(out: Path) -> None:
+        recorder = Recorder(out / "flight.mcap")
+        for semantic in synthetic_run.generations(6.0):
+            recorder.put("/camera", semantic["anchor_ns"], {"data": data})
+            recorder.put("/semantic", semantic["ready_ns"], semantic)
+        for tick in synthetic_run.tick_records(6.0):
+            recorder.put("/tick", tick["now_ns"], tick)
+        assert recorder.close()
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (_append_bytes("hil_trace.jsonl", b"\xff\xfe\n"), "hil_trace.jsonl cannot be read as UTF-8"),
+        (_append_bytes("hil_trace.jsonl", b'{"kind": "pose", "t_ns": 1}\n'), "hil_trace.jsonl: a record lacks"),
+        (lambda out: (out / "demo.json").write_text("{}"), "demo.json: expected a time in seconds under 'wall_s'"),
+        (_set("settings.json", duration_s=None), "settings.json: expected a time in seconds under 'duration_s'"),
+        (_set("settings.json", artifacts=3), "settings.json: expected the artifact directory's path"),
+        (_set("run.json", control={}), "a record of the run lacks or misshapes a field: KeyError('ticks')"),
+        (_set("run.json", delay_error_ms=[]), "a record of the run lacks or misshapes a field: TypeError"),
+        (_frames_that_are_no_pictures("~"), "not a foxglove.CompressedImage"),
+        (_frames_that_are_no_pictures("a" * 5), "not a foxglove.CompressedImage"),
+        (lambda out: (out / "report.html.partial").mkdir(), "report.html and demo.json cannot be written"),
+    ],
+)
+def test_a_damaged_file_is_one_line_and_leaves_the_old_report(
+    tmp_path: Path, spoil: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    synthetic_run.write_run(tmp_path, 6.0)
+    (tmp_path / "report.html").write_text("the old one")
+    spoil(tmp_path)
+    assert demo_report.main([str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert (tmp_path / "report.html").read_text() == "the old one"
+
+
+def test_an_empty_picture_does_not_end_the_report(tmp_path: Path) -> None:
+    synthetic_run.write_run(tmp_path, 6.0)
+    _frames_that_are_no_pictures("")(tmp_path)
+    assert demo_report.main([str(tmp_path)]) in (0, 1)
+
+
+def test_results_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthetic_run.write_run(tmp_path, 6.0)
+    written: list[str] = []
+    replace = Path.replace
+    monkeypatch.setattr(Path, "replace", lambda self, to: (written.append(Path(to).name), replace(self, to))[1])
+    write_report(RunFiles(tmp_path, tmp_path / "artifacts"), wall_s=1.0)
+    assert sorted(written) == ["demo.json", "report.html"]
+    assert list(tmp_path.glob("*.partial")) == []
+
+
+def test_a_folder_below_a_file_is_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert demo_report.main([str(tmp_path / "file" / "demo")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -21,9 +21,10 @@ from pathlib import Path
 
 import firmware_bridge
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
-from tools.children import Child, Children, StepError
+from tools.children import Child, Children, StepError, uninterrupted
 from tools.progress import Progress, TraceTail
 from tools.report.demo_report import RunFiles, write_report
+from tools.report.machine import machine_facts
 from tools.report.run_data import Record, ReportError
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
@@ -79,8 +80,18 @@ class DemoOptions:
             "seed": self.seed,
             "people": self.people,
             "domain": self.domain,
-            "artifacts": str(self.artifacts),
+            "artifacts": self._artifacts_from_out(),
         }
+
+    def _artifacts_from_out(self) -> str:
+        """Relative where they lie inside `out`, so that the folder may be moved, else absolute."""
+        out, artifacts = self.out.resolve(), self.artifacts.resolve()
+        return str(artifacts.relative_to(out) if artifacts.is_relative_to(out) else artifacts)
+
+    @property
+    def log_dir(self) -> Path:
+        """Where every step's log goes."""
+        return self.out / "log"
 
     @property
     def files(self) -> RunFiles:
@@ -98,15 +109,17 @@ def run_demo(
     commands: Mapping[str, Sequence[str]] = COMMANDS,
     report: Callable[..., Record] = write_report,
 ) -> Record:
-    """Run every step and return what demo.json holds. Raises StepError or ReportError; ends all its processes."""
+    """Run every step into the folders that exist already and return what demo.json holds.
+
+    Raises StepError or ReportError; ends all its processes.
+    """
     started_ns = time.monotonic_ns()
-    log_dir = options.out / "log"
-    log_dir.mkdir(parents=True, exist_ok=True)
     for old in options.files.of_a_run():
         old.unlink(missing_ok=True)
     settings = {"instruction": INSTRUCTION, "release_delay_s": RELEASE_DELAY_S, **options.as_json()}
-    write_result(str(options.files.settings), settings)
-    with Children(log_dir) as children, socket_dir() as socket_folder:
+    write_result(str(options.files.settings), {**settings, "machine": machine_facts()})
+    # The socket's folder is removed last: until then a child may still write to it.
+    with socket_dir() as socket_folder, Children(options.log_dir) as children:
         _export(options, commands["edge-export"], children)
         _drive(options, commands, children, socket_folder / "bridge.sock")
     _say("writing the report")
@@ -211,7 +224,8 @@ def socket_dir() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        with uninterrupted():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
@@ -256,6 +270,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         domain = free_domain() if args.domain is None else args.domain
         artifacts = args.artifacts or args.out / "artifacts"
         options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain)
+        _make_folder(options.log_dir)
     except (ValueError, OSError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
@@ -278,6 +293,14 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         _say(f"check {name} failed: {json.dumps(summary['checks'][name])}")
     (sys.stderr if args.json == "-" else sys.stdout).write(f"{options.files.report}\n")
     return EXIT_CHECK_FAILED if failed else EXIT_DONE
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"--out: cannot make the folder {folder} ({reason}); name one that can be written") from error
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -2,27 +2,36 @@
 
     python -m tools.report.demo_report out/demo
 
-reads settings.json, flight.mcap, hil_trace.jsonl, run.json, bridge.json, hil.json, export.json and
-artifacts/manifest.json in that folder and writes report.html and demo.json beside them.
+reads settings.json, flight.mcap, hil_trace.jsonl, run.json, bridge.json and hil.json in that folder and manifest.json
+of the artifacts that settings.json names, and writes report.html and demo.json beside them.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from edge.cli import write_result
 from tools.report import figures, page
 from tools.report.checks import Check, acceptance
-from tools.report.machine import machine_facts
-from tools.report.numbers import Number, headline, numbers
-from tools.report.run_data import Record, ReportError, RunData, load_flight_log, load_frames, load_json, load_trace
+from tools.report.numbers import Number, delay_at_call, headline, numbers
+from tools.report.run_data import (
+    MISSHAPEN,
+    Record,
+    ReportError,
+    RunData,
+    load_flight_log,
+    load_frames,
+    load_json,
+    load_trace,
+    seconds,
+)
 
 SHEET_FRAMES = 12
 _FRAME_WIDTH_PX = 480
@@ -73,11 +82,10 @@ class RunFiles:
 def load_run(files: RunFiles) -> RunData:
     """Read all files of a run; ReportError names the one that is missing or damaged."""
     results = {command: load_json(files.result(command)) for command in ("edge-run", "edge-hil", "edge-bridge")}
-    if files.result("edge-export").exists():
-        results["edge-export"] = load_json(files.result("edge-export"))
     manifest = load_json(files.artifacts / "manifest.json")
-    log, trace = load_flight_log(files.flight_log), load_trace(files.trace)
-    return RunData(load_json(files.settings), log, trace, results, manifest)
+    log, trace, settings = load_flight_log(files.flight_log), load_trace(files.trace), load_json(files.settings)
+    seconds(files.settings, settings, "duration_s")
+    return RunData(settings, log, trace, results, manifest)
 
 
 def write_report(files: RunFiles, *, wall_s: float) -> Record:
@@ -87,17 +95,35 @@ def write_report(files: RunFiles, *, wall_s: float) -> Record:
         checks = acceptance(data)
         summary = _summary(data, checks, wall_s)
         html = page.document("TIC-VLA edge: demo run", _body(data, checks, wall_s))
-    except (KeyError, TypeError, IndexError) as error:
+    except ReportError:
+        raise
+    except MISSHAPEN as error:
         raise ReportError(f"{files.out}: a record of the run lacks or misshapes a field: {error!r}") from error
-    files.report.write_text(html, encoding="utf-8")
-    files.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"{files.out}: a file of the run cannot be read: {error}") from error
+    try:
+        _write_page(files.report, html)
+        write_result(str(files.summary), summary)
+    except OSError as error:
+        raise ReportError(f"{files.report} and {files.summary.name} cannot be written: {error}") from error
     return summary
+
+
+def _write_page(path: Path, html: str) -> None:
+    """In one rename, as `write_result` writes results: a page that is there is whole."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text(html, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _summary(data: RunData, checks: Sequence[Check], wall_s: float) -> Record:
     run = data.results["edge-run"]
     return {
-        **{key: run[key] for key in ("control", "reasoning", "delay_s", "bridge")},
+        **{key: run[key] for key in ("control", "reasoning", "delay_s", "delay_error_ms")},
+        "bridge": data.results["edge-bridge"],
         "wire": data.trace.end.get("wire", data.results["edge-hil"].get("wire", {})),
         "checks": {check.name: check.as_json() for check in checks},
         "duration_s": data.duration_s,
@@ -155,13 +181,20 @@ def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
         ),
         "</div>",
         "<h2>Checks</h2>",
-        _check_table(checks),
+        _check_table(checks, beside={"delay_error_ms": delay_at_call(data)}),
         "<h2>Numbers</h2>",
         _number_table(numbers(data, wall_s)),
         "<h2>Machine</h2>",
-        page.table(("what", "value"), [(page.text_html(k), page.text_html(v)) for k, v in machine_facts().items()]),
+        _machine_table(data.settings.get("machine")),
     ]
     return "\n".join(part for part in parts if part)
+
+
+def _machine_table(facts: object) -> str:
+    """The machine of the run, as the demo noted it: the report may be written on another one."""
+    if not isinstance(facts, dict):
+        return "<p>settings.json does not say on which machine this was measured.</p>"
+    return page.table(("what", "value"), [(page.text_html(k), page.text_html(str(v))) for k, v in facts.items()])
 
 
 def _untrained_notice(data: RunData) -> str:
@@ -220,7 +253,7 @@ def _card(data: RunData, semantic: Record, frames: dict[int, bytes]) -> str:
 
 def _shrink(jpeg: bytes) -> bytes:
     """A frame at most 480 px wide, so that the page stays small; a frame that does not decode is left as it is."""
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if image is None or image.shape[1] <= _FRAME_WIDTH_PX:
         return jpeg
     height = round(image.shape[0] * _FRAME_WIDTH_PX / image.shape[1])
@@ -228,13 +261,17 @@ def _shrink(jpeg: bytes) -> bytes:
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
-def _check_table(checks: Sequence[Check]) -> str:
+def _check_table(checks: Sequence[Check], beside: Mapping[str, Number]) -> str:
+    """All checks; `beside` names numbers that belong under a check without being one."""
     rows = []
     for check in checks:
         mark = '<span class="pass">pass</span>' if check.passed else '<span class="fail">FAIL</span>'
         limit = f"{check.rule} {_words(check.limit)} {check.unit}".strip()
         value = f"{_words(check.value)} {check.unit}".strip()
         rows.append((mark, page.text_html(check.title), value, limit, "measured", page.text_html(check.note)))
+        if (number := beside.get(check.name)) is not None:
+            title, source = page.text_html(number.title), page.text_html(number.source)
+            rows.append(("–", title, page.text_html(number.value), "no check", number.kind, source))
     head = ("", "check", "value", "required", "kind", "note")
     return page.table(head, rows, numeric=frozenset({2, 3}))
 
@@ -252,6 +289,15 @@ def _words(value: float | int | bool | None) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def recorded_artifacts(out: Path) -> Path:
+    """The artifact directory that a run's settings.json names, relative to `out` where it lies inside."""
+    settings = out / "settings.json"
+    named = load_json(settings).get("artifacts")
+    if not isinstance(named, str) or not named:
+        raise ReportError(f"{settings}: expected the artifact directory's path under 'artifacts', found {named!r}")
+    return out / named
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
     parser = argparse.ArgumentParser(
@@ -260,21 +306,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog="example: python -m tools.report.demo_report out/demo",
     )
     parser.add_argument("out", type=Path, help="folder of the run, as written by python -m tools.demo")
-    parser.add_argument("--artifacts", type=Path, help="artifact directory (default: OUT/artifacts)")
+    parser.add_argument("--artifacts", type=Path, help="artifact directory (default: the one settings.json names)")
     parser.add_argument("--json", metavar="FILE", help="also write demo.json's content here; - is stdout")
     args = parser.parse_args(argv)
-    files = RunFiles(args.out, args.artifacts or args.out / "artifacts")
     try:
-        wall_s = float(load_json(files.summary)["wall_s"]) if files.summary.exists() else 0.0
+        files = RunFiles(args.out, args.artifacts or recorded_artifacts(args.out))
+        # Only the demo knows how long all of it took, and has left it in the demo.json of the first report.
+        wall_s = seconds(files.summary, load_json(files.summary), "wall_s") if files.summary.exists() else 0.0
         summary = write_report(files, wall_s=wall_s)
-    except ReportError as error:
+        write_result(args.json, summary)
+    except (ReportError, OSError) as error:
         print(f"demo_report: {error}", file=sys.stderr)
         return 2
-    text = json.dumps(summary, indent=2)
-    if args.json == "-":
-        print(text)
-    elif args.json:
-        Path(args.json).write_text(text + "\n", encoding="utf-8")
     if args.json != "-":
         print(files.report)
     return 0 if all(check["pass"] for check in summary["checks"].values()) else 1

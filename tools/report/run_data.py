@@ -20,6 +20,10 @@ Record = dict[str, Any]
 Array = NDArray[np.float64]
 
 
+MISSHAPEN = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+"""What reading a record raises when it lacks a field or holds something else there (numpy's errors included)."""
+
+
 class ReportError(ValueError):
     """A file of the run is missing or is not what it should be; one clear line."""
 
@@ -56,9 +60,8 @@ class Trace:
     """[n, 3] x, y (m), theta (rad, unwrapped) in the world frame."""
     velocity: Array
     """[n, 3] forward and leftward speed in the body frame (m/s) and yaw rate (rad/s)."""
-    people_ns: NDArray[np.int64]
     people: list[Array]
-    """One [people, 3] array of x, y (m), heading (rad) per stamp."""
+    """One [people, 3] array of x, y (m), heading (rad) per record."""
     wire: list[Record]
     end: Record
 
@@ -81,7 +84,7 @@ class RunData:
 
 def percentile(samples: Array, percent: float) -> float:
     """Nearest rank, a value that occurred: the same as the runner's `edge.stats.percentiles`."""
-    return float(np.percentile(samples, percent, method="higher"))
+    return float(np.percentile(samples, percent, method="inverted_cdf"))
 
 
 def load_json(path: Path) -> Record:
@@ -95,6 +98,14 @@ def load_json(path: Path) -> Record:
     if not isinstance(value, dict):
         raise ReportError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value
+
+
+def seconds(path: Path, record: Record, key: str) -> float:
+    """A time in s from `record`, as it was read from `path`; ReportError where there is none."""
+    value = record.get(key)
+    if not isinstance(value, int | float) or not 0 <= value < math.inf:
+        raise ReportError(f"{path}: expected a time in seconds under '{key}', found {value!r}")
+    return float(value)
 
 
 def load_flight_log(path: Path) -> FlightLog:
@@ -119,7 +130,11 @@ def load_flight_log(path: Path) -> FlightLog:
         raise ReportError(str(error)) from None
     if not ticks:
         raise ReportError(f"{path} holds no /tick record: the runner ended before its first control tick")
-    return FlightLog(path, run, ticks, sorted(semantics, key=lambda s: s["ready_ns"]), frozenset(stamps))
+    try:
+        semantics.sort(key=lambda s: s["ready_ns"])
+    except MISSHAPEN as error:
+        raise ReportError(f"{path}: a /semantic record lacks or misshapes a field: {error!r}") from error
+    return FlightLog(path, run, ticks, semantics, frozenset(stamps))
 
 
 def load_frames(path: Path, stamps_ns: set[int]) -> dict[int, bytes]:
@@ -137,6 +152,8 @@ def load_trace(path: Path) -> Trace:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         raise ReportError(f"{path} is missing; expected the trace written by edge-hil --trace") from None
+    except (OSError, ValueError) as error:
+        raise ReportError(f"{path} cannot be read as UTF-8 text, one JSON object a line: {error}") from None
     by_kind: dict[str, list[Record]] = {"scene": [], "pose": [], "people": [], "wire": [], "end": []}
     for number, line in enumerate(lines, start=1):
         try:
@@ -148,6 +165,13 @@ def load_trace(path: Path) -> Trace:
             raise ReportError(f"{path}:{number}: expected one JSON object with a 'kind', found {line[:60]!r}") from None
     if not by_kind["scene"] or not by_kind["pose"]:
         raise ReportError(f"{path} holds no scene or no pose record: the simulation ended before it started")
+    try:
+        return _trace(by_kind)
+    except MISSHAPEN as error:
+        raise ReportError(f"{path}: a record lacks or misshapes a field: {error!r}") from error
+
+
+def _trace(by_kind: dict[str, list[Record]]) -> Trace:
     poses = by_kind["pose"]
     theta = np.unwrap([float(p["theta"]) for p in poses])
     return Trace(
@@ -155,7 +179,6 @@ def load_trace(path: Path) -> Trace:
         pose_ns=np.array([p["t_ns"] for p in poses], np.int64),
         pose=np.column_stack([[float(p["x"]) for p in poses], [float(p["y"]) for p in poses], theta]),
         velocity=_body_velocity(poses, theta),
-        people_ns=np.array([p["t_ns"] for p in by_kind["people"]], np.int64),
         people=[np.asarray(p["poses"], float).reshape(-1, 3) for p in by_kind["people"]],
         wire=by_kind["wire"],
         end=by_kind["end"][-1] if by_kind["end"] else {},
