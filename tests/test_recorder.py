@@ -35,6 +35,13 @@ def _wait_for(condition, timeout_s: float = 5.0) -> bool:
     return False
 
 
+def _ticks(path: Path) -> list[int]:
+    """What a reader sees now; the file is empty until the writer's first flush."""
+    if path.stat().st_size == 0:
+        return []
+    return [payload["tick"] for topic, _, payload in read_messages(path) if topic == "/tick"]
+
+
 def test_records_come_back_in_order_with_their_stamps(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "flight.mcap")
     for tick in range(300):
@@ -108,7 +115,8 @@ def test_a_disk_that_is_full_stops_writing_and_is_reported(tmp_path: Path) -> No
     assert recorder.close() is False
 
 
-def _disk_fails_after(monkeypatch: pytest.MonkeyPatch, good_flushes: int) -> None:
+def _disk_fails_after(monkeypatch: pytest.MonkeyPatch, good_flushes: int) -> list[int]:
+    """Let the disk take so many flushes; the list holds how many are left and may be changed."""
     left = [good_flushes]
 
     def fsync(_: int) -> None:
@@ -117,6 +125,7 @@ def _disk_fails_after(monkeypatch: pytest.MonkeyPatch, good_flushes: int) -> Non
         left[0] -= 1
 
     monkeypatch.setattr("edge.recorder.os.fsync", fsync)
+    return left
 
 
 def test_records_of_the_chunk_the_disk_did_not_take_are_counted(
@@ -134,11 +143,12 @@ def test_records_of_the_chunk_the_disk_did_not_take_are_counted(
 def test_records_the_disk_took_before_it_failed_are_not_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _disk_fails_after(monkeypatch, good_flushes=2)
+    left = _disk_fails_after(monkeypatch, good_flushes=1_000)
     path = tmp_path / "flight.mcap"
     recorder = Recorder(path)
     recorder.put("/tick", 1, {"tick": 0})
-    assert _wait_for(lambda: len(list(read_messages(path))) == 1 and not recorder._unsaved, 20)
+    assert _wait_for(lambda: _ticks(path) == [0] and not recorder._unsaved, 20)
+    left[0] = 0
     recorder.put("/tick", 2, {"tick": 1})
     assert recorder.close() is False
     assert recorder.dropped == {"/tick": 1}
@@ -212,10 +222,6 @@ def test_threads_may_record_at_the_same_time(tmp_path: Path) -> None:
     for name in ("/tick", "/semantic", "/other"):
         numbers = [payload["n"] for topic, _, payload in read_messages(tmp_path / "flight.mcap") if topic == name]
         assert numbers == list(range(500))
-
-
-def _ticks(path: Path) -> list[int]:
-    return [payload["tick"] for topic, _, payload in read_messages(path) if topic == "/tick"]
 
 
 RECORD_FOR_EVER = """
