@@ -39,6 +39,11 @@ def write_result(where: str | None, result: Mapping[str, Any]) -> None:
         return
     path = Path(where)
     path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, text)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file in one rename, so that a file that is there is whole; raises OSError and leaves nothing."""
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(text, encoding="utf-8")

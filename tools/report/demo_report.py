@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.cli import write_result
+from edge.cli import write_result, write_whole
 from tools.report import figures, page
 from tools.report.checks import Check, acceptance
 from tools.report.numbers import Number, delay_at_call, headline, numbers
@@ -102,21 +102,11 @@ def write_report(files: RunFiles, *, wall_s: float) -> Record:
     except OSError as error:
         raise ReportError(f"{files.out}: a file of the run cannot be read: {error}") from error
     try:
-        _write_page(files.report, html)
+        write_whole(files.report, html)
         write_result(str(files.summary), summary)
     except OSError as error:
         raise ReportError(f"{files.report} and {files.summary.name} cannot be written: {error}") from error
     return summary
-
-
-def _write_page(path: Path, html: str) -> None:
-    """In one rename, as `write_result` writes results: a page that is there is whole."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(html, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _summary(data: RunData, checks: Sequence[Check], wall_s: float) -> Record:
