@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
+from contextlib import suppress
 from math import atan, degrees, radians, tan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pybullet
@@ -34,15 +35,15 @@ class CameraWorld:
         self._people_count = people
         self._robot: int | None = None
         self._robot_joints: list[int] = []
-        self._folder = tempfile.TemporaryDirectory(prefix="edge-camera-")
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
-            folder = Path(self._folder.name)
-            build_scene(self._client, folder, scene)
-            self._people = [
-                PersonBody(self._client, folder, look, f"person{index}-")
-                for index, look in enumerate(appearances(people, seed))
-            ]
+            # The renderer reads its files while building: afterwards even a killed run leaves none behind.
+            with TemporaryDirectory(prefix="edge-camera-") as folder:
+                build_scene(self._client, Path(folder), scene)
+                self._people = [
+                    PersonBody(self._client, Path(folder), look, f"person{index}-")
+                    for index, look in enumerate(appearances(people, seed))
+                ]
         except BaseException:
             self.close()
             raise
@@ -79,7 +80,8 @@ class CameraWorld:
     def _show_robot(self, state: Array) -> None:
         # The forward camera never sees the robot, so its body is loaded only for a view from outside.
         if self._robot is None:
-            self._robot, self._robot_joints = load_go2(self._client, Path(self._folder.name), (0, 0, 0.3), 0.0)
+            with TemporaryDirectory(prefix="edge-camera-") as folder:
+                self._robot, self._robot_joints = load_go2(self._client, Path(folder), (0, 0, 0.3), 0.0)
         place_go2(self._client, self._robot, self._robot_joints, state)
 
     def _picture(self, eye: Array, target: Array, up: Array, hfov_rad: float, width: int, height: int) -> Picture:
@@ -105,8 +107,8 @@ class CameraWorld:
         return np.ascontiguousarray(pixels[:, :, :3])
 
     def close(self) -> None:
-        """Release the client and its temporary files; may be called twice."""
+        """Release the client; may be called twice, and after its connection was lost."""
         if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
+            with suppress(pybullet.error):
+                pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
-            self._folder.cleanup()

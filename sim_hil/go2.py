@@ -11,7 +11,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from sim_hil.gait import GRAVITY_MPS2, BodyMotion
-from sim_hil.go2_urdf import BASE_COM_M, JOINT_NAMES, LEGS, write_go2_urdf
+from sim_hil.go2_urdf import BASE_COM_M, JOINT_FRICTION_NM, JOINT_NAMES, LEGS, write_go2_urdf
 from sim_hil.kinematics import Vec3, foot_position, foot_velocity
 from sim_hil.sport import LYING_RAD, Measured, SportController
 
@@ -101,14 +101,15 @@ class Go2:
             pybullet.getJointInfo(self.body, link, physicsClientId=client)[1].decode(): link for link in range(links)
         }
         self._feet = [names[f"{leg}_foot"] for leg in LEGS]
-        # PyBullet drives every joint with a velocity motor by default; zero force turns it off.
+        # PyBullet drives every joint with a velocity motor by default; as weak as this it is the joint's dry friction.
+        friction = [JOINT_FRICTION_NM] * 12
         pybullet.setJointMotorControlArray(
-            self.body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 12, physicsClientId=client
+            self.body, self._joints, pybullet.VELOCITY_CONTROL, forces=friction, physicsClientId=client
         )
         for link in range(-1, links):
-            friction = 0.9 if link in self._feet else 0.4
+            grip = 0.9 if link in self._feet else 0.4
             pybullet.changeDynamics(
-                self.body, link, lateralFriction=friction, linearDamping=0.0, angularDamping=0.0,
+                self.body, link, lateralFriction=grip, linearDamping=0.0, angularDamping=0.0,
                 physicsClientId=client,
             )  # fmt: skip
         self._torques: tuple[float, ...] = (0.0,) * 12

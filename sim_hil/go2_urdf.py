@@ -1,7 +1,10 @@
 """The simulated Go2's body: one table of numbers, and the URDF written from it.
 
-Inertias, geometry and limits are the maker's published ones (URDF and MJCF of the Go2 agree on them); the shapes are
-primitives of our own. The same table feeds the leg kinematics, so the model and the controller cannot drift apart.
+Inertias, geometry, limits, joint damping and joint friction are the maker's published ones (URDF and MJCF of the Go2);
+the shapes are primitives of our own. PyBullet heeds neither effort nor velocity limits nor friction of a URDF's joint
+that is driven by torques: the motors of sim_hil/sport.py keep the limits, sim_hil/go2.py adds the friction. The rotors'
+inertia (MJCF armature, 0.01 kg.m^2 a joint) is left out, as PyBullet has no such term. The same table feeds the leg
+kinematics, so the model and the controller cannot drift apart.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ THIGH_LENGTH_M = CALF_LENGTH_M = 0.213
 FOOT_RADIUS_M = 0.022
 TORQUE_LIMITS_NM = (23.7, 23.7, 45.43)
 VELOCITY_LIMITS_RADPS = (30.1, 30.1, 15.7)
+JOINT_DAMPING_NMS_PER_RAD, JOINT_FRICTION_NM = 0.1, 0.2
 HIP_LIMITS_RAD = (-1.0472, 1.0472)
 FRONT_THIGH_LIMITS_RAD = (-1.5708, 3.4907)
 REAR_THIGH_LIMITS_RAD = (-0.5236, 4.5379)
@@ -112,7 +116,8 @@ def _joint(name: str, kind: str, parent: str, child: str, xyz: tuple[float, ...]
 def _motor(index: int, axis: str, limits: tuple[float, float]) -> str:
     return (
         f'<axis xyz="{axis}"/><limit lower="{limits[0]:g}" upper="{limits[1]:g}" effort="{TORQUE_LIMITS_NM[index]:g}" '
-        f'velocity="{VELOCITY_LIMITS_RADPS[index]:g}"/><dynamics damping="0.1" friction="0"/>'
+        f'velocity="{VELOCITY_LIMITS_RADPS[index]:g}"/>'
+        f'<dynamics damping="{JOINT_DAMPING_NMS_PER_RAD:g}" friction="{JOINT_FRICTION_NM:g}"/>'
     )
 
 
@@ -166,7 +171,9 @@ def _leg(leg: LegGeometry) -> str:
 
 def go2_urdf() -> str:
     """Return the Go2 as URDF text: base plus four legs of hip, thigh, calf and a fixed foot; SI units."""
-    return f'<?xml version="1.0"?><robot name="go2">{_base()}{"".join(_leg(leg) for leg in LEG_GEOMETRY)}</robot>'
+    text = f'<?xml version="1.0"?><robot name="go2">{_base()}{"".join(_leg(leg) for leg in LEG_GEOMETRY)}</robot>'
+    # PyBullet reads lines of at most 8 KiB and breaks longer ones wherever that falls, inside a word too.
+    return text.replace("><", ">\n<") + "\n"
 
 
 def write_go2_urdf(folder: Path) -> Path:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
+from contextlib import suppress
 from math import atan2, hypot
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pybullet
@@ -18,11 +19,15 @@ from sim_hil.scene import Box, Scene
 from sim_hil.sport import SportAction
 from sim_hil.world import build_scene
 
-__all__ = ["PERSON_COLLISION_M", "ROBOT_FIELDS", "RobotTruth", "Simulation", "SportAction"]
+__all__ = ["PERSON_COLLISION_M", "ROBOT_FIELDS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
 
 PERSON_COLLISION_M = 0.5  # DynaNav: a person within 0.5 m of the robot counts as a collision
 ROBOT_FIELDS = 19  # render_state: position, quaternion xyzw, 12 joint angles
 _CONTACT_EVERY = 5  # steps: contacts last longer than 10 ms
+
+
+class SimulationClosedError(RuntimeError):
+    """The physics is gone: somebody closed its window, or the simulation was closed."""
 
 
 class Simulation:
@@ -43,15 +48,16 @@ class Simulation:
         self._steps = 0
         self._touched: set[str] = set()
         self._fell = False
-        self._folder = tempfile.TemporaryDirectory(prefix="edge-sim-")
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
-            self._build(scene)
+            # The engine reads its files while building: afterwards even a killed run leaves none behind.
+            with TemporaryDirectory(prefix="edge-sim-") as folder:
+                self._build(scene, Path(folder))
         except BaseException:
             self.close()
             raise
 
-    def _build(self, scene: Scene) -> None:
+    def _build(self, scene: Scene, folder: Path) -> None:
         client = self._client
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.DT_S, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=client
@@ -72,11 +78,11 @@ class Simulation:
         ]
         self._labels.update((body, "person") for body in self._person_bodies)
         if self._gui:
-            folder, looks = Path(self._folder.name), appearances(len(self._walkers), self._seed)
             build_scene(client, folder, scene)
+            looks = appearances(len(self._walkers), self._seed)
             self._looks = [PersonBody(client, folder, look, f"person{i}-") for i, look in enumerate(looks)]
         self._place_people()
-        self._go2 = Go2(client, Path(self._folder.name), scene.start, self.DT_S)
+        self._go2 = Go2(client, folder, scene.start, self.DT_S)
 
     def _static(self, box: Box, friction: float) -> int:
         client = self._client
@@ -106,7 +112,21 @@ class Simulation:
             )
 
     def step(self) -> None:
-        """Advance the world by DT_S."""
+        """Advance the world by DT_S. Raises SimulationClosedError when the physics is gone."""
+        try:
+            self._advance()
+        except pybullet.error as error:
+            raise self._explained(error) from error
+
+    def _explained(self, error: Exception) -> Exception:
+        if pybullet.isConnected(self._client):
+            return error
+        return SimulationClosedError(
+            "simulation: its physics ended (the window was closed, or close() was called): expected it to run until"
+            " the end; start the run again and leave the window open"
+        )
+
+    def _advance(self) -> None:
         if self._steps % round(1 / (UPDATE_HZ * self.DT_S)) == 0 and self._person_bodies:
             (x, y, _), heading = self._go2.pose()
             self._walkers.step(x, y, heading)
@@ -137,8 +157,11 @@ class Simulation:
         self._go2.sport.request_move(vx_mps, vy_mps, wz_radps)
 
     def truth(self) -> RobotTruth:
-        """Ground truth of the robot now."""
-        return self._go2.truth(self._steps * self.DT_S)
+        """Ground truth of the robot now. Raises SimulationClosedError when the physics is gone."""
+        try:
+            return self._go2.truth(self._steps * self.DT_S)
+        except pybullet.error as error:
+            raise self._explained(error) from error
 
     def people(self) -> NDArray[np.float64]:
         """[n, 3]: x m, y m, heading rad of every person."""
@@ -159,8 +182,8 @@ class Simulation:
         return np.concatenate((robot, self._walkers.render_rows().reshape(len(self._walkers) * RENDER_FIELDS)))
 
     def close(self) -> None:
-        """Release the physics client and its temporary files; may be called twice."""
+        """Release the physics client; may be called twice, and after its window was closed."""
         if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
+            with suppress(pybullet.error):
+                pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
-            self._folder.cleanup()

@@ -1,7 +1,8 @@
 """The Go2's sport controller: sport actions and velocity commands -> joint torques; pure, no physics engine inside.
 
 Mode numbers are those of SportModeState. A mode is reported when the robot has arrived in it; while it is still getting
-up or lying down it reports the mode it left (recovery reports 8 until it stands).
+up or lying down it reports the mode it left (recovery reports 8 until it stands). A request repeated while its motion
+runs changes nothing: a client that repeats a call faster than the robot moves still gets it done.
 
 What the trot can do without falling (measured on a flat floor, friction 0.8; see tests/test_sim_go2.py) is less than
 the real robot's range, and commands are clipped to it: see GaitConfig.
@@ -14,7 +15,7 @@ from math import cos, pi
 from typing import NamedTuple
 
 from sim_hil.gait import GRAVITY_MPS2, BodyMotion, GaitConfig, GaitState, start_gait, step_gait
-from sim_hil.go2_urdf import LEG_GEOMETRY, TORQUE_LIMITS_NM, TOTAL_MASS_KG
+from sim_hil.go2_urdf import LEG_GEOMETRY, TORQUE_LIMITS_NM, TOTAL_MASS_KG, VELOCITY_LIMITS_RADPS
 from sim_hil.kinematics import Vec3, joint_angles, joint_torque
 
 MODE_BALANCE_STAND, MODE_LOCOMOTION, MODE_LIE_DOWN, MODE_JOINT_LOCK = 1, 3, 5, 6
@@ -25,11 +26,14 @@ ERROR_NOT_STANDING = 4202  # the sport controller is not in a state that allows 
 # Ranges of the real Move request.
 VX_RANGE_MPS, VY_RANGE_MPS, WZ_RANGE_RADPS = (-2.5, 3.8), (-1.0, 1.0), (-4.0, 4.0)
 HOLD_S = 1.0  # firmware from V1.1.6 keeps the latest Move for one second
+_BALANCED = (MODE_BALANCE_STAND, MODE_LOCOMOTION)
+_STOPPING_S = 4.0  # a robot held or pushed may never come to rest: then the awaited motion starts all the same
+_CALF_DAMPING_SHARE = 0.6  # without the rotor's inertia a swinging calf is so light that full damping overshoots
+_FADE_SHARE = 0.2  # our choice: over the last fifth of its speed range a motor's driving torque falls to zero
 
 LYING_RAD = (-0.25, 1.32, -2.70, 0.25, 1.32, -2.70, -0.25, 1.32, -2.70, 0.25, 1.32, -2.70)
 _NO_PUSH: tuple[Vec3, ...] = ((0.0, 0.0, 0.0),) * 4
 _WEIGHT: tuple[Vec3, ...] = ((0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4),) * 4
-
 
 # Self-righting from the back, found by search in simulation. The right legs reach over to the floor beside the trunk
 # and push it onto its left side; the left hips, spread, carry it on to the belly. (seconds, right leg, left leg)
@@ -77,6 +81,19 @@ def _clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
+def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
+    """What the motor of hip, thigh or calf (0, 1, 2) gives of a wanted torque at a speed.
+
+    Braking is bounded by the torque limit alone; driving fades to zero towards the velocity limit.
+    """
+    limit = TORQUE_LIMITS_NM[joint]
+    if wanted_nm * speed_radps > 0.0:
+        spare = 1.0 - abs(speed_radps) / VELOCITY_LIMITS_RADPS[joint]
+        if spare < _FADE_SHARE:
+            limit *= max(spare, 0.0) / _FADE_SHARE
+    return _clip(wanted_nm, -limit, limit)
+
+
 class SportController:
     """The mode machine and its torques. Deterministic; call `step` once every dt_s."""
 
@@ -86,6 +103,7 @@ class SportController:
         self._mode = MODE_LIE_DOWN
         self._time_s = 0.0
         self._motion: _Motion | None = None
+        self._awaited: _Motion | None = None  # starts as soon as the trot has come to rest
         self._motion_start_s = 0.0
         self._motion_from: tuple[float, ...] = LYING_RAD
         self._gait: GaitState = start_gait(self._config, 0.0)
@@ -109,13 +127,19 @@ class SportController:
     def commanded(self) -> Vec3:
         """The velocity command in force, (vx m/s, vy m/s, wz rad/s): zero unless the robot may move."""
         expired = self._time_s - self._command_s >= HOLD_S - 1e-9
-        if expired or self._mode not in (MODE_BALANCE_STAND, MODE_LOCOMOTION) or self._motion is not None:
+        if expired or self._mode not in _BALANCED or self._bound_for is not None:
             return (0.0, 0.0, 0.0)
         return self._command
 
+    @property
+    def _bound_for(self) -> int | None:
+        """The mode that a motion, running or awaited, ends in."""
+        motion = self._motion if self._motion is not None else self._awaited
+        return None if motion is None else motion.mode
+
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
         """Take a velocity; kept one second, clipped to the robot's range, without effect unless it stands balanced."""
-        if self._mode not in (MODE_BALANCE_STAND, MODE_LOCOMOTION) or self._motion is not None:
+        if self._mode not in _BALANCED or self._bound_for is not None:
             return
         self._command = (
             _clip(vx_mps, *VX_RANGE_MPS),
@@ -126,28 +150,28 @@ class SportController:
 
     def request(self, action: SportAction) -> int:
         """Start an action; return 0, or 4202 where the robot's posture does not allow it."""
-        standing = self._mode in STANDING_MODES and self._motion is None
+        bound_for = self._bound_for
+        arrived = self._mode if bound_for is None else None
         if action is SportAction.DAMP:
-            self._forget_command()
-            self._motion, self._mode = None, MODE_DAMPING
+            self._go_limp()
         elif action is SportAction.STOP_MOVE:
             self._forget_command()
         elif action is SportAction.BALANCE_STAND:
-            if not standing:
+            if arrived not in STANDING_MODES:
                 return ERROR_NOT_STANDING
-            if self._mode == MODE_JOINT_LOCK:
+            if arrived == MODE_JOINT_LOCK:
                 self._enter_balance()
         elif action is SportAction.STAND_UP:
-            if self._mode != MODE_JOINT_LOCK or self._motion is not None:
+            if MODE_JOINT_LOCK not in (arrived, bound_for):
                 self._start(((0.4, self._folded()), (1.2, self._standing())), MODE_JOINT_LOCK)
         elif action is SportAction.STAND_DOWN:
-            if self._mode != MODE_LIE_DOWN or self._motion is not None:
+            if MODE_LIE_DOWN not in (arrived, bound_for):
                 self._start(((1.5, LYING_RAD),), MODE_LIE_DOWN)
         elif action is SportAction.RECOVERY_STAND:
-            if self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION) and self._motion is None:
-                return 0
-            self._mode, self._attempts = MODE_RECOVERY_STAND, 0
-            self._recover()
+            recovering = bound_for in (MODE_BALANCE_STAND, MODE_RECOVERY_STAND)
+            if arrived not in _BALANCED and not recovering:
+                self._mode, self._attempts = MODE_RECOVERY_STAND, 0
+                self._recover()
         return 0
 
     def _recover(self) -> None:
@@ -159,7 +183,11 @@ class SportController:
             frames = tuple((seconds, right + left + right + left) for seconds, right, left in _RIGHTING)
             self._start(frames, MODE_RECOVERY_STAND)
         else:
-            self._motion, self._mode = None, MODE_DAMPING
+            self._go_limp()
+
+    def _go_limp(self) -> None:
+        self._forget_command()
+        self._motion, self._awaited, self._mode = None, None, MODE_DAMPING
 
     def _forget_command(self) -> None:
         self._command, self._command_s = (0.0, 0.0, 0.0), -HOLD_S
@@ -170,13 +198,21 @@ class SportController:
 
     def _folded(self) -> tuple[float, ...]:
         # A robot that already stands goes straight up or stays; only a collapsed one folds its legs first.
-        if self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION):
+        if self._mode in _BALANCED:
             return self._standing()
         return LYING_RAD
 
     def _start(self, keyframes: tuple[tuple[float, tuple[float, ...]], ...], mode: int) -> None:
         self._forget_command()
-        self._motion = _Motion(keyframes, mode)
+        self._motion_start_s = self._time_s
+        if self._mode in _BALANCED and self._motion is None and self._gait.walking:
+            # A trot at speed that is broken off topples the robot: it comes to rest first.
+            self._awaited = _Motion(keyframes, mode)
+        else:
+            self._begin(_Motion(keyframes, mode))
+
+    def _begin(self, motion: _Motion) -> None:
+        self._motion, self._awaited = motion, None
         self._motion_start_s = self._time_s
         self._motion_from = self._latest.q_rad if self._latest is not None else LYING_RAD
 
@@ -191,25 +227,23 @@ class SportController:
         fallen = measured.up < 0.5 and self._mode in STANDING_MODES
         if fallen:
             # A robot that has lost its balance goes limp, as the real one does: flailing breaks it.
-            self._motion, self._mode = None, MODE_DAMPING
-            self._forget_command()
+            self._go_limp()
+        stopped = not self._gait.walking or self._time_s - self._motion_start_s >= _STOPPING_S
+        if self._awaited is not None and stopped:
+            self._begin(self._awaited)
         if self._motion is not None:
             torques = self._scripted(measured)
         elif self._mode == MODE_DAMPING:
             self._targets = measured.q_rad
-            torques = tuple(-2.0 * dq for dq in measured.dq_radps)
-        elif self._mode in (MODE_BALANCE_STAND, MODE_LOCOMOTION):
+            torques = tuple(motor_torque(i % 3, -2.0 * dq, dq) for i, dq in enumerate(measured.dq_radps))
+        elif self._mode in _BALANCED:
             torques = self._walk(measured)
         elif self._mode == MODE_JOINT_LOCK:
-            torques = self._track(measured, self._standing_targets, 90.0, 2.5, _WEIGHT)
+            torques = self._track(measured, self._targets, 90.0, 2.5, _WEIGHT)
         else:
             torques = self._track(measured, LYING_RAD, 25.0, 2.0, _NO_PUSH)
         self._time_s += self._dt_s
         return torques
-
-    @property
-    def _standing_targets(self) -> tuple[float, ...]:
-        return self._targets
 
     def _walk(self, measured: Measured) -> tuple[float, ...]:
         command = self.commanded
@@ -243,7 +277,6 @@ class SportController:
         self, measured: Measured, targets: tuple[float, ...], kp: float, kd: float, push: tuple[Vec3, ...]
     ) -> tuple[float, ...]:
         """PD on the joints plus the torque of each foot's push on the ground (without it the knees sag)."""
-        limits = (TORQUE_LIMITS_NM[0], TORQUE_LIMITS_NM[1], TORQUE_LIMITS_NM[2])
         previous, inverse_dt = self._targets, 1.0 / self._dt_s
         torques = []
         for leg in range(4):
@@ -256,7 +289,8 @@ class SportController:
                 target = _clip(targets[i], *lower_upper[joint])
                 # Swing targets move fast: the damping term must not fight the motion it is asked for.
                 rate = _clip((targets[i] - previous[i]) * inverse_dt, -15.0, 15.0)
-                torque = kp * (target - q[joint]) + kd * (rate - measured.dq_radps[i]) + carry[joint]
-                torques.append(_clip(torque, -limits[joint], limits[joint]))
+                damping = kd * (_CALF_DAMPING_SHARE if joint == 2 else 1.0)
+                torque = kp * (target - q[joint]) + damping * (rate - measured.dq_radps[i]) + carry[joint]
+                torques.append(motor_torque(joint, torque, measured.dq_radps[i]))
         self._targets = targets
         return tuple(torques)

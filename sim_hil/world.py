@@ -17,6 +17,7 @@ from sim_hil.scene import Scene, SceneObject, Wall
 from sim_hil.textures import rgb
 
 _PATCH_M = 2.0  # large surfaces are cut up: a face that reaches behind the camera costs precision
+_WALL_EDGE = (206, 200, 186)
 
 
 def _textured(
@@ -151,8 +152,12 @@ def _wall(mesh: MeshBuilder, wall: Wall) -> None:
             y = side * thickness / 2
             corners = [frame.point(p) for p in ((left, y, 0), (right, y, 0), (right, y, height), (left, y, height))]
             mesh.quad(wall.texture, corners, ((b - a) / 2.0, 1.0))
+        y = thickness / 2
+        mesh.face(
+            _WALL_EDGE, [frame.point(p) for p in ((a, -y, height), (b, -y, height), (b, y, height), (a, y, height))]
+        )
     for end in (-1, 1):
-        mesh.box(frame, (end * length / 2, 0, height / 2), (0.01, thickness, height), (206, 200, 186))
+        mesh.box(frame, (end * length / 2, 0, height / 2), (0.01, thickness, height), _WALL_EDGE)
 
 
 def build_scene(client: int, folder: Path, scene: Scene) -> list[int]:

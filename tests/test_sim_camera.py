@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from math import cos, pi, sin
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pybullet
 import pytest
 
 from sim_hil.camera import CameraWorld
@@ -148,3 +151,25 @@ def test_the_robot_is_seen_from_outside(world: CameraWorld) -> None:
     here = world.look(_state(10.5, 0, 0), *view, WIDTH, HEIGHT)
     away = world.look(_state(20.0, 0, 0), *view, WIDTH, HEIGHT)
     assert _changed(here, away).sum() > 800
+
+
+def test_the_top_of_a_wall_is_seen_from_above(world: CameraWorld) -> None:
+    left = next(wall for wall in load_scene("corridor").walls if wall.label == "left wall").box
+    x, y, top = 10.3, left.centre_m[1], left.size_m[2]
+    seen = world.look(_state(0, 0, 0), (x, y - 0.5, top + 1.5), (x, y, top), 41, 41, 0.02)
+    red, green, blue = seen[20, 20].astype(float)
+    assert red > green > blue > 100
+    assert (red / blue, green / blue) == pytest.approx((206 / 186, 200 / 186), abs=0.04)
+
+
+def test_a_camera_keeps_no_files_and_closes_after_its_connection_was_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    camera = CameraWorld(load_scene("corridor"), people=1, seed=0)
+    assert list(tmp_path.iterdir()) == []
+    camera.look(_state(0, 0, 0), (2.0, 0.0, 1.0), (0.0, 0.0, 0.3), 64, 36)
+    assert list(tmp_path.iterdir()) == []
+    pybullet.disconnect(physicsClientId=camera._client)
+    camera.close()
+    camera.close()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from math import degrees, pi
+from pathlib import Path
 
 import numpy as np
 import pybullet
 import pytest
 
+from sim_hil.gait import BodyMotion
+from sim_hil.go2_urdf import TORQUE_LIMITS_NM, VELOCITY_LIMITS_RADPS, go2_urdf
 from sim_hil.scene import Scene, load_scene
-from sim_hil.simulation import Simulation, SportAction
-from sim_hil.sport import ERROR_NOT_STANDING
+from sim_hil.simulation import Simulation, SimulationClosedError, SportAction
+from sim_hil.sport import ERROR_NOT_STANDING, Measured, SportController, motor_torque
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +167,48 @@ def test_stand_down_lies_down(simulation: Simulation) -> None:
     assert truth.mode == 5 and truth.body_height_m < 0.12
 
 
+def test_a_walking_robot_comes_to_rest_before_it_lies_down(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 2.0, (1.0, 0.0, 0.0))
+    assert simulation.sport(SportAction.STAND_DOWN) == 0
+    speeds = []
+    for _ in range(125):
+        _run(simulation, 0.04, (1.0, 0.0, 0.0))  # no longer heeded
+        truth = simulation.truth()
+        assert truth.commanded == (0.0, 0.0, 0.0)
+        if 0.12 < truth.body_height_m < 0.28:
+            speeds.append(np.linalg.norm(truth.velocity_world_mps[:2]))
+    assert not simulation.fell
+    assert speeds and max(speeds) < 0.1
+    assert simulation.truth().mode == 5
+
+
+def test_a_robot_that_is_kept_from_resting_lies_down_all_the_same() -> None:
+    controller = SportController(0.01)
+    pushed = Measured((0.0, 0.85, -1.7) * 4, (0.0,) * 12, BodyMotion(0, 0, 0, 0, 0, 0, 0.5, 0), up=1.0)
+    for action, seconds in ((SportAction.STAND_UP, 2), (SportAction.BALANCE_STAND, 1), (SportAction.STAND_DOWN, 6)):
+        assert controller.request(action) == 0
+        for _ in range(seconds * 100):
+            controller.step(pushed)
+    assert controller.mode == 5
+
+
+def test_a_repeated_stand_up_or_down_does_not_start_over(simulation: Simulation) -> None:
+    for action, arrived in ((SportAction.STAND_UP, 6), (SportAction.STAND_DOWN, 5)):
+        for _ in range(4):
+            assert simulation.sport(action) == 0
+            _run(simulation, 0.5)
+        assert simulation.truth().mode == arrived
+
+
+def test_stand_down_overrides_a_stand_up_that_runs(simulation: Simulation) -> None:
+    simulation.sport(SportAction.STAND_UP)
+    _run(simulation, 1.0)
+    simulation.sport(SportAction.STAND_DOWN)
+    _run(simulation, 1.6)
+    assert simulation.truth().mode == 5
+
+
 def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> None:
     _stand(simulation)
     simulation.sport(SportAction.DAMP)
@@ -186,8 +232,9 @@ def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: f
     simulation.sport(SportAction.DAMP)
     _run(simulation, 1.0)
     assert simulation.fell
-    assert simulation.sport(SportAction.RECOVERY_STAND) == 0
-    _run(simulation, 6.0)
+    for _ in range(12):  # repeated calls do not interrupt the turning over
+        assert simulation.sport(SportAction.RECOVERY_STAND) == 0
+        _run(simulation, 0.5)
     truth = simulation.truth()
     assert truth.mode == 1
     assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
@@ -232,3 +279,65 @@ def test_same_seed_and_calls_give_the_same_motion(corridor: Scene) -> None:
         ends.append(simulation.render_state())
         simulation.close()
     assert np.array_equal(ends[0], ends[1])
+
+
+def test_joints_stay_within_the_motors_speeds_and_torques_at_full_speed(simulation: Simulation) -> None:
+    _stand(simulation)
+    _run(simulation, 1.5, (1.1, 0.0, 0.0))
+    for index in range(1500):
+        _run(simulation, Simulation.DT_S, (1.1, 0.0, 0.0) if index % 50 == 0 else None)
+        truth = simulation.truth()
+        assert (np.abs(truth.joint_dq_radps.reshape(4, 3)) < VELOCITY_LIMITS_RADPS).all()
+        assert (np.abs(truth.joint_tau_nm.reshape(4, 3)) <= TORQUE_LIMITS_NM).all()
+
+
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_a_motor_drives_less_and_less_towards_its_top_speed_but_always_brakes(joint: int) -> None:
+    torque, speed = TORQUE_LIMITS_NM[joint], VELOCITY_LIMITS_RADPS[joint]
+    assert motor_torque(joint, 99.0, 0.0) == motor_torque(joint, 99.0, 0.5 * speed) == torque
+    assert motor_torque(joint, 99.0, 0.9 * speed) == pytest.approx(0.5 * torque)
+    assert motor_torque(joint, 99.0, speed) == motor_torque(joint, 99.0, 1.5 * speed) == 0.0
+    assert motor_torque(joint, -99.0, 1.5 * speed) == -torque
+    assert motor_torque(joint, -99.0, -speed) == 0.0
+
+
+def test_a_joint_without_torque_is_held_by_its_dry_friction(simulation: Simulation) -> None:
+    """Weightless, a torque below the friction (0.2 N.m) moves nothing and one above it does."""
+    body, calf = simulation._go2.body, simulation._go2._joints[2]
+    pybullet.setGravity(0, 0, 0, physicsClientId=simulation._client)
+    pybullet.resetBasePositionAndOrientation(body, (0, 0, 1), (0, 0, 0, 1), physicsClientId=simulation._client)
+    pybullet.resetJointState(body, calf, -1.8, physicsClientId=simulation._client)
+    turned = []
+    for torque in (0.15, 0.4):
+        for _ in range(50):
+            pybullet.setJointMotorControl2(
+                body, calf, pybullet.TORQUE_CONTROL, force=torque, physicsClientId=simulation._client
+            )
+            pybullet.stepSimulation(physicsClientId=simulation._client)
+        turned.append(pybullet.getJointState(body, calf, physicsClientId=simulation._client)[0] + 1.8)
+    assert abs(turned[0]) < 1e-3 and turned[1] > 0.05
+
+
+def test_no_line_of_the_urdf_is_longer_than_the_engine_reads() -> None:
+    assert max(len(line) for line in go2_urdf().splitlines()) < 8000
+
+
+def test_a_running_simulation_keeps_no_files(
+    open_floor: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    simulation = Simulation(open_floor, people=0, seed=0)
+    assert list(tmp_path.iterdir()) == []
+    simulation.close()
+
+
+def test_a_simulation_whose_window_was_closed_says_so_and_can_still_be_closed(simulation: Simulation) -> None:
+    simulation.step()
+    pybullet.disconnect(physicsClientId=simulation._client)  # what closing the window does
+    for call in (simulation.step, simulation.truth):
+        with pytest.raises(SimulationClosedError, match="window") as raised:
+            call()
+        assert "\n" not in str(raised.value)
+    simulation.close()
+    with pytest.raises(SimulationClosedError):
+        simulation.step()
