@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import math
 import os
 import signal
@@ -16,16 +15,20 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Final
 
+import pybullet
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
 from firmware_bridge.config import ConfigError, DdsConfig
 from firmware_bridge.unitree import ids
-from firmware_bridge.unitree.dds import Bus, DdsError
+from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, DdsError
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names
 from sim_hil.simulation import Simulation
 from sim_hil.trace import TraceWriter
 from sim_hil.unitree import sport
-from sim_hil.unitree.camera_process import CameraProcess, CameraProcessError
+from sim_hil.unitree.camera_process import CameraProcess
 from sim_hil.unitree.service import Received, ServiceServer
 from sim_hil.unitree.state import OdometryFrame, StatePublishers
 
@@ -35,21 +38,24 @@ POSE_HZ: Final = 10
 PEOPLE_HZ: Final = 5
 _STEPS_PER_S: Final = round(1 / Simulation.DT_S)
 _STEP_NS: Final = 1_000_000_000 // _STEPS_PER_S
+# What the world can do to a run: the camera process dies, the window is closed, a disk is full. Anything else is a bug
+# and keeps its traceback.
+_RUN_FAILURES: Final = (RuntimeError, ValueError, OSError, pybullet.error, *DDS_ERRORS)
 
 EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
-exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the camera process died, or trace or result could not be
-written; 2 bad arguments"""
+exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
+is written all the same, or trace or result could not be written; 2 bad arguments"""
 
 
 class Go2Hil:
-    """A simulated Go2 answering the Unitree protocol. Raises DdsError, CameraProcessError, ValueError at the start."""
+    """A simulated Go2 answering the Unitree protocol. Raises DdsError or ValueError when it cannot be built."""
 
-    def __init__(self, scene: Scene, args: argparse.Namespace, dds: DdsConfig, trace: TraceWriter | None) -> None:
+    def __init__(self, scene: Scene, args: argparse.Namespace, dds: DdsConfig) -> None:
         self._scene = scene
         self._args = args
-        self._trace = trace
+        self._trace: TraceWriter | None = None
         self._simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui)
         try:
             self._bus = Bus(dds)
@@ -67,30 +73,34 @@ class Go2Hil:
         self._sport = ServiceServer(self._bus, ids.SPORT_SERVICE)
         self._robot_state = ServiceServer(self._bus, sport.ROBOT_STATE_SERVICE)
         self._motion_switcher = ServiceServer(self._bus, sport.MOTION_SWITCHER_SERVICE)
-        servers = (self._sport, self._robot_state, self._motion_switcher)
-        self._waitset = self._bus.waitset(*(server.reader for server in servers))
+        self._servers = (self._sport, self._robot_state, self._motion_switcher)
+        self._waitset = self._bus.waitset(*(server.reader for server in self._servers))
         self._publishers = StatePublishers(self._bus, OdometryFrame(scene.start), _STEPS_PER_S)
         self._log = sport.CommandLog()
         self._steps = 0
-        self._lost_ns = 0
+        self._duration_s = 0.0
         self._video_frames = 0
+        self._video_malformed = 0
         self._path_m = 0.0
         self._last_xy: tuple[float, float] | None = None
-        self.summary: dict[str, object] = {}
 
-    def start(self) -> None:
-        """Wait for the camera and write the trace's first line. Raises CameraProcessError."""
-        self._camera.show(self._simulation.render_state())
-        self._camera.wait_ready()
+    def start(self, trace: TraceWriter | None, stop: list[int]) -> bool:
+        """Write the first line of `trace`, wait for the camera; False when a signal number appears in `stop` first.
+
+        Raises CameraProcessError.
+        """
+        self._trace = trace
         footprints = [
             {"label": f.label, "kind": f.kind, "polygon": [list(map(float, corner)) for corner in f.polygon]}
             for f in self._scene.footprints()
         ]
         start, goal = list(self._scene.start), list(self._scene.goal_xy)
         self._note("scene", name=self._scene.name, start=start, goal=goal, footprints=footprints)
+        self._camera.show(self._simulation.render_state())
+        return self._camera.wait_ready(stop)
 
     def run(self, stop: list[int], duration_s: float | None) -> None:
-        """Simulate in real time until a signal number appears in `stop`. Raises CameraProcessError."""
+        """Simulate in real time until a signal number appears in `stop`. Raises one of _RUN_FAILURES."""
         begin_ns = schedule_ns = next_ns = time.monotonic_ns()
         end_ns = None if duration_s is None else begin_ns + int(duration_s * 1e9)
         try:
@@ -110,7 +120,7 @@ class Go2Hil:
                 self._camera.show(self._simulation.render_state())
                 next_ns = max(next_ns + BATCH_NS, now_ns)
         finally:
-            self._summarise((time.monotonic_ns() - begin_ns) / 1e9)
+            self._duration_s = (time.monotonic_ns() - begin_ns) / 1e9
 
     def close(self) -> None:
         """End the camera process and the simulation."""
@@ -127,6 +137,10 @@ class Go2Hil:
         for event in self._camera.events():
             if event["event"] == "frame":
                 self._video_frames += 1
+            elif event["event"] == "malformed":
+                count = event["count"]
+                assert isinstance(count, int)
+                self._video_malformed += count
             elif event["event"] == "request":
                 t_ns, api_id, parameter = event["t_ns"], event["api_id"], event["parameter"]
                 assert isinstance(t_ns, int) and isinstance(api_id, int) and isinstance(parameter, str)
@@ -171,15 +185,18 @@ class Go2Hil:
         if self._trace is not None:
             self._trace.put(time.monotonic_ns(), kind, **fields)
 
-    def _summarise(self, duration_s: float) -> None:
-        self.summary = {
+    def summary(self) -> dict[str, object]:
+        """The result, of a run that has ended or never begun."""
+        duration_s = self._duration_s
+        malformed = self._video_malformed + sum(server.malformed for server in self._servers)
+        return {
             "robot": self._args.robot,
             "scene": self._scene.name,
             "seed": self._args.seed,
             "people": self._args.people,
             "duration_s": round(duration_s, 3),
             "real_time_factor": round(self._steps * Simulation.DT_S / duration_s, 4) if duration_s > 0 else 0.0,
-            "wire": self._log.summary(),
+            "wire": {**self._log.summary(), "malformed": malformed},
             "path_m": round(self._path_m, 3),
             "fell": self._simulation.fell,
             "collisions": sorted(self._simulation.collided_with()),
@@ -190,11 +207,18 @@ class Go2Hil:
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """A list that receives the number of every SIGINT and SIGTERM."""
+    """A list that receives the number of every SIGINT and SIGTERM until the end of the block."""
     received: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, _frame: received.append(signum))
-    yield received
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -232,53 +256,67 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
     args = _parser().parse_args(argv)
+    with stop_signals() as stop:
+        try:
+            dds = _checked(args)
+            hil = Go2Hil(load_scene(args.scene), args, dds)
+        except (ConfigError, SceneError, DdsError, ValueError, OSError) as error:
+            return _complain(error, EXIT_BAD_INPUT)
+        try:
+            trace = None if args.trace is None else TraceWriter(args.trace)
+        except OSError as error:
+            hil.close()
+            return _complain(f"--trace {args.trace}: expected a file to write, {error.strerror}", EXIT_BAD_INPUT)
+        try:
+            code = _run(hil, trace, stop, args, dds)
+        finally:
+            written = _write_results(hil, trace, args)
+        return code or written
+
+
+def _checked(args: argparse.Namespace) -> DdsConfig:
+    """Refuse bad arguments before anything is started or overwritten; raises ConfigError or OSError."""
+    if args.gui and not os.environ.get("DISPLAY"):
+        raise ConfigError("--gui: expected a display, DISPLAY is not set; run without --gui or on a desktop")
+    if args.duration is not None and not 0 < args.duration < math.inf:
+        raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
+    for flag, value in (("--people", args.people), ("--seed", args.seed)):
+        if value < 0:
+            raise ConfigError(f"{flag}: expected 0 or more, found {value}")
+    check_result_target(args.json)
+    return DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ())
+
+
+def _run(hil: Go2Hil, trace: TraceWriter | None, stop: list[int], args: argparse.Namespace, dds: DdsConfig) -> int:
     try:
-        if args.gui and not os.environ.get("DISPLAY"):
-            raise ConfigError("--gui: expected a display, DISPLAY is not set; run without --gui or on a desktop")
-        if args.duration is not None and not 0 < args.duration < math.inf:
-            raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
-        dds = DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ())
-        scene = load_scene(args.scene)
-        trace = None if args.trace is None else TraceWriter(args.trace)
-        with stop_signals() as stop:
-            hil = Go2Hil(scene, args, dds, trace)
-            code = _run(hil, stop, args, dds)
-    except (ConfigError, SceneError, DdsError, ValueError, OSError) as error:
-        sys.stderr.write(f"edge-hil: {error}\n")
-        return 2
+        try:
+            if hil.start(trace, stop):
+                sys.stderr.write(f"edge-hil: ready, domain {dds.domain} on {dds.interface}\n")
+                sys.stderr.flush()
+                hil.run(stop, args.duration)
+        finally:
+            hil.close()
+    except _RUN_FAILURES as error:
+        return _complain(f"the run has failed: {error}", EXIT_CHECK_FAILED)
+    return EXIT_DONE
+
+
+def _write_results(hil: Go2Hil, trace: TraceWriter | None, args: argparse.Namespace) -> int:
+    code, summary = EXIT_DONE, hil.summary()
     if trace is not None:
-        trace.close(time.monotonic_ns(), **hil.summary)
+        trace.close(time.monotonic_ns(), **summary)
         if trace.error is not None:
-            sys.stderr.write(f"edge-hil: trace {args.trace} is incomplete: {trace.error}\n")
-            code = 1
+            code = _complain(f"trace {args.trace} is incomplete: {trace.error}", EXIT_CHECK_FAILED)
     try:
-        _write_result(args.json, hil.summary)
+        write_result(args.json, summary)
     except OSError as error:
-        sys.stderr.write(f"edge-hil: the result could not be written: {error}\n")
-        return 1
+        code = _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
     return code
 
 
-def _write_result(where: str | None, summary: dict[str, object]) -> None:
-    text = json.dumps(summary, indent=2) + "\n"
-    if where == "-":
-        sys.stdout.write(text)
-    elif where:
-        Path(where).write_text(text, encoding="utf-8")
-
-
-def _run(hil: Go2Hil, stop: list[int], args: argparse.Namespace, dds: DdsConfig) -> int:
-    try:
-        hil.start()
-        sys.stderr.write(f"edge-hil: ready, domain {dds.domain} on {dds.interface}\n")
-        sys.stderr.flush()
-        hil.run(stop, args.duration)
-    except CameraProcessError as error:
-        sys.stderr.write(f"edge-hil: {error}\n")
-        return 1
-    finally:
-        hil.close()
-    return 0
+def _complain(what: object, code: int) -> int:
+    sys.stderr.write(f"edge-hil: {what}\n")
+    return code
 
 
 if __name__ == "__main__":

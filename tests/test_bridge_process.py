@@ -20,7 +20,7 @@ import pytest
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.unitree import ids
 from tests.fake_go2 import FakeGo2
-from tests.processes import GO2_SIM, REPOSITORY, Running, running, wait_for
+from tests.processes import GO2_SIM, REPOSITORY, HostStall, Running, check_stop_latency, running, wait_for
 
 STOP_BOUND_NS = 300_000_000
 ZERO = (0.0, 0.0, 0.0)
@@ -54,7 +54,7 @@ def driver(socket_path: Path, folder: Path):
 
 def latency_to_zero_ns(robot: FakeGo2, since_ns: int) -> int:
     """From `since_ns` until the robot heard its first zero velocity with nothing but zeros after it."""
-    time.sleep(0.6)
+    time.sleep(1.0)
     moves = robot.moves()
     last_moving = max(i for i, heard in enumerate(moves) if heard.velocity != ZERO)
     assert last_moving + 1 < len(moves), "no zero velocity was ever heard"
@@ -65,13 +65,13 @@ def latency_to_zero_ns(robot: FakeGo2, since_ns: int) -> int:
 def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
-    with driver(socket_path, tmp_path) as runner:
-        wait_for(robot.is_driven, 10, "the robot is driven")
+    with HostStall() as host, driver(socket_path, tmp_path) as runner:
+        wait_for(robot.is_driven, 20, "the robot is driven")
         time.sleep(0.25)
         since_ns = time.monotonic_ns()
         os.kill(runner.pid, number)
         latency_ns = latency_to_zero_ns(robot, since_ns)
-        assert latency_ns <= STOP_BOUND_NS
+        check_stop_latency(latency_ns, STOP_BOUND_NS, since_ns, host)
         assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard if heard.received_ns > since_ns]
         runner.process.kill()
 
@@ -80,7 +80,7 @@ def test_a_frozen_runner_that_thaws_does_not_drive_again(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
     with driver(socket_path, tmp_path) as runner:
-        wait_for(robot.is_driven, 10, "the robot is driven")
+        wait_for(robot.is_driven, 20, "the robot is driven")
         os.kill(runner.pid, signal.SIGSTOP)
         time.sleep(0.5)
         robot.heard.clear()
@@ -93,10 +93,10 @@ def test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
     with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 10, "the robot is driven")
+        wait_for(robot.is_driven, 20, "the robot is driven")
         robot.heard.clear()
         assert bridge.end() == 0
-    wait_for(lambda: robot.moves() and robot.moves()[-1].velocity == ZERO, 2, "zero as the last command")
+    wait_for(lambda: robot.moves() and robot.moves()[-1].velocity == ZERO, 20, "zero as the last command")
     assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard]
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["zero_after_stop"] and result["last_command"] == [0.0, 0.0, 0.0]
@@ -107,10 +107,10 @@ def test_a_robot_that_falls_silent_is_stopped(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
     with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 10, "the robot is driven")
+        wait_for(robot.is_driven, 20, "the robot is driven")
         robot.reporting = False
         try:
-            wait_for(lambda: not robot.is_driven(), 2, "zero velocity")
+            wait_for(lambda: not robot.is_driven(), 20, "zero velocity")
         finally:
             robot.reporting = True
     assert "silent" in bridge.stderr()
@@ -131,7 +131,7 @@ def test_a_second_client_is_turned_away_and_the_first_drives_on(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
     with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 10, "the robot is driven")
+        wait_for(robot.is_driven, 20, "the robot is driven")
         with pytest.raises(BridgeUnavailable, match="another client"):
             BridgeClient(socket_path)
         time.sleep(0.3)
@@ -143,9 +143,9 @@ def test_a_new_client_may_arm_again_after_the_first_has_died(
 ) -> None:
     for _ in range(2):
         with driver(socket_path, tmp_path) as runner:
-            wait_for(robot.is_driven, 10, "the robot is driven")
+            wait_for(robot.is_driven, 20, "the robot is driven")
             runner.process.kill()
-        wait_for(lambda: not robot.is_driven(), 1, "zero velocity")
+        wait_for(lambda: not robot.is_driven(), 20, "zero velocity")
 
 
 def test_garbage_on_the_socket_is_ignored(robot: FakeGo2, bridge: Running, socket_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_garbage_on_the_socket_is_ignored(robot: FakeGo2, bridge: Running, socke
     for data in (b"\0", b"TVEB" + b"\xff" * 600, b"x" * 511):
         client._socket.send(data)
     client.arm()
-    wait_for(lambda: client.poll().state == "armed", 10, "armed")
+    wait_for(lambda: client.poll().state == "armed", 20, "armed")
     client.close()
 
 

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,7 @@ _POLL_S: Final = 0.02
 
 
 class CameraProcessError(RuntimeError):
-    """The camera process did not start or has died."""
+    """The camera process did not start, has died, or talks nonsense."""
 
 
 class CameraProcess:
@@ -49,27 +50,35 @@ class CameraProcess:
         """Make this the state that the next frame is rendered from; takes microseconds."""
         self._pose.write(render_state)
 
-    def wait_ready(self) -> None:
-        """Wait until the service answers. Raises CameraProcessError."""
+    def wait_ready(self, stop: Sequence[int]) -> bool:
+        """Wait until the service answers; False when something appears in `stop` first. Raises CameraProcessError."""
         deadline_ns = time.monotonic_ns() + int(_START_TIMEOUT_S * 1e9)
-        while not any(event.get("event") == "ready" for event in self.events()):
+        while not any(event["event"] == "ready" for event in self.events()):
+            if stop:
+                return False
             if time.monotonic_ns() > deadline_ns:
                 raise CameraProcessError(f"the camera process was not ready within {_START_TIMEOUT_S:g} s")
             time.sleep(_POLL_S)
+        return True
 
     def events(self) -> list[dict[str, object]]:
-        """What the camera process has reported since the last look. Raises CameraProcessError when it has died."""
+        """What the camera process has reported since the last look. Raises CameraProcessError."""
         assert self._process.stdout is not None
         data = b""
         with contextlib.suppress(BlockingIOError):
             while True:
                 chunk = os.read(self._process.stdout.fileno(), 65536)
                 if not chunk:
-                    code = self._process.wait()
-                    raise CameraProcessError(f"the camera process has died (exit status {code}); see its output above")
+                    with contextlib.suppress(subprocess.TimeoutExpired):  # it hung up and lives on: close() kills it
+                        self._process.wait(_END_TIMEOUT_S)
+                    raise CameraProcessError(f"the camera process {self._fate()}; see its output above")
                 data += chunk
         *lines, self._partial = (self._partial + data).split(b"\n")
-        return [json.loads(line) for line in lines]
+        return [_event(line) for line in lines]
+
+    def _fate(self) -> str:
+        code = self._process.returncode
+        return "has closed its output, still running" if code is None else f"has died (exit status {code})"
 
     def close(self) -> None:
         """End the process; killed if it does not end by itself."""
@@ -83,3 +92,13 @@ class CameraProcess:
             self._process.wait()
         self._process.stdout.close()
         self._pose.close()
+
+
+def _event(line: bytes) -> dict[str, object]:
+    try:
+        event = json.loads(line)
+    except (ValueError, RecursionError):
+        event = None
+    if not isinstance(event, dict) or not isinstance(event.get("event"), str):
+        raise CameraProcessError(f"the camera process: expected an event as a line of JSON, found {line[:60]!r}")
+    return event

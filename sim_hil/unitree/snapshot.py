@@ -1,4 +1,4 @@
-"""One float64 array shared with another process: the newest value, never a torn one, and nobody ever waits.
+"""One float64 array shared with another process: the newest value, never a torn one, and the writer never waits.
 
 The memory is an anonymous file passed down as a descriptor, so nothing is left behind by a process that is killed.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+import time
 import zlib
 from typing import Final
 
@@ -16,6 +17,11 @@ from numpy.typing import NDArray
 
 _HEADER: Final = struct.Struct("<QI")  # sequence number (0: nothing yet), CRC-32 of sequence and data
 _TRIES: Final = 100
+_PAUSE_S: Final = 0.001  # a writer that lost its core inside its copy is away for milliseconds
+
+
+class TornSnapshotError(RuntimeError):
+    """The writer left a value half-written and did not come back."""
 
 
 def _crc(sequence: int, data: bytes) -> int:
@@ -58,7 +64,10 @@ class SnapshotReader:
         self._memory = mmap.mmap(fd, size, prot=mmap.PROT_READ)
 
     def read(self) -> NDArray[np.float64] | None:
-        """The newest whole value; None before the first. A copy caught half-written fails its CRC and is repeated."""
+        """The newest whole value; None before the first. Raises TornSnapshotError after 0.1 s without one.
+
+        A copy caught half-written fails its CRC and is repeated.
+        """
         for _ in range(_TRIES):
             content = bytes(self._memory[:])
             sequence, crc = _HEADER.unpack_from(content)
@@ -67,7 +76,8 @@ class SnapshotReader:
             data = content[_HEADER.size :]
             if _crc(sequence, data) == crc:
                 return np.frombuffer(data, dtype="<f8").astype(np.float64)
-        raise RuntimeError(f"no consistent snapshot in {_TRIES} tries; is the writer alive?")
+            time.sleep(_PAUSE_S)
+        raise TornSnapshotError(f"no consistent snapshot in {_TRIES} tries; is the writer alive?")
 
     def close(self) -> None:
         """Release the memory."""

@@ -23,6 +23,9 @@ _ACTIONS: Final = {
     ids.STAND_DOWN: SportAction.STAND_DOWN,
     ids.RECOVERY_STAND: SportAction.RECOVERY_STAND,
 }
+# A request that is not here leaves the velocity in force, or is counted as if it did: BalanceStand, a RecoveryStand on
+# its feet and an unknown id change nothing, and StandUp is not a way to stop a robot.
+_ENDS_MOTION: Final = frozenset({ids.STOP_MOVE, ids.DAMP, ids.STAND_DOWN})
 _API_NAMES: Final = {
     ids.SPORT_SERVICE: ids.SPORT_API_NAMES,
     ids.VIDEO_SERVICE: {ids.GET_IMAGE_SAMPLE: "GetImageSample"},
@@ -95,6 +98,7 @@ class CommandLog:
         self.commands = 0
         self.last_move: tuple[float, float, float] | None = None
         self.last_command: str | None = None
+        self._at_zero = True  # what the last motion request asked for
 
     def note(self, request: Received) -> None:
         """Count one received request."""
@@ -104,13 +108,15 @@ class CommandLog:
         if request.api_id == ids.MOVE:
             self.commands += 1
             self.last_move = parse_move(request.parameter)
+            self._at_zero = self.last_move is not None and not any(self.last_move)
+        elif request.api_id in _ENDS_MOTION:
+            self._at_zero = True
 
     def summary(self) -> dict[str, object]:
         """The `wire` part of the result; a robot that was never told to move was last told zero."""
-        moving = self.last_command == "Move" and (self.last_move is None or any(self.last_move))
         return {
             "commands": self.commands,
             "last_move": None if self.last_move is None else list(self.last_move),
             "last_command": self.last_command,
-            "last_command_zero": not moving,
+            "last_command_zero": self._at_zero,
         }

@@ -1,7 +1,8 @@
 """The front camera as a process of its own: answers `videohub` GetImageSample with a JPEG rendered at that moment.
 
 Started by `CameraProcess`; talks to its parent through three pipes' worth of plain things: the pose in shared memory
-(`snapshot.py`), events as JSON lines on stdout, and an end of file on stdin when the parent has gone.
+(`snapshot.py`), events as JSON lines on what was stdout at the start, and an end of file on stdin when the parent has
+gone.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import select
 import signal
 import sys
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TextIO
 
 import cv2
 import numpy as np
@@ -26,7 +28,7 @@ from firmware_bridge.unitree.dds import Bus
 from sim_hil.camera import CameraWorld
 from sim_hil.scene import load_scene
 from sim_hil.unitree.service import Received, ServiceServer
-from sim_hil.unitree.snapshot import SnapshotReader
+from sim_hil.unitree.snapshot import SnapshotReader, TornSnapshotError
 
 JPEG_QUALITY: Final = 85
 _PARENT_CHECK_NS: Final = 50_000_000
@@ -47,10 +49,14 @@ class VideoHub:
     def __init__(
         self, server: ServiceServer, render: Callable[[], bytes | None], tell: Callable[[dict[str, object]], None]
     ) -> None:
-        """`render` gives a JPEG, or None while there is no pose yet; `tell` reports an event to the parent."""
+        """`render` gives a JPEG, or None while there is no pose yet, and may raise TornSnapshotError.
+
+        `tell` reports an event to the parent.
+        """
         self._server = server
         self._render = render
         self._tell = tell
+        self._malformed = 0
 
     def serve(self) -> None:
         """Answer what is waiting."""
@@ -70,9 +76,17 @@ class VideoHub:
                 waiting.append(request)
             else:
                 self._server.reply(request, ids.ERROR_NOT_IMPLEMENTED)
+        if self._server.malformed != self._malformed:
+            self._tell({"event": "malformed", "count": self._server.malformed - self._malformed})
+            self._malformed = self._server.malformed
         if not waiting:
             return
-        jpeg = self._render()
+        try:
+            jpeg = self._render()
+        except TornSnapshotError as error:
+            # The physics is held up or has gone; the next request finds out which.
+            sys.stderr.write(f"edge-hil camera: a picture was left out: {error}\n")
+            jpeg = None
         for request in waiting:
             if jpeg is None:
                 self._server.reply(request, ERROR_NO_IMAGE)
@@ -81,9 +95,11 @@ class VideoHub:
                 self._tell({"event": "frame", "t_ns": time.monotonic_ns()})
 
 
-def _tell(event: dict[str, object]) -> None:
-    sys.stdout.write(json.dumps(event) + "\n")
-    sys.stdout.flush()
+def _event_pipe() -> TextIO:
+    """The pipe to the parent, for us alone: what a library prints to stdout goes to stderr from now on."""
+    pipe = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return pipe
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -102,6 +118,12 @@ def main(argv: list[str] | None = None) -> int:
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    pipe = _event_pipe()
+
+    def tell(event: dict[str, object]) -> None:
+        pipe.write(json.dumps(event) + "\n")
+        pipe.flush()
+
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
 
@@ -112,10 +134,10 @@ def main(argv: list[str] | None = None) -> int:
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     server = ServiceServer(bus, ids.VIDEO_SERVICE)
     waitset = bus.waitset(server.reader)
-    hub = VideoHub(server, render, _tell)
+    hub = VideoHub(server, render, tell)
     # BrokenPipeError: the parent died between two looks at stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
-        _tell({"event": "ready"})
+        tell({"event": "ready"})
         while not select.select([sys.stdin], [], [], 0)[0]:
             waitset.wait(_PARENT_CHECK_NS)
             hub.serve()
