@@ -96,6 +96,15 @@ def test_the_robot_is_told_zero_within_300_ms(rig: Rig, number: signal.Signals) 
     check_stop_latency(latency_ns, BOUND_NS, since_ns, host)
 
 
+def test_only_what_the_machine_stood_still_inside_the_window_is_granted() -> None:
+    host = HostStall()
+    host._stalls = [(0, 10), (20, 40), (90, 95)]
+    assert host.between_ns(5, 30) == 5 + 10
+    check_stop_latency(25, bound_ns=10, since_ns=5, host=host)
+    with pytest.raises(AssertionError, match="allowed"):
+        check_stop_latency(26, bound_ns=9, since_ns=5, host=host)
+
+
 def test_the_robot_comes_to_a_stand(rig: Rig) -> None:
     walk_then(rig, signal.SIGKILL)
     wait_for(lambda: rig.speed_mps() < 0.1, 20, "the robot to stand")
