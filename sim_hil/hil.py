@@ -225,7 +225,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """`WxH` in pixels; raises argparse.ArgumentTypeError."""
     width, times, height = text.partition("x")
     if not (times and width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"expected WxH such as 320x240, found {text!r}")
+        raise argparse.ArgumentTypeError(f"expected WxH such as 320x180, found {text!r}")
     if not (32 <= int(width) <= 1920 and 32 <= int(height) <= 1080):
         raise argparse.ArgumentTypeError(f"expected 32x32 to 1920x1080, found {text}")
     return int(width), int(height)
@@ -246,7 +246,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="DDS domain (default 0)")
     parser.add_argument("--interface", default="lo", help="network interface (default lo)")
-    parser.add_argument("--camera", type=parse_size, default=(320, 240), metavar="WxH", help="default 320x240")
+    parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH", help="default 320x180")
     parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     parser.add_argument("--gui", action="store_true", help="show the physics in a window")

@@ -13,11 +13,21 @@ from pathlib import Path
 import pytest
 
 from edge.recording import read_messages
-from tests.processes import GO2_SIM, REPOSITORY, Running, hil_arguments, read_trace, running, wait_for
+from tests.processes import (
+    GO2_SIM,
+    REPOSITORY,
+    HostStall,
+    Running,
+    check_stop_latency,
+    hil_arguments,
+    read_trace,
+    running,
+    wait_for,
+)
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 MOVE = 1008
-STOP_BOUND_MS = 300
+STOP_BOUND_NS = 300_000_000
 
 
 class Robot:
@@ -101,7 +111,7 @@ def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> No
 
 
 def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) -> None:
-    with drive(robot) as runner:
+    with drive(robot) as runner, HostStall() as host:
         wait_for(robot.is_moving, 20, "the robot to be told to move")
         time.sleep(1.0)
         runner.process.send_signal(signal.SIGKILL)
@@ -110,12 +120,12 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
     time.sleep(1.0)
     after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= killed_ns]
     zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    assert (zero_ns - killed_ns) / 1e6 <= STOP_BOUND_MS
+    check_stop_latency(zero_ns - killed_ns, STOP_BOUND_NS, killed_ns, host)
     assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
 
 
 def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead(robot: Robot) -> None:
-    with drive(robot) as runner:
+    with drive(robot) as runner, HostStall() as host:
         wait_for(robot.is_moving, 20, "the robot to be told to move")
         time.sleep(1.0)
         runner.process.send_signal(signal.SIGSTOP)
@@ -125,7 +135,7 @@ def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands
         status = runner.process.wait(20)
     after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= frozen_ns]
     zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    assert (zero_ns - frozen_ns) / 1e6 <= STOP_BOUND_MS
+    check_stop_latency(zero_ns - frozen_ns, STOP_BOUND_NS, frozen_ns, host)
     assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
     assert status == 1, "a run that the bridge had to stop is a failed run"
 

@@ -345,7 +345,7 @@ class TestRealProcess:
         pictures = [picture()]
         wait_for(has_turned, 20, "the robot to turn")
         pictures.append(picture())
-        assert pictures[0].shape == (240, 320, 3)
+        assert pictures[0].shape == (180, 320, 3)
         assert float(np.abs(pictures[0].astype(int) - pictures[1]).mean()) > 5
 
     def test_the_trace_has_what_was_on_the_wire(self, hil: tuple[Running, Path]) -> None:

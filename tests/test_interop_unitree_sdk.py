@@ -75,5 +75,5 @@ def test_the_sdk_is_told_what_the_robot_cannot_do(session: dict) -> None:
 
 def test_the_sdk_fetches_a_picture(session: dict) -> None:
     code, size, shape, contrast = session["image"]
-    assert (code, shape) == (0, [240, 320, 3])
+    assert (code, shape) == (0, [180, 320, 3])
     assert size > 1000 and contrast > 5
