@@ -214,7 +214,9 @@ def test_a_child_deaf_to_sigint_is_killed_with_all_it_started(tmp_path: Path) ->
 
 def test_processes_end_in_reverse_order_of_their_start(tmp_path: Path) -> None:
     script = (
-        "import sys, time\n"
+        "import signal, sys, time\n"
+        # A shell starts what it runs in the background with SIGINT ignored, and children inherit that.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "try:\n"
         "    print('up', flush=True)\n"
         "    time.sleep(60)\n"
