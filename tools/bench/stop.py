@@ -1,0 +1,109 @@
+"""How soon the robot hears zero velocity when the runner is killed or frozen while it drives.
+
+    python -m tools.bench.stop --artifacts out/demo/artifacts --runs 20 --json out/bench/stop.json
+
+Real processes on loopback: edge-hil, edge-bridge, and an edge-run a time, which is sent SIGKILL or SIGSTOP in turn. The
+judge is the simulated robot's own trace of what it received: the figure is signal → first of the zeros that then last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import statistics
+import sys
+import time
+from pathlib import Path
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from tools.children import Child, Children, StepError
+from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+
+SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
+BOUND_MS = 300.0
+DRIVING_S = (0.5, 1.5)
+"""A run drives this long before the signal: the phase against the tick and the deadman is random."""
+AFTERMATH_S = 0.8
+
+
+def received_moves(trace: Path) -> list[tuple[int, bool]]:
+    """(stamp ns, is zero) of every velocity command in a trace of edge-hil, an unfinished last line left out."""
+    moves: list[tuple[int, bool]] = []
+    for line in trace.read_text(encoding="utf-8").split("\n")[:-1]:
+        record = json.loads(line)
+        if record["kind"] == "wire" and record["name"] == "Move":
+            moves.append((record["t_ns"], not any(json.loads(record["parameter"]).values())))
+    return moves
+
+
+def lasting_zero_ms(moves: list[tuple[int, bool]], signal_ns: int) -> float:
+    """From the signal to the zero after which nothing but zero came; raises ValueError when there was none."""
+    after = [(stamp_ns, zero) for stamp_ns, zero in moves if stamp_ns >= signal_ns]
+    last_motion = max((i for i, (_, zero) in enumerate(after) if not zero), default=-1)
+    if last_motion + 1 >= len(after):
+        raise ValueError("the robot was not stopped at all")
+    return (after[last_motion + 1][0] - signal_ns) / 1e6
+
+
+def stop_once(children: Children, runner: list[str], trace: Path, number: signal.Signals, driving_s: float) -> float:
+    """Start a runner, let it drive, send the signal; returns the latency in ms."""
+    child: Child = children.start("edge-run", runner)
+    before = len(received_moves(trace))
+    moving = lambda: any(not zero for _, zero in received_moves(trace)[before:])  # noqa: E731
+    children.wait_until(child, moving, 60.0, "motion", lambda: None)
+    time.sleep(driving_s)
+    signal_ns = time.monotonic_ns()
+    child.process.send_signal(number)
+    time.sleep(AFTERMATH_S)
+    child.process.kill()
+    child.process.wait()
+    children.forget(child)
+    return lasting_zero_ms(received_moves(trace), signal_ns)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p.add_argument("--runs", type=int, default=20, help="runs of each signal (default: 20)")
+    p.add_argument("--json", metavar="FILE|-")
+    args = p.parse_args(argv)
+    rng = random.Random(0)
+    samples: dict[str, list[float]] = {number.name: [] for number in SIGNALS}
+    try:
+        check_result_target(args.json)
+        if args.runs < 1:
+            raise ValueError(f"--runs {args.runs}: expected at least 1")
+        with socket_dir() as folder, Children(folder) as children:
+            trace, domain = folder / "trace.jsonl", ["--domain", str(free_domain())]
+            link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
+            scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
+            hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, "--trace", str(trace), *domain])
+            children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
+            children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+            runner = [*COMMANDS["edge-run"], *link, "--artifacts", str(args.artifacts), "--instruction", INSTRUCTION]
+            for index in range(args.runs):
+                for number in SIGNALS:
+                    latency_ms = stop_once(children, runner, trace, number, rng.uniform(*DRIVING_S))
+                    samples[number.name].append(latency_ms)
+                    sys.stderr.write(f"run {index + 1}/{args.runs}: {number.name} {latency_ms:.1f} ms\n")
+    except (StepError, OSError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return EXIT_BAD_INPUT
+    summary = {
+        name: {"n": len(values), "p50": statistics.median(values), "max": max(values)}
+        for name, values in samples.items()
+    }
+    ok = all(row["max"] <= BOUND_MS for row in summary.values())
+    result = {"stop_ms": summary, "bound_ms": BOUND_MS, "ok": ok, "samples_ms": samples, "tagged": "measured"}
+    write_result(args.json, result)
+    if args.json != "-":
+        for name, row in summary.items():
+            print(f"{name}: n {row['n']}, p50 {row['p50']:.1f} ms, max {row['max']:.1f} ms (bound {BOUND_MS:.0f} ms)")
+    return EXIT_DONE if ok else EXIT_CHECK_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
