@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -221,3 +223,24 @@ def test_no_trace_is_written_and_ten_participants_a_host_are_found() -> None:
     xml = domain_xml(replace(load_robot_config(GO2_SIM).dds))
     assert "Tracing" not in xml and '<Peer address="127.0.0.1"/>' in xml
     assert "<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex>" in xml
+
+
+def test_a_client_that_leaves_is_not_a_malformed_request(bus: Bus, dds_domain: int) -> None:
+    server = ServiceServer(bus, "leaving")
+    code = (
+        "from firmware_bridge.config import DdsConfig\n"
+        "from firmware_bridge.unitree.dds import Bus\n"
+        "from firmware_bridge.unitree.rpc import RpcClient\n"
+        f"bus = Bus(DdsConfig({dds_domain}, 'lo', ('127.0.0.1',)))\n"
+        "RpcClient(bus, 'leaving').call(1001, timeout_s=20)\n"
+        "bus.close()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code]) as client:
+        while client.poll() is None:
+            for request in server.requests():
+                server.reply(request, ids.OK)
+            time.sleep(0.005)
+    assert client.returncode == 0
+    time.sleep(0.3)
+    assert list(server.requests()) == []
+    assert server.malformed == 0

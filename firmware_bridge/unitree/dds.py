@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
@@ -90,7 +91,10 @@ class Bus:
 
 
 def take_each(reader: DataReader[Any], limit: int = 64) -> Iterator[Any]:
-    """Take up to `limit` waiting samples one by one; a sample that does not decode is None, for the caller to count."""
+    """Take up to `limit` waiting samples one by one; a sample that does not decode is None, for the caller to count.
+
+    Notices without data (a writer has left) are passed over.
+    """
     for _ in range(limit):
         try:
             samples = reader.take(1)
@@ -99,4 +103,5 @@ def take_each(reader: DataReader[Any], limit: int = 64) -> Iterator[Any]:
             continue
         if not samples:
             return
-        yield samples[0] if isinstance(samples[0], reader.topic.data_type) else None
+        if not isinstance(samples[0], InvalidSample):
+            yield samples[0] if isinstance(samples[0], reader.topic.data_type) else None
