@@ -23,6 +23,7 @@ from typing import Final
 
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core import BridgeCore, Call, Feedback, Inputs, Move, Outputs
+from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import MAX_DATAGRAM_BYTES, BridgeStatus, LinkError, Message, decode, encode
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus, DdsError, take_each
@@ -32,6 +33,7 @@ from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 _STATUS_PERIOD_NS: Final = 100_000_000
 _MAX_DATAGRAMS_A_STEP: Final = 64
 _MAX_UNANSWERED: Final = 32
+_LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 
 EPILOG: Final = """examples:
@@ -154,7 +156,8 @@ class ClientLink:
 class Bridge:
     """Shell around BridgeCore: joins socket, robot and clock. Raises DdsError, ConfigError, SocketTakenError."""
 
-    def __init__(self, config: RobotConfig) -> None:
+    def __init__(self, config: RobotConfig, log: LineLog) -> None:
+        self._log = log
         self._bus = Bus(config.dds)
         self._sport = RpcClient(self._bus, ids.SPORT_SERVICE, allowed=ids.BRIDGE_ALLOWED)
         self._states = self._bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_)
@@ -241,11 +244,11 @@ class Bridge:
         said = f"{status.state}: {status.reason}"
         if said != self._said:
             self._said = said
-            sys.stderr.write(f"edge-bridge: {said}\n")
+            self._log.say(said)
         for answer in self._sport.responses():
             name = self._sent.pop(answer.request_id, None)
             if name is not None and answer.code != ids.OK:
-                sys.stderr.write(f"edge-bridge: the robot answered {name} with error {answer.code}\n")
+                self._log.say(f"the robot answered {name} with error {answer.code}")
 
     def _last_words(self) -> None:
         if self._core.status(0).commands:
@@ -285,13 +288,15 @@ def main(argv: list[str] | None = None) -> int:
     try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         with signals_to_socket() as wakeup:
-            bridge = Bridge(config)
+            log = LineLog(sys.stderr, "edge-bridge")
+            bridge = Bridge(config, log)
             dds, path = config.dds, config.bridge.socket
-            sys.stderr.write(
-                f"edge-bridge: ready, robot {config.name}, domain {dds.domain} on {dds.interface}, socket {path}\n"
-            )
+            log.say(f"ready, robot {config.name}, domain {dds.domain} on {dds.interface}, socket {path}")
             gc.freeze()  # what exists now stays; collections look at a step's objects only
-            bridge.run(wakeup)
+            try:
+                bridge.run(wakeup)
+            finally:
+                log.close(_LOG_TIMEOUT_S)
     except SocketTakenError as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
         return 3
@@ -303,7 +308,9 @@ def main(argv: list[str] | None = None) -> int:
         if args.json == "-":
             sys.stdout.write(text)
         elif args.json:
-            Path(args.json).write_text(text, encoding="utf-8")
+            partial = Path(args.json + ".partial")
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(args.json)
     except OSError as error:
         sys.stderr.write(f"edge-bridge: the result could not be written: {error}\n")
         return 1

@@ -1,0 +1,39 @@
+"""Lines for the operator from a thread of their own: a stalled terminal or journal must not hold the bridge up."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from typing import TextIO
+
+
+class LineLog:
+    """Bounded queue in front of a text stream; `say` never waits, what does not fit is dropped and counted."""
+
+    def __init__(self, stream: TextIO, prefix: str, *, capacity: int = 64) -> None:
+        self.dropped = 0
+        self._stream = stream
+        self._prefix = prefix
+        self._lines: queue.Queue[str | None] = queue.Queue(capacity)
+        self._thread = threading.Thread(target=self._write, name="line-log", daemon=True)
+        self._thread.start()
+
+    def say(self, line: str) -> None:
+        """Queue one line."""
+        try:
+            self._lines.put_nowait(line)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self, timeout_s: float) -> None:
+        """Give the stream up to `timeout_s` to take what is queued."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(timeout_s)
+
+    def _write(self) -> None:
+        for line in iter(self._lines.get, None):
+            with contextlib.suppress(OSError, ValueError):  # closed or full: there is nobody left to tell
+                self._stream.write(f"{self._prefix}: {line}\n")
+                self._stream.flush()
