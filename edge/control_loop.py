@@ -146,6 +146,7 @@ class ControlLoop:
         self.statistics.tick_ms.append((end_ns - deadline_ns) / 1e6)
         self.statistics.reasons[command.reason] = self.statistics.reasons.get(command.reason, 0) + 1
         if self._recorder is not None:
+            used = None if delay_s is None else semantic
             self._recorder.put(
                 "/tick",
                 start_ns,
@@ -159,8 +160,8 @@ class ControlLoop:
                     "act_ms": (acted_ns - now_ns) / 1e6,
                     "frame_ns": None if encoded is None else encoded.stamp_ns,
                     "frame_age_ms": inputs.frame_age_ms,
-                    "generation": None if delay_s is None or semantic is None else semantic.generation,
-                    "anchor_ns": None if delay_s is None or semantic is None else semantic.anchor_ns,
+                    "generation": None if used is None else used.generation,
+                    "anchor_ns": None if used is None else used.anchor_ns,
                     "delay_s": delay_s,
                     "offset": None if offset is None else offset.as_tuple(),
                     "pose": None if pose is None else pose.T_odom_base.as_tuple(),

@@ -24,9 +24,9 @@ from tests.processes import (
     running,
     wait_for,
 )
+from tools.bench.stop import received_moves
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
-MOVE = 1008
 STOP_BOUND_NS = 300_000_000
 
 
@@ -46,11 +46,7 @@ class Robot:
 
     def moves(self) -> list[tuple[int, bool]]:
         """Every velocity command that reached the robot: stamp, and whether it was zero."""
-        records = [r for r in read_trace(self.trace) if r["kind"] == "wire" and r["api_id"] == MOVE]
-        parameters = [
-            json.loads(r["parameter"]) if isinstance(r["parameter"], str) else r["parameter"] for r in records
-        ]
-        return [(r["t_ns"], not any(p.values())) for r, p in zip(records, parameters, strict=True)]
+        return [(stamp_ns, not any(velocity)) for stamp_ns, velocity in received_moves(self.trace)]
 
     def is_moving(self) -> bool:
         moves = self.moves()

@@ -7,7 +7,6 @@ in the same window and granted on top.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -26,6 +25,7 @@ from tests.processes import (
     running,
     wait_for,
 )
+from tools.bench.stop import received_moves
 
 BOUND_NS = 300_000_000
 
@@ -40,9 +40,7 @@ class Rig:
 
     def moves(self) -> list[tuple[int, tuple[float, float, float]]]:
         """Every Move received: (ns, velocity)."""
-        lines = [line for line in read_trace(self.trace) if line["kind"] == "wire" and line["name"] == "Move"]
-        values = [json.loads(line["parameter"]) for line in lines]
-        return [(line["t_ns"], (v["x"], v["y"], v["z"])) for line, v in zip(lines, values, strict=True)]
+        return received_moves(self.trace)
 
     def speed_mps(self) -> float:
         pose = [line for line in read_trace(self.trace) if line["kind"] == "pose"][-1]

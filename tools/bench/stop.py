@@ -28,20 +28,24 @@ DRIVING_S = (0.5, 1.5)
 AFTERMATH_S = 0.8
 
 
-def received_moves(trace: Path) -> list[tuple[int, bool]]:
-    """(stamp ns, is zero) of every velocity command in a trace of edge-hil, an unfinished last line left out."""
-    moves: list[tuple[int, bool]] = []
+Moves = list[tuple[int, tuple[float, float, float]]]
+
+
+def received_moves(trace: Path) -> Moves:
+    """(stamp ns, velocity) of every Move in a trace of edge-hil, an unfinished last line left out."""
+    moves: Moves = []
     for line in trace.read_text(encoding="utf-8").split("\n")[:-1]:
         record = json.loads(line)
         if record["kind"] == "wire" and record["name"] == "Move":
-            moves.append((record["t_ns"], not any(json.loads(record["parameter"]).values())))
+            velocity = json.loads(record["parameter"])
+            moves.append((record["t_ns"], (velocity["x"], velocity["y"], velocity["z"])))
     return moves
 
 
-def lasting_zero_ms(moves: list[tuple[int, bool]], signal_ns: int) -> float:
+def lasting_zero_ms(moves: Moves, signal_ns: int) -> float:
     """From the signal to the zero after which nothing but zero came; raises ValueError when there was none."""
-    after = [(stamp_ns, zero) for stamp_ns, zero in moves if stamp_ns >= signal_ns]
-    last_motion = max((i for i, (_, zero) in enumerate(after) if not zero), default=-1)
+    after = [move for move in moves if move[0] >= signal_ns]
+    last_motion = max((i for i, (_, velocity) in enumerate(after) if any(velocity)), default=-1)
     if last_motion + 1 >= len(after):
         raise ValueError("the robot was not stopped at all")
     return (after[last_motion + 1][0] - signal_ns) / 1e6
@@ -51,8 +55,11 @@ def stop_once(children: Children, runner: list[str], trace: Path, number: signal
     """Start a runner, let it drive, send the signal; returns the latency in ms."""
     child: Child = children.start("edge-run", runner)
     before = len(received_moves(trace))
-    moving = lambda: any(not zero for _, zero in received_moves(trace)[before:])  # noqa: E731
-    children.wait_until(child, moving, 60.0, "motion", lambda: None)
+
+    def is_moving() -> bool:
+        return any(any(velocity) for _, velocity in received_moves(trace)[before:])
+
+    children.wait_until(child, is_moving, 60.0, "motion", lambda: None)
     time.sleep(driving_s)
     signal_ns = time.monotonic_ns()
     child.process.send_signal(number)
