@@ -1,0 +1,63 @@
+"""Precision of a graph's weights: one default and, by layer name, what differs from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+PRECISIONS = ("fp32", "fp16", "int8", "int8-b128", "int8-b32", "int4-b128", "int4-b32")
+"""From the most to the least exact; `int8` also rounds activations, `-bN` are weight-only in blocks of N."""
+
+
+class PrecisionError(ValueError):
+    """A precision that is not one of PRECISIONS, or an override that addresses no layer."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Precision of every linear layer of a graph; the first override whose pattern matches a layer's name wins."""
+
+    default: str
+    overrides: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in (self.default, *(precision for _, precision in self.overrides)):
+            if name not in PRECISIONS:
+                raise PrecisionError(f"precision {name!r} is not known; expected one of: {', '.join(PRECISIONS)}")
+
+    def of(self, layer: str) -> str:
+        """Precision of the layer of that name, e.g. `layers.3.down` or `lm_head`."""
+        return next((precision for pattern, precision in self.overrides if fnmatchcase(layer, pattern)), self.default)
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain JSON form."""
+        return {"default": self.default, "overrides": dict(self.overrides)}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, object]) -> Precision:
+        """Inverse of `to_dict`; raises PrecisionError."""
+        overrides = content.get("overrides", {})
+        if set(content) - {"default", "overrides"} or not isinstance(overrides, Mapping):
+            raise PrecisionError(f"precision must be 'default' and 'overrides', found {sorted(content)}")
+        return cls(str(content.get("default")), tuple((str(k), str(v)) for k, v in overrides.items()))
+
+
+def block_size(precision: str) -> int | None:
+    """Weights that share one scale in a weight-only precision; None for the others."""
+    return int(precision.partition("-b")[2]) if "-b" in precision else None
+
+
+def bits(precision: str) -> int:
+    """Bits that one weight takes, without its share of the scales."""
+    return {"fp32": 32, "fp16": 16}.get(precision) or int(precision.removeprefix("int").partition("-")[0])
+
+
+def weight_bytes(precision: str, rows: int, columns: int, *, scale_bytes: int = 4) -> int:
+    """Bytes of a [rows, columns] weight in a precision, its scales included."""
+    block = block_size(precision)
+    if block is not None:
+        blocks = -(-columns // block)
+        return rows * blocks * (block * bits(precision) // 8 + scale_bytes)
+    scales = rows * scale_bytes if precision == "int8" else 0
+    return rows * columns * bits(precision) // 8 + scales
