@@ -1,0 +1,233 @@
+"""Cache of finished build stages: what a stage is made from names its result, so nothing is made twice.
+
+An entry is a directory `<key>/` with the stage's files and `entry.json`, their sizes and hashes. It is built in
+`<key>.partial` and renamed, so an interrupted stage leaves no entry; its hashes are checked on every use, so a damaged
+one is rebuilt, not shipped. Files leave the cache by copy only: nothing done to an output can reach what is kept here.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from edge.cli import write_whole
+
+ENTRY_NAME = "entry.json"
+RESULT_NAME = "result.json"
+PACKAGES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "tokenizers", "torch")
+SOURCE_FOLDERS = ("edge", "export")
+_LOCK_NAME = "lock"
+_TIMINGS_NAME = "timings.json"
+_CHUNK_BYTES = 1 << 22
+
+
+class CacheError(OSError):
+    """A cache directory that cannot be used; its text is the one line to show."""
+
+
+def default_cache_dir(environ: Mapping[str, str]) -> Path:
+    """`$XDG_CACHE_HOME/tic-vla-edge`, or `~/.cache/tic-vla-edge` where that is not set to an absolute path."""
+    named = Path(environ.get("XDG_CACHE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".cache") / "tic-vla-edge"
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, read in pieces; raises OSError."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while piece := stream.read(_CHUNK_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=1)
+def source_sha256() -> str:
+    """Hash of all our code and data that can change a result: another version of it finds none of the old entries."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    files = (p for folder in SOURCE_FOLDERS for p in (root / folder).rglob("*") if "__pycache__" not in p.parts)
+    for path in sorted(p for p in files if p.is_file()):
+        digest.update(f"{path.relative_to(root).as_posix()}:{file_sha256(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def package_versions() -> dict[str, str]:
+    """Installed versions of the packages that a result depends on."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
+
+
+def stage_key(stage: str, parts: Mapping[str, Any]) -> str:
+    """SHA-256 of everything that a stage's result follows from; `parts` is plain JSON."""
+    content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source_sha256()}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def fsync_path(path: Path) -> None:
+    """Force a file or directory to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
+    """A cache to work with; afterwards the entries used longest ago go until the rest fits `limit_bytes`.
+
+    Entries go only while no other process has the cache open. Raises CacheError.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise CacheError(
+            f"cache {directory}: cannot be written ({error.strerror}); name another with --cache DIR or use --no-cache"
+        ) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        cache = StageCache(directory, say)
+        try:
+            yield cache
+        finally:
+            if _try_lock(descriptor):
+                cache.prune(limit_bytes)
+    finally:
+        os.close(descriptor)
+
+
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class StageCache:
+    """Finished stages in a directory, each under the hash of what it was made from; made by `open_cache`."""
+
+    directory: Path
+    say: Callable[[str], None]
+
+    def fetch_or_build(self, key: str, build: Callable[[Path], None]) -> tuple[Path, bool]:
+        """Directory of a stage's files and whether they were there already; else `build` writes them.
+
+        A second process that wants the same stage waits for the first and takes its result. Whatever `build` raises
+        comes through and leaves no entry.
+        """
+        entry = self.directory / key
+        with self._locked(key):
+            if entry.exists():
+                damage = _damage(entry)
+                if damage is None:
+                    os.utime(entry / ENTRY_NAME)  # its age counts from its last use
+                    return entry, True
+                self.say(f"cache: {damage}; building it again")
+                shutil.rmtree(entry)
+            partial = self.directory / f"{key}.partial"
+            shutil.rmtree(partial, ignore_errors=True)  # left by a process that was killed
+            partial.mkdir()
+            try:
+                build(partial)
+                _seal(partial)
+                partial.rename(entry)
+                fsync_path(self.directory)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+        return entry, False
+
+    def result(self, key: str, compute: Callable[[], Mapping[str, Any]]) -> tuple[dict[str, Any], bool]:
+        """A stage whose result is plain JSON, and whether it was there already."""
+
+        def build(directory: Path) -> None:
+            text = json.dumps(compute(), indent=1, sort_keys=True, allow_nan=False) + "\n"
+            (directory / RESULT_NAME).write_text(text, encoding="utf-8")
+
+        entry, cached = self.fetch_or_build(key, build)
+        content: dict[str, Any] = json.loads((entry / RESULT_NAME).read_text(encoding="utf-8"))
+        return content, cached
+
+    def timings(self, run: str) -> dict[str, float]:
+        """Seconds that each stage took the last time it was built for this kind of run; empty when unknown."""
+        known = self._all_timings().get(run)
+        pairs = known.items() if isinstance(known, dict) else ()
+        return {k: float(v) for k, v in pairs if isinstance(v, int | float) and not isinstance(v, bool) and v >= 0}
+
+    def remember_timings(self, run: str, seconds: Mapping[str, float]) -> None:
+        """Keep the seconds of the stages that were built; they only serve the next run's estimate."""
+        content = self._all_timings()
+        content[run] = {**self.timings(run), **{k: round(v, 3) for k, v in seconds.items()}}
+        write_whole(self.directory / _TIMINGS_NAME, json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+    def _all_timings(self) -> dict[str, Any]:
+        try:
+            content = json.loads((self.directory / _TIMINGS_NAME).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}  # never there before, or damaged: an estimate is not worth an error
+        return content if isinstance(content, dict) else {}
+
+    def prune(self, limit_bytes: int) -> None:
+        """Drop leftovers of killed processes and the entries used longest ago, until the rest fits."""
+        for leftover in [*self.directory.glob("*.partial"), *self.directory.glob("*.building")]:
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+        entries = [path for path in self.directory.iterdir() if path.is_dir()]
+        total = sum(map(_size_bytes, entries))
+        for entry in sorted(entries, key=_last_used_ns):
+            if total <= limit_bytes:
+                return
+            total -= _size_bytes(entry)
+            shutil.rmtree(entry)
+
+    @contextmanager
+    def _locked(self, key: str) -> Iterator[None]:
+        descriptor = os.open(self.directory / f"{key}.building", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def _seal(directory: Path) -> None:
+    """Record what is in a finished stage, and force all of it to the disk before it gets its name."""
+    files = sorted(path for path in directory.iterdir())
+    content = {path.name: {"sha256": file_sha256(path), "bytes": path.stat().st_size} for path in files}
+    entry = directory / ENTRY_NAME
+    entry.write_text(json.dumps({"files": content}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    for path in [*files, entry, directory]:
+        fsync_path(path)
+
+
+def _damage(entry: Path) -> str | None:
+    """What is wrong with an entry; None when every file is what was recorded and no file is beside them."""
+    try:
+        files = json.loads((entry / ENTRY_NAME).read_text(encoding="utf-8"))["files"]
+        found = sorted(path.name for path in entry.iterdir() if path.name != ENTRY_NAME)
+        if found != sorted(files):
+            return f"{entry.name[:12]}… holds {found}, recorded were {sorted(files)}"
+        for name, recorded in files.items():
+            if file_sha256(entry / name) != recorded["sha256"]:
+                return f"{entry.name[:12]}…/{name} is not what was stored"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"{entry.name[:12]}… cannot be read ({error})"
+    return None
+
+
+def _size_bytes(entry: Path) -> int:
+    return sum(path.stat().st_size for path in entry.iterdir())
+
+
+def _last_used_ns(entry: Path) -> int:
+    record = entry / ENTRY_NAME
+    return record.stat().st_mtime_ns if record.exists() else 0
