@@ -15,9 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge import page
 from edge.recorder import Recorder
 from tests import synthetic_run
-from tools.report import checks, demo_report, page, run_data
+from tools.report import checks, demo_report, run_data
 from tools.report.demo_report import RunFiles, load_run, spread, write_report
 from tools.report.run_data import ReportError
 

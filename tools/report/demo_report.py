@@ -17,8 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edge import page
 from edge.cli import write_result, write_whole
-from tools.report import figures, page
+from tools.report import figures
 from tools.report.checks import Check, acceptance
 from tools.report.numbers import Number, delay_at_call, headline, numbers
 from tools.report.run_data import (

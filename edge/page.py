@@ -1,4 +1,4 @@
-"""The few pieces of HTML the report is made of. One page, no script, nothing loaded from anywhere.
+"""The few pieces of HTML reports are made of. One page, no script, nothing loaded from anywhere.
 
 Text from outside (above all the VLM's) goes through `text_html`: it may hold markup, control characters or
 characters that turn the writing direction, and none of these may act on the page.
