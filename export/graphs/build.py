@@ -1,0 +1,107 @@
+"""Every graph of an artifact directory by name (design §5)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from export.graphs.action import write_action, write_context
+from export.graphs.language import ROLES, write_language
+from export.graphs.vision import write_vision
+from export.model.config import TicVlaConfig
+from export.model.network import TicVla
+from export.precision import Precision, bits
+
+FORMS = ("fused", "plain")
+"""`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""
+LANGUAGE_WHOLE = ("language_model",)
+LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+SINGLE_FILE_BYTES = 64_000_000
+"""A graph with more weights than this keeps them in a data file of their own, which is mapped and not read."""
+
+
+def graph_names(pair: bool) -> tuple[str, ...]:
+    """Names of a directory's graphs, with one language model or with a pair."""
+    language = LANGUAGE_PAIR if pair else LANGUAGE_WHOLE
+    return ("vision_encoder", *language, "semantic_context", "action_expert")
+
+
+def write_graph(
+    model: TicVla, name: str, precision: Precision, form: str, directory: Path, *, half: bool = False
+) -> list[str]:
+    """Write one graph and return the names of its files; same weights and precision → same bytes.
+
+    `half`: activations and KV buffers in fp16 (GPU targets). Raises ValueError for a name or form that is not known.
+    """
+    if form not in FORMS:
+        raise ValueError(f"form {form!r} is not known; expected one of {FORMS}")
+    if name == "vision_encoder":
+        external = _weight_bytes(model.vision, precision) > SINGLE_FILE_BYTES
+        return write_vision(model.vision, directory, precision=precision, form=form, half=half, external=external)
+    if name in ROLES:
+        vision = model.config.vision
+        return write_language(
+            model.language,
+            directory,
+            name,
+            tokens=vision.tokens,
+            token_dim=vision.token_dim,
+            precision=precision,
+            half=half,
+            external=_weight_bytes(model.language, precision) > SINGLE_FILE_BYTES,
+        )
+    if name == "semantic_context":
+        return write_context(model.action, directory, precision=precision, form=form, half=half)
+    if name == "action_expert":
+        return write_action(model.action, directory, precision=precision, form=form, half=half)
+    raise ValueError(f"graph {name!r} is not known; expected one of {(*graph_names(False), *LANGUAGE_PAIR)}")
+
+
+def _weight_bytes(module: Any, precision: Precision) -> int:
+    return sum(parameter.numel() for parameter in module.parameters()) * bits(precision.default) // 8
+
+
+def graph_contract(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """Inputs and outputs as the file declares them: name, dtype, shape (free axes by name)."""
+    proto = onnx.load(str(path), load_external_data=False)
+
+    def describe(value: onnx.ValueInfoProto) -> dict[str, Any]:
+        tensor = value.type.tensor_type
+        shape = [d.dim_value if d.HasField("dim_value") else d.dim_param for d in tensor.shape.dim]
+        return {"name": value.name, "dtype": onnx.TensorProto.DataType.Name(tensor.elem_type).lower(), "shape": shape}
+
+    return {
+        "inputs": [describe(v) for v in proto.graph.input],
+        "outputs": [describe(v) for v in proto.graph.output],
+    }
+
+
+def graph_parameters(path: Path) -> int:
+    """Numbers that a graph file stores: weights, scales and tables (packed 4-bit weights count as bytes)."""
+    proto = onnx.load(str(path), load_external_data=False)
+    return sum(math.prod(tensor.dims) for tensor in proto.graph.initializer)
+
+
+def linear_layers(config: TicVlaConfig, name: str) -> tuple[str, ...]:
+    """Names of the layers of a graph whose precision can be set one by one."""
+    if name == "vision_encoder":
+        blocks = [f"blocks.{i}.{part}" for i in range(config.vision.layers) for part in ("qkv", "proj", "fc1", "fc2")]
+        stem = () if config.vision.stem_channels else ("embed",)
+        return (*stem, *blocks, "projector.1", "projector.3")
+    if name in ROLES:
+        role, parts = ROLES[name], ("q", "k", "v", "o", "gate", "up", "down")
+        layers = [f"layers.{i}.{part}" for i in range(config.language.layers) for part in parts]
+        merge = ("merge.1",) if role.images and config.language.token_merge > 1 else ()
+        return ("embed", *merge, *layers, *(("lm_head",) if role.token else ()))
+    pairs = [f"key_values.{i}.{part}" for i in range(config.action.layers) for part in "kv"]
+    if name == "semantic_context":
+        return ("semantic_projection.0", "semantic_projection.2", *pairs)
+    if name == "action_expert":
+        mlps = [f"{m}_projection.{i}" for m in ("visual", "state", "latency") for i in (0, 2)]
+        layers = [f"layers.{i}.{part}" for i in range(config.action.layers) for part in ("q", "o", "fc1", "fc2")]
+        # Layer 0 has no query product left: its queries are constants.
+        return (*mlps, *pairs, *(name for name in layers if name != "layers.0.q"), "head.0", "head.2", "out")
+    raise ValueError(f"graph {name!r} is not known")

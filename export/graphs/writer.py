@@ -1,0 +1,212 @@
+"""Writes one ONNX graph node by node, its large weights straight to an external-data file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from export.precision import PRECISIONS, Precision, block_size
+from export.quantize import quantise_blocks, quantise_channels
+
+Array = npt.NDArray[Any]
+
+OPSET = 20
+IR_VERSION = 10
+CONTRIB = "com.microsoft"
+PRODUCER = "tic-vla-edge"
+EXTERNAL_BYTES = 4096
+"""Weights of at least this size go to the data file, if the graph has one."""
+ALIGNMENT = 4096
+"""Offsets in the data file are multiples of a page, so that ONNX Runtime can map weights instead of reading them."""
+INT8_COMPUTE = 4
+"""`accuracy_level` of MatMulNBits with which the CPU kernels multiply in 8-bit integers."""
+
+
+class GraphWriter:
+    """A graph under construction; as a context manager it leaves NAME.onnx (and NAME.onnx.data) or nothing."""
+
+    def __init__(
+        self, directory: Path, name: str, *, precision: Precision, form: str, half: bool, external: bool
+    ) -> None:
+        self.name = name
+        self.precision = precision
+        self.fused = form == "fused"
+        self.half = half
+        self.float = np.dtype(np.float16 if half else np.float32)
+        self.float_type = TensorProto.FLOAT16 if half else TensorProto.FLOAT
+        self._path = directory / f"{name}.onnx"
+        self._data_path = directory / f"{name}.onnx.data" if external else None
+        self._data = None if self._data_path is None else self._data_path.open("wb")
+        self._nodes: list[onnx.NodeProto] = []
+        self._initializers: list[TensorProto] = []
+        self._names: set[str] = set()
+        self._inputs: list[onnx.ValueInfoProto] = []
+        self._outputs: list[onnx.ValueInfoProto] = []
+        self._shared: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+        self.parameters = 0
+
+    def __enter__(self) -> GraphWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._data is not None:
+            self._data.close()
+        if kind is not None:
+            for path in (self._path, self._data_path):
+                if path is not None:
+                    path.unlink(missing_ok=True)
+
+    def input(self, name: str, dtype: int, shape: Sequence[int | str]) -> str:
+        """Declare a graph input."""
+        self._inputs.append(helper.make_tensor_value_info(name, dtype, list(shape)))
+        self._names.add(name)
+        return name
+
+    def output(self, name: str, dtype: int, shape: Sequence[int | str]) -> None:
+        """Declare a value that was computed under that name as a graph output."""
+        self._outputs.append(helper.make_tensor_value_info(name, dtype, list(shape)))
+
+    def op(
+        self, kind: str, inputs: Sequence[str], *, out: str | None = None, contrib: bool = False, **attr: Any
+    ) -> str:
+        """Append a node with one output and return the output's name (`out`, or one derived from the node)."""
+        return self.ops(kind, inputs, [out or self.unique(kind)], contrib=contrib, **attr)[0]
+
+    def ops(
+        self, kind: str, inputs: Sequence[str], outputs: Sequence[str], *, contrib: bool = False, **attr: Any
+    ) -> list[str]:
+        """Append a node with the named outputs ("" for one that is not wanted)."""
+        self._names.update(outputs)
+        self._nodes.append(
+            helper.make_node(
+                kind,
+                list(inputs),
+                list(outputs),
+                name=f"n{len(self._nodes)}_{kind}",
+                domain=CONTRIB if contrib else "",
+                **attr,
+            )
+        )
+        return list(outputs)
+
+    def unique(self, stem: str) -> str:
+        """A value name that is not taken."""
+        name, n = stem, 1
+        while name in self._names:
+            name, n = f"{stem}_{n}", n + 1
+        self._names.add(name)
+        return name
+
+    def constant(self, value: Array | Sequence[int] | int, stem: str = "c") -> str:
+        """A small constant (int64 for Python integers); equal ones are stored once."""
+        array = np.asarray(value)
+        if array.dtype.kind == "i" and not isinstance(value, np.ndarray):
+            array = array.astype(np.int64)
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._shared:
+            self._shared[key] = self._store(array, self.unique(stem))
+        return self._shared[key]
+
+    def floats(self, value: Array, stem: str = "f") -> str:
+        """A small constant in the graph's float type."""
+        return self.constant(np.asarray(value).astype(self.float), stem)
+
+    def weight(self, value: Array, name: str) -> str:
+        """A weight under its own name, in its own type; it goes to the data file when it is large."""
+        self._names.add(name)
+        return self._store(value, name)
+
+    def _store(self, value: Array, name: str) -> str:
+        value = np.ascontiguousarray(value)
+        if self._data is None or value.nbytes < EXTERNAL_BYTES:
+            self._initializers.append(numpy_helper.from_array(value, name))
+            return name
+        self._data.write(b"\0" * (-self._data.tell() % ALIGNMENT))
+        tensor = TensorProto(name=name, data_type=helper.np_dtype_to_tensor_dtype(value.dtype), dims=value.shape)
+        tensor.data_location = TensorProto.EXTERNAL
+        assert self._data_path is not None
+        for key, entry in (
+            ("location", self._data_path.name),
+            ("offset", str(self._data.tell())),
+            ("length", str(value.nbytes)),
+        ):
+            tensor.external_data.add(key=key, value=entry)
+        self._data.write(value.data)
+        self._initializers.append(tensor)
+        return name
+
+    def linear(self, x: str, layer: str, weight: Array, bias: Array | None, *, precision: str | None = None) -> str:
+        """x [..., in] · weight [out, in]ᵀ + bias in the precision that the graph gives this layer."""
+        precision = precision or self.precision.of(layer)
+        self.parameters += weight.size + (0 if bias is None else bias.size)
+        if precision == "int8" and self.fused:
+            return self._dynamic_int8(x, layer, weight, bias)
+        if block_size(precision) is not None:
+            return self._blocks(x, layer, weight, bias, precision)
+        if precision == "int8":
+            return self._weight_int8(x, layer, weight, bias)
+        y = self.op("MatMul", [x, self.weight(weight.T.astype(self.float), f"{layer}.weight")])
+        return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
+
+    def _dynamic_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
+        q = quantise_channels(weight)
+        inputs = [x, self.weight(q.values.T, f"{layer}.weight"), self.weight(q.scales, f"{layer}.scale")]
+        if bias is not None:
+            inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
+        return self.op("DynamicQuantizeMatMul", inputs, contrib=True)
+
+    def _weight_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
+        q = quantise_channels(weight)
+        stored = [self.weight(q.values.T, f"{layer}.weight"), self.floats(q.scales, f"{layer}.scale")]
+        y = self.op("MatMul", [x, self.op("DequantizeLinear", stored, axis=1)])
+        return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
+
+    def _blocks(self, x: str, layer: str, weight: Array, bias: Array | None, precision: str) -> str:
+        q = quantise_blocks(weight, precision)
+        scales = q.scales.astype(self.float)
+        inputs = [x, self.weight(q.packed, f"{layer}.weight"), self.weight(scales, f"{layer}.scale")]
+        if bias is not None and not self.half:
+            # The CUDA kernel for one row has no fused bias; there it stays an addition of its own.
+            inputs += ["", "", self.weight(bias.astype(np.float32), f"{layer}.bias")]
+        y = self.op(
+            "MatMulNBits",
+            inputs,
+            contrib=True,
+            K=weight.shape[1],
+            N=weight.shape[0],
+            bits=q.bits,
+            block_size=block_size(precision),
+            accuracy_level=INT8_COMPUTE,
+        )
+        return self.op("Add", [y, self.floats(bias, f"{layer}.bias")]) if bias is not None and self.half else y
+
+    def cast(self, x: str, dtype: int, *, out: str | None = None) -> str:
+        """x in another element type."""
+        return self.op("Cast", [x], out=out, to=dtype)
+
+    def finish(self) -> list[str]:
+        """Write the graph file and return the names of the files written."""
+        opsets = [helper.make_opsetid("", OPSET)]
+        if any(node.domain == CONTRIB for node in self._nodes):
+            opsets.append(helper.make_opsetid(CONTRIB, 1))
+        graph = helper.make_graph(self._nodes, self.name, self._inputs, self._outputs, self._initializers)
+        proto = helper.make_model(graph, opset_imports=opsets, producer_name=PRODUCER)
+        proto.ir_version = IR_VERSION
+        if self._data is not None:
+            self._data.flush()
+        self._path.write_bytes(proto.SerializeToString(deterministic=True))
+        return [self._path.name, *([] if self._data_path is None else [self._data_path.name])]
+
+
+def most_exact(precisions: Sequence[str]) -> str:
+    """The most exact of several layers' precisions: what they get when one product computes them all."""
+    return min(precisions, key=PRECISIONS.index)
