@@ -1,9 +1,7 @@
-"""Gate: every graph, on the exact bytes that ship, must give what PyTorch gives (and must react to its input)."""
+"""Test inputs of every graph and what PyTorch makes of them: the reference that the gate compares with."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,28 +9,11 @@ import numpy.typing as npt
 import torch
 
 from export.graphs import GraphSpec, past_names
+from export.metrics import Sample
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
-from export.target import ParityGate
 
 Arrays = dict[str, npt.NDArray[Any]]
-RunGraph = Callable[[Mapping[str, npt.NDArray[Any]]], Sequence[npt.NDArray[Any]]]
-
-
-@dataclass(frozen=True)
-class ParityResult:
-    """Worst case over all inputs and outputs of one graph."""
-
-    inputs: int
-    cosine: float
-    max_abs: float
-    min_difference: float
-    """Smallest max-abs difference between the outputs of two different inputs (negative control)."""
-    verdict: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
-        return asdict(self)
 
 
 def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
@@ -77,55 +58,16 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
     raise ValueError(f"no test inputs for graph {name!r}")
 
 
-def _torch_outputs(spec: GraphSpec, feeds: Arrays) -> list[npt.NDArray[Any]]:
+def references(model: TicVla, spec: GraphSpec, count: int) -> list[Sample]:
+    """`count` different inputs of a graph with the outputs of PyTorch in fp32."""
+    return [_reference(spec, sample_inputs(model.config, spec.name, index)) for index in range(count)]
+
+
+def _reference(spec: GraphSpec, feeds: Arrays) -> Sample:
     tensors = {name: torch.from_numpy(array) for name, array in feeds.items()}
     caches = [tensor for name, tensor in tensors.items() if name.startswith("past_key_values")]
     plain = [tensor for name, tensor in tensors.items() if not name.startswith("past_key_values")]
     with torch.no_grad():
         outputs = spec.module(*plain, caches) if caches else spec.module(*plain)
     outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-    return [tensor.numpy() for tensor in outputs]
-
-
-def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> float:
-    x, y = a.ravel().astype(np.float64), b.ravel().astype(np.float64)
-    norm = np.linalg.norm(x) * np.linalg.norm(y)
-    return float(x @ y / norm) if norm > 0 else float(np.array_equal(x, y))
-
-
-def _difference(a: Sequence[npt.NDArray[Any]], b: Sequence[npt.NDArray[Any]]) -> float:
-    """Largest difference where two runs overlap (their free axes may differ in length)."""
-    largest = 0.0
-    for x, y in zip(a, b, strict=True):
-        cut = tuple(slice(0, min(m, n)) for m, n in zip(x.shape, y.shape, strict=True))
-        if all(s.stop > 0 for s in cut):
-            largest = max(largest, float(np.max(np.abs(x[cut].astype(np.float64) - y[cut].astype(np.float64)))))
-    return largest
-
-
-def check_graph(model: TicVla, spec: GraphSpec, run: RunGraph, gate: ParityGate) -> ParityResult:
-    """Compare `run` with PyTorch over `gate.inputs` inputs; PASS only when every threshold holds."""
-    cosine, max_abs, min_difference = 1.0, 0.0, np.inf
-    previous: list[Sequence[npt.NDArray[Any]]] = []
-    for index in range(gate.inputs):
-        feeds = sample_inputs(model.config, spec.name, index)
-        expected, found = _torch_outputs(spec, feeds), run(feeds)
-        for name, x, y in zip(spec.outputs, expected, found, strict=True):
-            if x.shape != y.shape or not np.isfinite(y).all():
-                cosine, max_abs = -1.0, float("inf")
-                continue
-            if x.size and name == "next_token":
-                # An index has no cosine; any other token than PyTorch's is a failure.
-                max_abs = max(max_abs, float(np.any(x != y)))
-            elif x.size:
-                cosine = min(cosine, _cosine(x, y))
-                max_abs = max(max_abs, float(np.max(np.abs(x.astype(np.float64) - y))))
-        # The first floating output speaks for the graph: caches echo their input and would always differ.
-        chosen = [y for name, y in zip(spec.outputs, found, strict=True) if name in PRIMARY_OUTPUTS]
-        min_difference = min([min_difference, *(_difference(chosen, other) for other in previous)])
-        previous.append(chosen)
-    ok = cosine >= gate.min_cosine and max_abs <= gate.max_abs and min_difference >= gate.min_difference
-    return ParityResult(gate.inputs, round(cosine, 9), max_abs, float(min_difference), "PASS" if ok else "FAIL")
-
-
-PRIMARY_OUTPUTS = ("visual_tokens", "logits", "context_values", "trajectory")
+    return Sample(feeds, {name: tensor.numpy() for name, tensor in zip(spec.outputs, outputs, strict=True)})
