@@ -8,11 +8,20 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from edge.manifest import ArtifactError, Artifacts
+from edge.manifest import ArtifactError, Artifacts, TensorContract
 
 Array = npt.NDArray[np.generic]
 
-_ORT_TYPES = {"tensor(float)": "float", "tensor(int64)": "int64", "tensor(uint8)": "uint8"}
+CPU_PROVIDER = "CPUExecutionProvider"
+DTYPES: dict[str, type[np.generic]] = {
+    "float": np.float32,
+    "float16": np.float16,
+    "int32": np.int32,
+    "int64": np.int64,
+    "uint8": np.uint8,
+}
+_ORT_TYPES = {f"tensor({name})": name for name in DTYPES}
+_DEVICES = {"CUDAExecutionProvider": "cuda", "TensorrtExecutionProvider": "cuda"}
 
 
 class GraphError(RuntimeError):
@@ -20,12 +29,13 @@ class GraphError(RuntimeError):
 
 
 class Graph:
-    """A session on the CPU with a stated number of threads.
+    """A session with a stated number of threads on the execution provider that the manifest names.
 
-    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run.
+    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run. Weights in data files
+    are mapped, not read; the files' identity is checked again once the session holds them.
     """
 
-    def __init__(self, artifacts: Artifacts, name: str, *, threads: int) -> None:
+    def __init__(self, artifacts: Artifacts, name: str, *, threads: int, provider: str | None = None) -> None:
         contract = artifacts.graphs[name]
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
@@ -33,19 +43,28 @@ class Graph:
         # A spinning worker would take the core that the other thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
-        # Opened from bytes, a graph would read external weights from the working directory: from a folder that is
-        # not there it can read none, and fails to open.
-        nowhere = str(artifacts.directory / "no-external-data")
-        options.add_session_config_entry("session.model_external_initializers_file_folder_path", nowhere)
+        # Opened from bytes, a graph would read external weights from the working directory: it may read them from its
+        # own directory if the manifest lists them, and from a folder that is not there if it lists none.
+        weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
+        self.provider = provider or contract.session.provider
+        if self.provider not in ort.get_available_providers():
+            raise ArtifactError(
+                f"{contract.file}: made for {self.provider}, this ONNX Runtime has {ort.get_available_providers()}; "
+                f"install the package that brings it or export for another target"
+            )
+        providers = [(self.provider, dict(contract.session.options) if provider is None else {})]
         try:
             self._session = ort.InferenceSession(
-                artifacts.contents[contract.file], sess_options=options, providers=["CPUExecutionProvider"]
+                artifacts.contents[contract.file], sess_options=options, providers=providers
             )
         except Exception as error:
             raise ArtifactError(
                 f"{contract.file}: ONNX Runtime cannot open it ({str(error).splitlines()[0]})"
             ) from error
+        artifacts.check_unchanged(contract.data_files)
         self.name = name
+        self.contract = contract
         for declared, found in (
             (contract.inputs, self._session.get_inputs()),
             (contract.outputs, self._session.get_outputs()),
@@ -57,6 +76,11 @@ class Graph:
         self.input_names = [t.name for t in contract.inputs]
         self.output_names = [t.name for t in contract.outputs]
 
+    @property
+    def device(self) -> str:
+        """Where the graph's large buffers belong, in ONNX Runtime's words: `cpu` or `cuda`."""
+        return _DEVICES.get(self.provider, "cpu")
+
     def run(self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None) -> list[Array]:
         """Outputs (all, or those named) for named inputs; raises GraphError."""
         try:
@@ -64,3 +88,20 @@ class Graph:
         except Exception as error:
             raise GraphError(f"{self.name}: {str(error).splitlines()[0]}") from error
         return result
+
+    def binding(self) -> ort.IOBinding:
+        """A new set of bound buffers for `run_bound`."""
+        return self._session.io_binding()
+
+    def run_bound(self, binding: ort.IOBinding) -> None:
+        """Run on bound buffers, in place where an input and an output share one; raises GraphError."""
+        try:
+            self._session.run_with_iobinding(binding)
+        except Exception as error:
+            raise GraphError(f"{self.name}: {str(error).splitlines()[0]}") from error
+
+
+def zeros(contract: TensorContract, **axes: int) -> Array:
+    """A buffer of zeros in a tensor's shape, its free axes as given."""
+    shape = [axis if isinstance(axis, int) else axes[axis] for axis in contract.shape]
+    return np.zeros(shape, dtype=DTYPES[contract.dtype])

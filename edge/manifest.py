@@ -5,17 +5,31 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST_NAME = "manifest.json"
 MAX_MANIFEST_BYTES = 4_000_000
-GRAPH_NAMES = ("vision_encoder", "language_model", "semantic_context", "action_expert")
+LANGUAGE_WHOLE = ("language_model",)
+LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+HASH_BLOCK_BYTES = 1 << 20
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
-_SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "provenance")
+_SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "plan", "provenance")
+_POSITIVE = frozenset(
+    {
+        "image_px",
+        "frame_tokens",
+        "kv_dim",
+        "max_context",
+        "max_new_tokens",
+        "prefill_chunk_tokens",
+        "tick_period_ms",
+        "step_s",
+    }
+)
 
 
 class ArtifactError(ValueError):
@@ -32,12 +46,48 @@ class TensorContract:
 
 
 @dataclass(frozen=True)
+class SessionConfig:
+    """How a graph is opened: ONNX Runtime's execution provider, its options, threads."""
+
+    provider: str
+    options: Mapping[str, str]
+    threads: int | None
+    """Intra-op threads; None leaves them to the runner."""
+    engine: bool
+    """The provider compiles an engine, which has to be built on the device before any run."""
+
+
+@dataclass(frozen=True)
+class FileIdentity:
+    """What tells whether a file is still the one that was hashed."""
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+
+    @classmethod
+    def of(cls, path: Path) -> FileIdentity:
+        """Identity of the file at a path; raises OSError."""
+        found = path.stat(follow_symlinks=False)
+        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
+
+
+@dataclass(frozen=True)
 class GraphContract:
     """What one graph file takes and gives."""
 
     file: str
+    data_files: tuple[str, ...]
+    """Files beside it that hold its large weights."""
     inputs: tuple[TensorContract, ...]
     outputs: tuple[TensorContract, ...]
+    session: SessionConfig
+
+    @property
+    def caches(self) -> tuple[TensorContract, ...]:
+        """The KV buffers among the inputs."""
+        return tuple(tensor for tensor in self.inputs if tensor.name.startswith("past_key_values."))
 
     def input(self, name: str) -> TensorContract:
         """The input of that name; raises ArtifactError."""
@@ -63,6 +113,7 @@ class RuntimeConfig:
     kv_dim: int
     max_context: int
     max_new_tokens: int
+    prefill_chunk_tokens: int
     frame_offsets_s: tuple[float, ...]
     tick_period_ms: int
     step_s: float
@@ -73,9 +124,9 @@ class RuntimeConfig:
     img_context_id: int
 
     def __post_init__(self) -> None:
-        for name in ("image_px", "frame_tokens", "kv_dim", "max_context", "max_new_tokens", "tick_period_ms", "step_s"):
-            if getattr(self, name) <= 0:
-                raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {getattr(self, name)}")
+        for name, value in vars(self).items():
+            if name in _POSITIVE and value <= 0:
+                raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {value}")
         if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
             raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
 
@@ -92,16 +143,50 @@ class Artifacts:
     runtime: RuntimeConfig
     graphs: Mapping[str, GraphContract]
     contents: Mapping[str, bytes]
+    """Every file but the graphs' data files."""
+    identities: Mapping[str, FileIdentity]
+    """The data files as they were when they were hashed."""
+
+    @property
+    def language_graphs(self) -> tuple[str, ...]:
+        """The language model's graphs: one, or the pair of prefill and decode."""
+        return LANGUAGE_WHOLE if LANGUAGE_WHOLE[0] in self.graphs else LANGUAGE_PAIR
+
+    def check_unchanged(self, names: Iterable[str]) -> None:
+        """Raise ArtifactError if a data file is not the one that was hashed any more."""
+        for name in names:
+            path = self.directory / name
+            try:
+                same = FileIdentity.of(path) == self.identities[name]
+            except OSError:
+                same = False
+            if not same:
+                raise ArtifactError(f"{path}: changed while it was being opened; start again")
 
 
 def load_artifacts(directory: Path) -> Artifacts:
     """Verify every file's size and SHA-256, the schema version and the I/O contract; raises ArtifactError."""
     raw, manifest = _read_manifest(directory)
-    contents = {name: _read_file(directory, name, entry) for name, entry in _section(manifest, "files").items()}
-    unlisted = sorted(p.name for p in directory.iterdir() if p.name not in contents and p.name != MANIFEST_NAME)
+    files = _section(manifest, "files")
+    data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
+    contents = {name: _read_file(directory, name, entry) for name, entry in files.items() if name not in data}
+    identities = {name: _hash_file(directory, name, entry) for name, entry in files.items() if name in data}
+    unlisted = sorted(p.name for p in directory.iterdir() if p.name not in files and p.name != MANIFEST_NAME)
     if unlisted:
         raise ArtifactError(f"{directory / unlisted[0]}: not listed in the manifest; export again into a new directory")
-    graphs = {name: _graph(manifest, name, contents) for name in GRAPH_NAMES}
+    pair = all(name in _section(manifest, "graphs") for name in LANGUAGE_PAIR)
+    graphs = {
+        name: _graph(manifest, name, contents, identities)
+        for name in (
+            "vision_encoder",
+            *(LANGUAGE_PAIR if pair else LANGUAGE_WHOLE),
+            "semantic_context",
+            "action_expert",
+        )
+    }
+    surplus = sorted(set(_section(manifest, "graphs")) - set(graphs))
+    if surplus:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is not one that the runner knows")
     if "tokenizer.json" not in contents:
         raise ArtifactError(f"{directory}: tokenizer.json is missing from the manifest")
     model = _section(manifest, "model")
@@ -114,6 +199,7 @@ def load_artifacts(directory: Path) -> Artifacts:
         runtime=_runtime(_section(manifest, "runtime")),
         graphs=graphs,
         contents=contents,
+        identities=identities,
     )
     check_contract(artifacts)
     return artifacts
@@ -158,7 +244,16 @@ def _section(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
     return section
 
 
-def _read_file(directory: Path, name: str, entry: Any) -> bytes:
+def _data_files(graph: Any) -> list[str]:
+    """Data files that a graph's entry names; raises ArtifactError."""
+    names = graph.get("data_files") if isinstance(graph, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ArtifactError(f"{MANIFEST_NAME}: every graph must list its data_files")
+    return names
+
+
+def _check_file(directory: Path, name: str, entry: Any) -> Path:
+    """Path of a listed file that is a regular file of the listed size; raises ArtifactError."""
     if not _PLAIN_NAME.fullmatch(name) or name == MANIFEST_NAME:
         raise ArtifactError(f"{MANIFEST_NAME}: file name {name!r} is not a plain name")
     path = directory / name
@@ -172,11 +267,31 @@ def _read_file(directory: Path, name: str, entry: Any) -> bytes:
         raise ArtifactError(f"{path}: missing or not a regular file")
     if path.stat().st_size != entry["bytes"]:
         raise ArtifactError(f"{path}: {path.stat().st_size} bytes, the manifest says {entry['bytes']}; export again")
-    data = path.read_bytes()
-    found = hashlib.sha256(data).hexdigest()
+    return path
+
+
+def _compare(path: Path, found: str, entry: Mapping[str, Any]) -> None:
     if found != entry["sha256"]:
         raise ArtifactError(f"{path}: sha256 {found[:12]}…, the manifest says {entry['sha256'][:12]}…; export again")
+
+
+def _read_file(directory: Path, name: str, entry: Any) -> bytes:
+    path = _check_file(directory, name, entry)
+    data = path.read_bytes()
+    _compare(path, hashlib.sha256(data).hexdigest(), entry)
     return data
+
+
+def _hash_file(directory: Path, name: str, entry: Any) -> FileIdentity:
+    """Verify a file that is too large to be held; returns what it is recognised by afterwards."""
+    path = _check_file(directory, name, entry)
+    identity = FileIdentity.of(path)
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(HASH_BLOCK_BYTES):
+            digest.update(block)
+    _compare(path, digest.hexdigest(), entry)
+    return identity
 
 
 def _tensors(graph: str, entry: Mapping[str, Any], key: str) -> tuple[TensorContract, ...]:
@@ -191,14 +306,32 @@ def _tensors(graph: str, entry: Mapping[str, Any], key: str) -> tuple[TensorCont
     return tuple(tensors)
 
 
-def _graph(manifest: Mapping[str, Any], name: str, contents: Mapping[str, bytes]) -> GraphContract:
+def _graph(
+    manifest: Mapping[str, Any], name: str, contents: Mapping[str, bytes], identities: Mapping[str, FileIdentity]
+) -> GraphContract:
     entry = _section(manifest, "graphs").get(name)
     if not isinstance(entry, dict):
         raise ArtifactError(f"{MANIFEST_NAME}: graph {name} is missing")
     file = str(entry.get("file"))
-    if file not in contents:
-        raise ArtifactError(f"{MANIFEST_NAME}: graph {name}: file {file!r} is not among the files")
-    return GraphContract(file, _tensors(name, entry, "inputs"), _tensors(name, entry, "outputs"))
+    missing = [n for n in (file, *_data_files(entry)) if n not in contents and n not in identities]
+    if missing or file not in contents:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {name}: file {[*missing, file][0]!r} is not among the files")
+    inputs, outputs = _tensors(name, entry, "inputs"), _tensors(name, entry, "outputs")
+    return GraphContract(file, tuple(_data_files(entry)), inputs, outputs, _session(name, entry.get("session")))
+
+
+def _session(graph: str, entry: Any) -> SessionConfig:
+    known = {"provider": str, "options": dict, "threads": int | None, "engine": bool}
+    if not isinstance(entry, dict) or set(entry) != set(known):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session must give {', '.join(known)}")
+    wrong = [key for key, kind in known.items() if not isinstance(entry[key], kind)]
+    options = entry["options"]
+    if wrong or not all(isinstance(value, str) for value in options.values()):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session {[*wrong, 'options'][0]} is of the wrong type")
+    threads = entry["threads"]
+    if threads is not None and not 1 <= threads <= 256:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session threads {threads}, expected 1 to 256")
+    return SessionConfig(entry["provider"], options, threads, entry["engine"])
 
 
 def _runtime(section: dict[str, Any]) -> RuntimeConfig:
@@ -219,29 +352,43 @@ def _runtime(section: dict[str, Any]) -> RuntimeConfig:
 
 def check_contract(artifacts: Artifacts) -> None:
     """The graphs must fit one another and the runner: names, types and widths; raises ArtifactError."""
-    vision, language, context, action = (artifacts.graphs[name] for name in GRAPH_NAMES)
+    vision, context, action = (artifacts.graphs[n] for n in ("vision_encoder", "semantic_context", "action_expert"))
+    first, last = (artifacts.graphs[name] for name in (artifacts.language_graphs[0], artifacts.language_graphs[-1]))
     runtime = artifacts.runtime
     tokens = vision.output("visual_tokens")
+    keys, values = context.output("context_keys"), context.output("context_values")
     expected: list[tuple[GraphContract, TensorContract, str, tuple[int | str, ...]]] = [
         (vision, vision.input("frame"), "uint8", (1, runtime.image_px, runtime.image_px, 3)),
         (vision, tokens, "float", (1, *tokens.shape[1:])),
-        (language, language.input("input_ids"), "int64", (1, "S")),
-        (language, language.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
-        (language, language.output("next_token"), "int64", (1, 1)),
-        (language, language.output("last_layer_kv"), "float", (1, "S", runtime.kv_dim)),
+        (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
+        (first, first.input("image_offset"), "int64", (1,)),
+        (last, last.output("next_token"), "int64", (1, 1)),
         (context, context.input("last_layer_kv"), "float", (1, "T", runtime.kv_dim)),
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),
         (action, action.input("latency"), "float", (1, 4)),
-        (action, action.input("context_keys"), "float", context.output("context_keys").shape),
-        (action, action.input("context_values"), "float", context.output("context_values").shape),
+        (action, action.input("context_keys"), keys.dtype, keys.shape),
+        (action, action.input("context_values"), values.dtype, values.shape),
     ]
+    for graph in (first, last):
+        expected += [
+            (graph, graph.input("input_ids"), "int64", (1, "S")),
+            (graph, graph.input("seqlens_k"), "int32", (1,)),
+            (graph, graph.input("total_sequence_length"), "int32", ()),
+            (graph, graph.output("last_layer_kv"), "float", (1, "S", runtime.kv_dim)),
+        ]
+        for cache in graph.caches:
+            present = graph.output(cache.name.replace("past_key_values", "present"))
+            # Every buffer is bound as input and output at once, and the two graphs of a pair fill the same ones.
+            expected += [(graph, present, cache.dtype, cache.shape), (first, first.input(cache.name), *_form(cache))]
     for graph, tensor, dtype, shape in expected:
         if tensor.dtype != dtype or tensor.shape != shape:
             raise ArtifactError(
                 f"{graph.file}: {tensor.name} is {tensor.dtype}{list(tensor.shape)}, "
                 f"the runner expects {dtype}{list(shape)}"
             )
+    if not last.caches or len(first.caches) != len(last.caches):
+        raise ArtifactError(f"{last.file}: {len(last.caches)} KV buffers, {first.file} has {len(first.caches)}")
     trajectory = action.output("trajectory")
     if trajectory.dtype != "float" or len(trajectory.shape) != 3 or trajectory.shape[2] != 3:
         raise ArtifactError(f"{action.file}: trajectory is {list(trajectory.shape)}, the runner expects [1, steps, 3]")
@@ -250,3 +397,7 @@ def check_contract(artifacts: Artifacts) -> None:
         raise ArtifactError(
             f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at"
         )
+
+
+def _form(tensor: TensorContract) -> tuple[str, tuple[int | str, ...]]:
+    return tensor.dtype, tensor.shape

@@ -28,10 +28,13 @@ def fit_frame(rgb: npt.NDArray[np.uint8], image_px: int) -> npt.NDArray[np.uint8
 class Policy:
     """π of equation 1, in the three calls that run at different rates."""
 
-    def __init__(self, artifacts: Artifacts, *, threads: int = 1) -> None:
-        self._vision = Graph(artifacts, "vision_encoder", threads=threads)
-        self._action = Graph(artifacts, "action_expert", threads=threads)
-        self._context = Graph(artifacts, "semantic_context", threads=threads)
+    def __init__(self, artifacts: Artifacts, *, threads: int = 1, provider: str | None = None) -> None:
+        def graph(name: str) -> Graph:
+            return Graph(artifacts, name, threads=threads, provider=provider)
+
+        self._vision, self._action, self._context = (
+            graph(name) for name in ("vision_encoder", "action_expert", "semantic_context")
+        )
 
     def encode(self, frame: npt.NDArray[np.uint8]) -> FloatArray:
         """Frame [1, px, px, 3] → visual tokens [1, N, D] (every new frame, control thread)."""
