@@ -19,6 +19,16 @@ def _require(ok: bool, message: str) -> None:
         raise ModelConfigError(message)
 
 
+def _require_sizes(config: object) -> None:
+    """Sizes and counts lie between 1 and 2^20: more would not be a network for a robot but a mistyped number."""
+    for key, value in vars(config).items():
+        for size in value if isinstance(value, tuple) else (value,):
+            if isinstance(size, int) and not isinstance(size, bool) and not key.endswith("_id"):
+                _require(1 <= size <= 1 << 20, f"{key} is {size}, expected 1 to {1 << 20}")
+            elif key.endswith("eps") or key in ("step_s", "rope_theta"):
+                _require(size > 0, f"{key} is {size}, expected a number above 0")
+
+
 @dataclass(frozen=True)
 class VisionConfig:
     """InternViT-style encoder and its projector (design §3; defaults are InternViT-300M)."""
@@ -41,6 +51,7 @@ class VisionConfig:
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
 
     def __post_init__(self) -> None:
+        _require_sizes(self)
         _require(self.image_px % self.patch_px == 0, f"image_px {self.image_px} is not a multiple of {self.patch_px}")
         _require(self.grid % self.pixel_shuffle == 0, f"grid {self.grid} is not a multiple of {self.pixel_shuffle}")
         _require(self.hidden % self.heads == 0, f"hidden {self.hidden} is not a multiple of heads {self.heads}")
@@ -83,9 +94,14 @@ class LanguageConfig:
     img_context_id: int = 151667
 
     def __post_init__(self) -> None:
+        _require_sizes(self)
         _require(self.heads % self.kv_heads == 0, f"heads {self.heads} is not a multiple of kv_heads {self.kv_heads}")
         ids = (self.im_start_id, self.im_end_id, self.img_start_id, self.img_end_id, self.img_context_id)
-        _require(len(set(ids)) == 5 and max(ids) < self.vocab, f"special ids {ids} must be distinct and below vocab")
+        _require(
+            len(set(ids)) == 5 and min(ids) >= 0 and max(ids) < self.vocab,
+            f"special ids {ids} must be distinct and below vocab {self.vocab}",
+        )
+        _require(self.head_dim % 2 == 0, f"head_dim {self.head_dim} must be even for rotary positions")
 
 
 @dataclass(frozen=True)
@@ -108,6 +124,7 @@ class ActionConfig:
     """(dx m, dy m, dθ rad) a step that the head's bias starts from: 0.5 m/s straight ahead."""
 
     def __post_init__(self) -> None:
+        _require_sizes(self)
         _require(self.hidden % self.heads == 0, f"hidden {self.hidden} is not a multiple of heads {self.heads}")
         _require(
             self.semantic_interface in SEMANTIC_INTERFACES,
@@ -127,6 +144,9 @@ class ValueConfig:
 
     channels: int = 256
     conv_layers: int = 3
+
+    def __post_init__(self) -> None:
+        _require_sizes(self)
 
 
 @dataclass(frozen=True)

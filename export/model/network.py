@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
 import torch
 from torch import nn
+from torch.overrides import TorchFunctionMode
 
 from export.model.action import ActionExpert
 from export.model.config import TicVlaConfig
@@ -13,6 +17,7 @@ from export.model.vision import VisionEncoder
 
 INIT_STD = 0.02
 HEAD_STD = 3e-4
+PARTS = ("vision", "language", "action", "value")
 
 
 class TicVla(nn.Module):
@@ -27,11 +32,36 @@ class TicVla(nn.Module):
         self.value = ValueNetwork(config)
 
 
-def initialise(model: TicVla, seed: int) -> None:
-    """Fill every weight from one generator, so that a seed names the same weights on every machine."""
+class _SkipRandomInit(TorchFunctionMode):
+    """Leaves out torch's own random initial weights: at paper size they cost seconds and are overwritten anyway."""
+
+    SKIPPED = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Collection[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        if func in self.SKIPPED:
+            return args[0] if args else (kwargs or {})["tensor"]
+        return func(*args, **(kwargs or {}))
+
+
+def empty_network(config: TicVlaConfig) -> TicVla:
+    """A network in evaluation mode whose random weights are still to be written (its norms and buffers are set)."""
+    with _SkipRandomInit():
+        return TicVla(config).eval()
+
+
+def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
+    """Fill every weight of `parts` from one generator, so that a seed names the same weights on every machine."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, module in model.named_modules():
+            if name.split(".")[0] not in parts:
+                continue
             if isinstance(module, nn.Conv1d | nn.Conv2d):
                 # He initialisation: with 0.02 the signal of a frame would fade to nothing in a stack of convolutions.
                 fan_in = module.weight[0].numel()
@@ -46,14 +76,15 @@ def initialise(model: TicVla, seed: int) -> None:
             elif isinstance(module, nn.Embedding):
                 module.weight.normal_(0.0, 1.0, generator=generator)
         for name, parameter in model.named_parameters():
-            if name.endswith(("position", "cls", "queries")):
+            if name.split(".")[0] in parts and name.endswith(("position", "cls", "queries")):
                 parameter.normal_(0.0, 1.0 if name.endswith("queries") else INIT_STD, generator=generator)
-        # The head starts near zero around a slow walk straight ahead, as policies usually start at their mean action.
-        model.action.out.bias.copy_(torch.tensor(model.config.action.initial_step))
+        if "action" in parts:
+            # The head starts near zero around a slow walk straight ahead, as policies usually start at their mean.
+            model.action.out.bias.copy_(torch.tensor(model.config.action.initial_step))
 
 
 def build(config: TicVlaConfig, seed: int) -> TicVla:
     """An untrained network in evaluation mode with the weights that `seed` names."""
-    model = TicVla(config)
+    model = empty_network(config)
     initialise(model, seed)
-    return model.eval()
+    return model
