@@ -30,7 +30,7 @@ def _mlp(g: GraphWriter, x: str, name: str, module: nn.Sequential) -> str:
 
 
 def write_context(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
-    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → context_keys [L, H, d, T], context_values [L, H, T, d]."""
+    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → keys [L, H, d, T] and values [L, H, T, d]."""
     c = action.config.action
     head_dim = c.hidden // c.heads
     name = "semantic_context"

@@ -1,4 +1,4 @@
-"""The language model's graphs: fused attention over KV buffers that the caller owns and that every call extends in place.
+"""The language model's graphs: fused attention over the caller's KV buffers, which every call extends in place.
 
 `language_model` serves prefill and decode with one precision. The pair `language_model.prefill` (no vocabulary
 projection: it only fills the buffers) and `language_model.decode` (reads text only) serves them with two over the same
@@ -119,9 +119,7 @@ def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
     return g.op("Mul", [rows, scale])
 
 
-def _insert_images(
-    g: GraphWriter, language: LanguageModel, ids: str, text: str, tokens: int, token_dim: int
-) -> str:
+def _insert_images(g: GraphWriter, language: LanguageModel, ids: str, text: str, tokens: int, token_dim: int) -> str:
     """Visual tokens in the places of `<IMG_CONTEXT>`, in order, after the `image_offset` that earlier calls took."""
     c = language.config
     visual = g.input("visual_tokens", TensorProto.FLOAT, ("F", tokens, token_dim))
@@ -201,10 +199,7 @@ def _last_layer_kv(g: GraphWriter, last: int, position: _Position, width: int) -
     for part in ("key", "value"):
         new = g.op("Slice", [f"present.{last}.{part}", position.begin, position.end, g.constant([2])])
         parts.append(g.op("Reshape", [g.op("Transpose", [new], perm=[0, 2, 1, 3]), g.constant([1, -1, width])]))
-    if g.half:
-        g.cast(g.op("Concat", parts, axis=2), TensorProto.FLOAT, out="last_layer_kv")
-    else:
-        g.op("Concat", parts, axis=2, out="last_layer_kv")
+    g.to_float32(g.op("Concat", parts, axis=2), "last_layer_kv")
 
 
 def _next_token(g: GraphWriter, language: LanguageModel, x: str, delta: str) -> None:
@@ -215,9 +210,5 @@ def _next_token(g: GraphWriter, language: LanguageModel, x: str, delta: str) -> 
     ]
     h, _ = _norm(g, last[0], last[1], g.floats(array(language.norm.weight), "norm"), c.rms_eps)
     h = g.op("Reshape", [h, g.constant([1, c.hidden])])
-    logits = g.linear(h, "lm_head", array(language.lm_head.weight), None)
-    if g.half:
-        logits = g.cast(logits, TensorProto.FLOAT, out="logits")
-    else:
-        logits = g.op("Identity", [logits], out="logits")
+    logits = g.to_float32(g.linear(h, "lm_head", array(language.lm_head.weight), None), "logits")
     g.op("ArgMax", [logits], out="next_token", axis=-1, keepdims=1)

@@ -24,9 +24,7 @@ def write_vision(
 ) -> list[str]:
     """Write vision_encoder.onnx: frame [1, px, px, 3] → visual_tokens [1, N, D]."""
     c = vision.config
-    with GraphWriter(
-        directory, "vision_encoder", precision=precision, form=form, half=half, external=external
-    ) as g:
+    with GraphWriter(directory, "vision_encoder", precision=precision, form=form, half=half, external=external) as g:
         frame = g.input("frame", TensorProto.UINT8, (1, c.image_px, c.image_px, 3))
         x = _stem(g, vision, frame) if c.stem_channels else _patches(g, vision, frame)
         position = array(vision.position)
@@ -152,8 +150,4 @@ def _projector(g: GraphWriter, vision: VisionEncoder, x: str) -> None:
     assert isinstance(norm, nn.LayerNorm) and isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
     x = layer_norm(g, fold_tokens(g, x, c.grid, c.pixel_shuffle, c.hidden), norm, "projector.0")
     x = g.op("Gelu", [g.linear(x, "projector.1", array(first.weight), array(first.bias))])
-    x = g.linear(x, "projector.3", array(second.weight), array(second.bias))
-    if g.half:
-        g.cast(x, TensorProto.FLOAT, out="visual_tokens")
-    else:
-        g.op("Identity", [x], out="visual_tokens")
+    g.to_float32(g.linear(x, "projector.3", array(second.weight), array(second.bias)), "visual_tokens")

@@ -193,6 +193,10 @@ class GraphWriter:
         """x in another element type."""
         return self.op("Cast", [x], out=out, to=dtype)
 
+    def to_float32(self, x: str, out: str) -> str:
+        """x under the name of a float32 output of the graph."""
+        return self.cast(x, TensorProto.FLOAT, out=out) if self.half else self.op("Identity", [x], out=out)
+
     def finish(self) -> list[str]:
         """Write the graph file and return the names of the files written."""
         opsets = [helper.make_opsetid("", OPSET)]

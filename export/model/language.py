@@ -87,21 +87,21 @@ class LanguageModel(nn.Module):
         inv_freq = config.rope_theta ** (-torch.arange(0, config.head_dim, 2).float() / config.head_dim)
         self.register_buffer("inv_freq", inv_freq, persistent=False)
 
-    def embed_inputs(self, input_ids: Tensor, visual_tokens: Tensor) -> Tensor:
-        """Token embeddings [1, S, hidden] with frames in the places of `<IMG_CONTEXT>`."""
+    def embed_inputs(self, input_ids: Tensor, visual_tokens: Tensor, image_offset: int = 0) -> Tensor:
+        """Token embeddings [1, S, hidden] with frames in the places of `<IMG_CONTEXT>`, from `image_offset` on."""
         images = self.merge(fold_tokens(visual_tokens, self.config.token_merge))
         images = images.reshape(-1, self.config.hidden)
         is_image = input_ids[0] == self.config.img_context_id
-        place = (torch.cumsum(is_image.long(), dim=0) - 1).clamp(min=0)
+        place = (torch.cumsum(is_image.long(), dim=0) - 1 + image_offset).clamp(min=0)
         # More image places than image tokens cannot come from our prompt builder; clamping keeps the gather in range.
         place = torch.minimum(place, torch.full_like(place, 1) * (images.shape[0] - 1))
         return torch.where(is_image[:, None], images[place], self.embed(input_ids[0]))[None]
 
     def hidden_states(
-        self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor]
+        self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor], image_offset: int = 0
     ) -> tuple[Tensor, list[Tensor], Tensor]:
         """Final hidden states [1, S, hidden], grown caches, and the new tokens' last-layer K‖V [1, S, kv_dim]."""
-        x = self.embed_inputs(input_ids, visual_tokens)
+        x = self.embed_inputs(input_ids, visual_tokens, image_offset)
         new, old = input_ids.shape[1], past[0].shape[2]
         position = torch.arange(new, device=x.device) + old
         angle = position.float()[:, None] * self.inv_freq[None]
@@ -116,8 +116,10 @@ class LanguageModel(nn.Module):
         parts = [p.transpose(1, 2).reshape(1, new, self.config.kv_heads * self.config.head_dim) for p in (k_new, v_new)]
         return self.norm(x), present, torch.cat(parts, dim=-1)
 
-    def forward(self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor]) -> tuple[Tensor, ...]:
+    def forward(
+        self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor], image_offset: int = 0
+    ) -> tuple[Tensor, ...]:
         """`next_token` [1, 1], `logits` [1, vocab] of the last position, `last_layer_kv` [1, S, kv_dim], caches."""
-        x, present, last_layer_kv = self.hidden_states(input_ids, visual_tokens, past)
+        x, present, last_layer_kv = self.hidden_states(input_ids, visual_tokens, past, image_offset)
         logits = self.lm_head(x[:, -1])
         return logits.argmax(-1, keepdim=True), logits, last_layer_kv, *present
