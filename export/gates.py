@@ -1,0 +1,103 @@
+"""The gate: a graph that is not the same model, by the target's own thresholds, does not leave the workshop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from export.metrics import ParityResult
+from export.target_types import GraphGate, TaskGate
+
+PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
+CPU_PROVIDER = "CPUExecutionProvider"
+
+
+class GateError(Exception):
+    """A graph that is not the same model; its text says which and by how much."""
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """What a graph's rounding does to the robot: worst case over the delays of the semantic state."""
+
+    waypoint_cm: float
+    heading_deg: float
+    speed_mps: float
+    turn_radps: float
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain JSON form."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """PASS, WARN or FAIL with a line for every threshold that was crossed."""
+
+    level: str
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GateResult:
+    """What the gate found for one graph, where it ran it, and what it made of that."""
+
+    parity: ParityResult
+    task: TaskResult | None
+    verdict: Verdict
+    provider: str
+    shipping_provider: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """The manifest's `parity` section."""
+        return {
+            **self.parity.to_dict(),
+            "task": None if self.task is None else self.task.to_dict(),
+            "verdict": self.verdict.level,
+            "reasons": list(self.verdict.reasons),
+            "provider": self.provider,
+            "shipping_provider_checked": self.provider == self.shipping_provider,
+        }
+
+
+def judge(parity: ParityResult, task: TaskResult | None, gate: GraphGate, task_gate: TaskGate) -> Verdict:
+    """Hold one graph's numbers against its thresholds; a comparison that is not a number fails."""
+    failed: list[str] = []
+    warned: list[str] = []
+
+    def at_least(what: str, found: float, limit: float | None, into: list[str]) -> None:
+        if limit is not None and not found >= limit:
+            into.append(f"{what} {found:.7g} (≥ {limit:g})")
+
+    def at_most(what: str, found: float, limit: float | None, into: list[str]) -> None:
+        if limit is not None and not found <= limit:
+            into.append(f"{what} {found:.4g} (≤ {limit:g})")
+
+    at_least("cosine", parity.cosine, gate.min_cosine, failed)
+    at_least("cosine", parity.cosine, gate.warn_cosine, warned)
+    at_most("max-abs", parity.max_abs, gate.max_abs, failed)
+    at_least("difference between inputs", parity.min_difference, gate.min_difference, failed)
+    if parity.top1 is not None:
+        at_least("same token", parity.top1, gate.top1, failed)
+    if task is not None:
+        for name, unit in (("waypoint", "cm"), ("heading", "deg")):
+            found = getattr(task, f"{name}_{unit}")
+            at_most(f"{name} error in {unit}", found, getattr(task_gate, f"{name}_{unit}"), failed)
+            at_most(f"{name} error in {unit}", found, getattr(task_gate, f"warn_{name}_{unit}"), warned)
+        at_most("speed command error in m/s", task.speed_mps, task_gate.speed_mps, failed)
+        at_most("turn command error in rad/s", task.turn_radps, task_gate.turn_radps, failed)
+    if failed:
+        return Verdict(FAIL, tuple(failed))
+    return Verdict(WARN, tuple(warned)) if warned else Verdict(PASS)
+
+
+def worst(verdicts: Mapping[str, Verdict]) -> str:
+    """The worst of several graphs' verdicts; raises ValueError without any."""
+    return max((verdict.level for verdict in verdicts.values()), key=(PASS, WARN, FAIL).index)
+
+
+def require(graph: str, verdict: Verdict) -> None:
+    """Raise GateError when a graph failed."""
+    if verdict.level == FAIL:
+        raise GateError(f"{graph}: not the same model: {'; '.join(verdict.reasons)}; nothing was written")
