@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from export.model.config import PRESETS, TicVlaConfig
-from export.model.network import TicVla
+from export.model.network import PARTS, TicVla
 
 FORMAT = "tic-vla-edge/1"
 
@@ -38,8 +39,8 @@ def weights_sha256(model: TicVla) -> str:
     return digest.hexdigest()
 
 
-def save_weights(model: TicVla, path: Path, info: WeightsInfo) -> None:
-    """Write a weights file in one rename; raises OSError."""
+def save_weights(model: TicVla, path: Path, info: WeightsInfo, parts: Sequence[str] = PARTS) -> None:
+    """Write the weights of `parts` in one rename; raises OSError."""
     metadata = {
         "format": FORMAT,
         "config": json.dumps(model.config.to_dict(), sort_keys=True),
@@ -48,7 +49,8 @@ def save_weights(model: TicVla, path: Path, info: WeightsInfo) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    save_file({k: v.contiguous() for k, v in model.state_dict().items()}, str(partial), metadata=metadata)
+    tensors = {k: v.contiguous() for k, v in model.state_dict().items() if k.split(".")[0] in parts}
+    save_file(tensors, str(partial), metadata=metadata)
     partial.replace(path)
 
 

@@ -1,0 +1,259 @@
+"""The numbers of an InternVL directory's config.json, in both of its layouts; what we do not implement is refused.
+
+Layouts: OpenGVLab's own (`InternVLChatModel`, with `llm_config`) and that of transformers
+(`InternVLForConditionalGeneration`, with `text_config`). A key that is absent has the default of the class that wrote
+the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from export.checkpoint.coverage import CheckpointError
+from export.checkpoint.sources import read_json
+from export.model.config import LanguageConfig, ModelConfigError, TicVlaConfig, VisionConfig
+
+CONFIG = "config.json"
+PREPROCESSOR = "preprocessor_config.json"
+_NO_DEFAULT = object()
+
+Demand = tuple[str, tuple[Any, ...], Any]
+"""Key, the values that this network implements, the default of an absent key."""
+
+_CHAT = (
+    ("ps_version", ("v2",), "v1"),
+    ("select_layer", (-1,), -1),
+    ("use_llm_lora", (0,), 0),
+    ("use_backbone_lora", (0,), 0),
+)
+_CHAT_VISION = (
+    ("hidden_act", ("gelu",), "gelu"),
+    ("norm_type", ("layer_norm",), "rms_norm"),
+    ("qk_normalization", (False,), True),
+    ("qkv_bias", (True,), False),
+    ("num_channels", (3,), 3),
+)
+_HF = (
+    ("vision_feature_layer", (-1,), -1),
+    ("vision_feature_select_strategy", ("default",), "default"),
+    ("projector_hidden_act", ("gelu",), "gelu"),
+)
+_HF_VISION = (
+    ("hidden_act", ("gelu",), "gelu"),
+    ("norm_type", ("layer_norm",), "layer_norm"),
+    ("use_qk_norm", (False,), False),
+    ("attention_bias", (True,), False),
+    ("use_mask_token", (False,), False),
+    ("use_absolute_position_embeddings", (True,), False),
+    ("use_mean_pooling", (True,), True),
+    ("num_channels", (3,), 3),
+)
+_QWEN2 = (
+    ("model_type", ("qwen2",), "qwen2"),
+    ("hidden_act", ("silu",), "silu"),
+    ("use_sliding_window", (False,), False),
+)
+_ROPE_TYPES = ("default", "dynamic")
+_HF_VISION_DEFAULTS = {
+    "hidden_size": 1024,
+    "num_hidden_layers": 24,
+    "num_attention_heads": 16,
+    "intermediate_size": 4096,
+    "image_size": 448,
+    "patch_size": 14,
+}
+
+
+@dataclass(frozen=True)
+class HfConfig:
+    """What a directory says of its network."""
+
+    vision: VisionConfig
+    language: LanguageConfig
+    tied: bool
+    """The output head is the embedding: a file without a head is complete."""
+
+
+def config_from_hf(directory: Path) -> tuple[VisionConfig, LanguageConfig]:
+    """Encoder and language model of an InternVL directory; raises CheckpointError naming what we do not implement.
+
+    Token ids and `max_context` are not in config.json and keep the defaults of `LanguageConfig`.
+    """
+    config = read_hf_config(directory, LanguageConfig())
+    return config.vision, config.language
+
+
+def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
+    """config.json in either layout; `ours` gives what it does not say (token ids, `max_context`)."""
+    top = read_json(directory, CONFIG)
+    where = f"{directory.resolve().name}/{CONFIG}"
+    try:
+        if "llm_config" in top:
+            return _chat(where, top, directory, ours)
+        if "text_config" in top:
+            return _hugging_face(where, top, directory, ours)
+    except (ModelConfigError, OverflowError) as error:
+        raise CheckpointError(f"{where}: {error}") from error
+    found = top.get("model_type", top.get("architectures", "neither"))
+    raise CheckpointError(f"{where}: expected InternVL's llm_config or text_config; found {found!r}")
+
+
+def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
+    """Refuse a directory whose config.json contradicts `config`; raises CheckpointError naming the numbers."""
+    said = read_hf_config(directory, config.language)
+    pairs = []
+    for section, theirs in (("vision", said.vision), ("language", said.language)):
+        ours = getattr(config, section)
+        for field in dataclasses.fields(theirs):
+            a, b = getattr(theirs, field.name), getattr(ours, field.name)
+            # The layer scale's initial value has no part in a network whose weights are loaded.
+            if a != b and field.name != "layer_scale_init":
+                pairs.append(f"{section}.{field.name} is {a}, model {config.name!r} has {b}")
+    if pairs:
+        more = f" and {len(pairs) - 3} more" if len(pairs) > 3 else ""
+        raise CheckpointError(
+            f"{directory.resolve().name}/{CONFIG}: {'; '.join(pairs[:3])}{more}: "
+            "choose the --model this checkpoint was made for"
+        )
+    return said
+
+
+def _chat(where: str, top: Mapping[str, Any], directory: Path, ours: LanguageConfig) -> HfConfig:
+    vision, text = _section(where, top, "vision_config"), _section(where, top, "llm_config")
+    _demand(where, "", top, _CHAT)
+    _demand(where, "vision_config.", vision, _CHAT_VISION)
+    return _assemble(where, top, directory, ours, (vision, {}), text)
+
+
+def _hugging_face(where: str, top: Mapping[str, Any], directory: Path, ours: LanguageConfig) -> HfConfig:
+    vision, text = _section(where, top, "vision_config"), _section(where, top, "text_config")
+    _demand(where, "", top, _HF)
+    _demand(where, "vision_config.", vision, _HF_VISION)
+    image_id = _number(where, "", top, "image_token_id", int, 151667)
+    ours = dataclasses.replace(ours, img_context_id=image_id) if image_id != ours.img_context_id else ours
+    return _assemble(where, top, directory, ours, (vision, _HF_VISION_DEFAULTS), text)
+
+
+def _assemble(
+    where: str,
+    top: Mapping[str, Any],
+    directory: Path,
+    ours: LanguageConfig,
+    tower: tuple[Mapping[str, Any], Mapping[str, Any]],
+    text: Mapping[str, Any],
+) -> HfConfig:
+    _demand(where, "text_config.", text, _QWEN2)
+    if any(kind != "full_attention" for kind in text.get("layer_types") or ()):
+        raise CheckpointError(f"{where}: layer_types has {text['layer_types']!r}, only full_attention is implemented")
+    head_dim = text.get("head_dim")
+    hidden, heads = (_number(where, "text_config.", text, key, int) for key in ("hidden_size", "num_attention_heads"))
+    language = dataclasses.replace(
+        ours,
+        hidden=hidden,
+        layers=_number(where, "text_config.", text, "num_hidden_layers", int),
+        heads=heads,
+        kv_heads=_number(where, "text_config.", text, "num_key_value_heads", int),
+        head_dim=head_dim if isinstance(head_dim, int) else hidden // max(heads, 1),
+        mlp=_number(where, "text_config.", text, "intermediate_size", int),
+        vocab=_number(where, "text_config.", text, "vocab_size", int),
+        rope_theta=_rope_theta(where, text, ours.max_context),
+        rms_eps=_number(where, "text_config.", text, "rms_norm_eps", float, 1e-6),
+        token_merge=1,
+    )
+    # transformers ties InternVL's head unless told not to; OpenGVLab's Qwen2 does not unless told to.
+    tied = top.get("tie_word_embeddings", text.get("tie_word_embeddings", "text_config" in top))
+    return HfConfig(_vision(where, top, directory, tower, hidden), language, bool(tied))
+
+
+def _vision(
+    where: str,
+    top: Mapping[str, Any],
+    directory: Path,
+    tower: tuple[Mapping[str, Any], Mapping[str, Any]],
+    token_dim: int,
+) -> VisionConfig:
+    vision, defaults = tower
+
+    def size(key: str) -> int:
+        value = vision.get(key, defaults.get(key))
+        if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
+            value = value[0]
+        return _number(where, "vision_config.", {key: value}, key, int)
+
+    ratio = _number(where, "", top, "downsample_ratio", float, 0.5)
+    if ratio <= 0 or (1 / ratio) != round(1 / ratio):
+        raise CheckpointError(f"{where}: downsample_ratio is {ratio}, expected one over a whole number")
+    mean, std = _normalisation(directory)
+    return VisionConfig(
+        image_px=size("image_size"),
+        patch_px=size("patch_size"),
+        hidden=size("hidden_size"),
+        layers=size("num_hidden_layers"),
+        heads=size("num_attention_heads"),
+        mlp=size("intermediate_size"),
+        layer_norm_eps=_number(where, "vision_config.", vision, "layer_norm_eps", float, 1e-6),
+        pixel_shuffle=round(1 / ratio),
+        token_dim=token_dim,
+        mean=mean,
+        std=std,
+    )
+
+
+def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Mean and deviation of the pixels from preprocessor_config.json where there is one, else ImageNet's."""
+    if not (directory / PREPROCESSOR).exists():
+        return VisionConfig.mean, VisionConfig.std
+    content = read_json(directory, PREPROCESSOR)
+    found = []
+    for key, default in (("image_mean", VisionConfig.mean), ("image_std", VisionConfig.std)):
+        value = content.get(key, list(default))
+        if not isinstance(value, list) or len(value) != 3 or not all(isinstance(v, float | int) for v in value):
+            raise CheckpointError(f"{directory.resolve().name}/{PREPROCESSOR}: {key} is {value!r}, expected 3 numbers")
+        found.append((float(value[0]), float(value[1]), float(value[2])))
+    return found[0], found[1]
+
+
+def _rope_theta(where: str, text: Mapping[str, Any], max_context: int) -> float:
+    """Base of the rotary angles; newer files keep it in `rope_parameters`, older ones beside `rope_scaling`."""
+    parameters = text.get("rope_parameters") or {}
+    scaling = text.get("rope_scaling") or parameters
+    kind = scaling.get("rope_type", scaling.get("type", "default"))
+    if kind not in _ROPE_TYPES:
+        raise CheckpointError(f"{where}: rope_scaling of type {kind!r} is not implemented, expected {_ROPE_TYPES}")
+    # Dynamic scaling acts on sequences beyond the trained length only, which are longer than any prompt of ours.
+    trained = _number(where, "text_config.", text, "max_position_embeddings", int, 32768)
+    if trained < max_context:
+        raise CheckpointError(f"{where}: max_position_embeddings is {trained}, the model reads {max_context}")
+    source = parameters if "rope_theta" in parameters else text
+    return _number(where, "text_config.", source, "rope_theta", float, 10000.0)
+
+
+def _section(where: str, top: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    section = top.get(key)
+    if not isinstance(section, dict):
+        raise CheckpointError(f"{where}: has no {key}")
+    return section
+
+
+def _demand(where: str, prefix: str, section: Mapping[str, Any], demands: tuple[Demand, ...]) -> None:
+    for key, accepted, default in demands:
+        value = section.get(key, default)
+        if value not in accepted:
+            expected = " or ".join(repr(a) for a in accepted)
+            raise CheckpointError(f"{where}: {prefix}{key} is {value!r}, this network implements {expected}")
+
+
+def _number(
+    where: str, prefix: str, section: Mapping[str, Any], key: str, kind: type, default: Any = _NO_DEFAULT
+) -> Any:
+    value = section.get(key, default)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or isinstance(value, bool):
+        found = "not there" if value is _NO_DEFAULT or value is None else repr(value)
+        raise CheckpointError(f"{where}: {prefix}{key} is {found}, expected {kind.__name__}")
+    return value

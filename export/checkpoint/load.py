@@ -1,0 +1,223 @@
+"""Checkpoints into the network: layouts found, every tensor accounted for, then read one by one as fp32."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from export.checkpoint.coverage import CheckpointError, Coverage, SourceCoverage
+from export.checkpoint.hf_config import check_config
+from export.checkpoint.layouts import find_layouts
+from export.checkpoint.sources import Source, file_sha256, open_source
+from export.checkpoint.tokenizer import directory_tokenizer
+from export.model.config import TicVlaConfig
+from export.model.network import TicVla, empty_network, initialise
+from export.model.weights import FORMAT, WeightsInfo
+
+EMBED, LM_HEAD = "language.embed.weight", "language.lm_head.weight"
+VALUE_SEED = 0
+"""Of a value network that no file has: it is training's business and in no graph."""
+
+
+@dataclass(frozen=True)
+class LoadedCheckpoint:
+    """A network and the account of where it came from."""
+
+    model: TicVla
+    info: WeightsInfo
+    coverage: Coverage
+    tokenizer: bytes | None
+    """tokenizer.json of the Hugging Face directory, checked against the configuration's token ids."""
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """How one of our tensors is read: the pieces are stacked along the first axis."""
+
+    source: Source
+    names: tuple[str, ...]
+
+    def describe(self) -> str:
+        return f"{self.source.label}: {', '.join(self.names)}"
+
+
+@dataclass
+class _Plan:
+    """What the files give, before anything is read."""
+
+    recipes: dict[str, _Recipe]
+    sources: list[SourceCoverage]
+    unknown: list[str]
+    repeated: list[str]
+
+
+def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: int | None) -> LoadedCheckpoint:
+    """Load `config`'s network from checkpoints; raises CheckpointError unless every tensor is accounted for.
+
+    `fill_seed` is for benchmarks: an action expert that no file has gets the seed's weights, and `info.trained` is
+    False. Peak memory is the fp32 network and the largest single tensor.
+    """
+    if not paths:
+        raise CheckpointError("no checkpoint given; expected at least one --checkpoint PATH")
+    sources = [open_source(path) for path in paths]
+    tied = False
+    for source in sources:
+        _check_own_config(source, config)
+        if source.directory is not None:
+            tied = tied or check_config(source.directory, config).tied
+    model = empty_network(config)
+    wanted = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
+    plan = _plan(sources, wanted, config)
+    if tied and LM_HEAD not in plan.recipes and EMBED in plan.recipes:
+        plan.recipes[LM_HEAD] = plan.recipes[EMBED]
+    coverage = _account(plan, wanted, fill_seed)
+    if not coverage.complete:
+        _refuse(coverage, config, sources)
+    _read(model, plan.recipes)
+    for part, seed in coverage.seeded.items():
+        initialise(model, seed, (part,))
+    contents = (directory_tokenizer(s.directory, config.language) for s in sources if s.directory is not None)
+    tokenizer = next((content for content in contents if content is not None), None)
+    return LoadedCheckpoint(model, _info(sources, coverage), coverage, tokenizer)
+
+
+def _check_own_config(source: Source, config: TicVlaConfig) -> None:
+    """A file of ours says which network it was made for: another one is refused even where all shapes fit."""
+    written = source.metadata.get("format", "")
+    if written.split("/")[0] != FORMAT.split("/")[0]:
+        return
+    if written != FORMAT:
+        raise CheckpointError(f"{source.label}: format {written!r}, expected {FORMAT!r}")
+    try:
+        said = json.loads(source.metadata["config"])
+        ours = json.loads(json.dumps(config.to_dict()))
+        differ = [
+            f"{section}.{key} is {said[section].get(key)!r}, expected {value!r}"
+            for section in ("vision", "language", "action", "value")
+            for key, value in ours[section].items()
+            if said[section].get(key) != value
+        ]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{source.label}: its configuration is not readable; was it changed?") from error
+    if differ:
+        raise CheckpointError(
+            f"{source.label}: was made for another configuration than model {config.name!r} ({'; '.join(differ[:3])})"
+        )
+
+
+def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config: TicVlaConfig) -> _Plan:
+    plan = _Plan({}, [], [], [])
+    for source in sources:
+        matches = find_layouts(source.tensors, wanted, config)
+        if not matches:
+            shown = ", ".join(list(source.tensors)[:3]) or "no tensors"
+            raise CheckpointError(
+                f"{source.label}: tensors of no layout that is known ({shown}); expected InternVL, InternVL-hf or "
+                f"{FORMAT} names"
+            )
+        used: set[str] = set()
+        for match in matches:
+            for ours, theirs in match.table.items():
+                if not any(name in source.tensors for name in theirs):
+                    continue
+                used.update(theirs)
+                if ours in plan.recipes:
+                    plan.repeated.append(f"{ours} in {plan.recipes[ours].source.label} and {source.label}")
+                else:
+                    plan.recipes[ours] = _Recipe(source, theirs)
+        rest = [name for name in source.tensors if name not in used]
+        patterns = [pattern for match in matches for pattern in match.ignored]
+        ignored = tuple(name for name in rest if any(re.fullmatch(pattern, name) for pattern in patterns))
+        plan.unknown += [f"{source.label}: {name}" for name in rest if name not in ignored]
+        plan.sources.append(
+            SourceCoverage(
+                label=source.label,
+                layouts=tuple(match.describe() for match in matches),
+                tensors=len(source.tensors),
+                loaded=sum(name in source.tensors for name in used),
+                ignored=ignored,
+                outside=source.outside,
+            )
+        )
+    return plan
+
+
+def _account(plan: _Plan, wanted: dict[str, tuple[int, ...]], fill_seed: int | None) -> Coverage:
+    given = {name.split(".")[0] for name in plan.recipes}
+    seeded = {}
+    if "value" not in given:
+        seeded["value"] = VALUE_SEED if fill_seed is None else fill_seed
+    if "action" not in given and fill_seed is not None:
+        seeded["action"] = fill_seed
+    missing, misshaped = [], []
+    for name, shape in wanted.items():
+        if name.split(".")[0] in seeded:
+            continue
+        recipe = plan.recipes.get(name)
+        if recipe is None:
+            missing.append(name)
+            continue
+        tensors = recipe.source.tensors
+        missing += [f"{recipe.source.label}: {piece}" for piece in recipe.names if piece not in tensors]
+        expected = (shape[0] // len(recipe.names), *shape[1:]) if len(recipe.names) > 1 else shape
+        misshaped += [
+            f"{piece} is {list(tensors[piece].shape)}, expected {list(expected)}"
+            for piece in recipe.names
+            if piece in tensors and tensors[piece].shape != expected
+        ]
+    return Coverage(
+        sources=tuple(plan.sources),
+        loaded={name: recipe.describe() for name, recipe in plan.recipes.items()},
+        seeded=seeded,
+        missing=tuple(missing),
+        unknown=tuple(plan.unknown),
+        misshaped=tuple(misshaped),
+        repeated=tuple(plan.repeated),
+    )
+
+
+def _refuse(coverage: Coverage, config: TicVlaConfig, sources: Sequence[Source]) -> None:
+    labels = ", ".join(source.label for source in sources)
+    absent = [part for part in ("vision", "language", "action") if not any(n.startswith(part) for n in coverage.loaded)]
+    only_parts = not (coverage.unknown or coverage.misshaped or coverage.repeated) and all(
+        name.split(".")[0] in absent for name in coverage.missing
+    )
+    if only_parts:
+        names = {"vision": "vision encoder", "language": "language model", "action": "action expert"}
+        hint = "add the file that has it as another --checkpoint"
+        if absent == ["action"]:
+            hint += ", or ask for untrained weights with --random-weights SEED"
+        parts = " and no ".join(names[part] for part in absent)
+        raise CheckpointError(f"{labels}: no {parts} ({len(coverage.missing)} tensors); {hint}", coverage)
+    raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}", coverage)
+
+
+def _read(model: TicVla, recipes: dict[str, _Recipe]) -> None:
+    targets = model.state_dict()
+    for ours, recipe in recipes.items():
+        target: Tensor = targets[ours]
+        rows = target.shape[0] // len(recipe.names) if target.ndim else 0
+        for i, name in enumerate(recipe.names):
+            # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
+            tensor = recipe.source.tensors[name].read()
+            (target[i * rows : (i + 1) * rows] if len(recipe.names) > 1 else target).copy_(tensor)
+        if not torch.isfinite(target).all():
+            raise CheckpointError(f"{recipe.describe()}: has values that are not finite; the file is damaged")
+
+
+def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
+    """Origin by file name and hash; trained unless a file of ours or a seed says otherwise."""
+    parts = []
+    for source in sources:
+        said = source.metadata.get("origin", "")
+        suffix = f", {said}" if said else ""
+        parts += [f"{label} (sha256 {file_sha256(path)}{suffix})" for label, path in source.files.items()]
+    parts += [f"{part}: random seed {seed}" for part, seed in coverage.seeded.items()]
+    untrained = "action" in coverage.seeded or any(s.metadata.get("trained") == "false" for s in sources)
+    return WeightsInfo(trained=not untrained, origin="; ".join(parts))

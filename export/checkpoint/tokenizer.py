@@ -1,0 +1,76 @@
+"""Which tokenizer an artifact directory gets, and whether it says what the network's token ids mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tokenizers import Tokenizer
+
+from export.checkpoint.coverage import CheckpointError
+from export.checkpoint.sources import inside
+from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
+from export.model.tokenizer import NANO_TOKENIZER
+from export.model.tokenizer_1b import TokenizerError, build_tokenizer
+
+if TYPE_CHECKING:
+    from export.checkpoint.load import LoadedCheckpoint
+
+TOKENIZER = "tokenizer.json"
+MAX_TOKENIZER_BYTES = 64 << 20
+ID_FIELDS = {
+    "im_start_id": "<|im_start|>",
+    "im_end_id": "<|im_end|>",
+    "img_start_id": "<img>",
+    "img_end_id": "</img>",
+    "img_context_id": "<IMG_CONTEXT>",
+}
+
+
+def special_ids(language: LanguageConfig) -> dict[str, int]:
+    """Special token → the id that the network was built for."""
+    return {token: getattr(language, name) for name, token in ID_FIELDS.items()}
+
+
+def check_tokenizer(content: bytes, language: LanguageConfig, label: str) -> bytes:
+    """`content` if it gives the special tokens the network's ids and no id beyond it; raises CheckpointError."""
+    try:
+        tokenizer = Tokenizer.from_buffer(content)
+    except Exception as error:  # the library raises plain Exception for a file it cannot read
+        raise CheckpointError(f"{label}: not a tokenizer ({' '.join(str(error).split())[:160]})") from error
+    for token, wanted in special_ids(language).items():
+        found = tokenizer.token_to_id(token)
+        if found != wanted:
+            raise CheckpointError(f"{label}: {token} is id {found}, the network was built for {wanted}")
+    highest = max(tokenizer.get_vocab().values())
+    if highest >= language.vocab:
+        raise CheckpointError(f"{label}: has id {highest}, the network's vocabulary ends at {language.vocab - 1}")
+    return content
+
+
+def directory_tokenizer(directory: Path, language: LanguageConfig) -> bytes | None:
+    """tokenizer.json of a Hugging Face directory, checked, or None where there is none; raises CheckpointError."""
+    if not (directory / TOKENIZER).exists():
+        return None
+    path = inside(directory, TOKENIZER)
+    if path.stat().st_size > MAX_TOKENIZER_BYTES:
+        raise CheckpointError(f"{path}: {path.stat().st_size} bytes, expected at most {MAX_TOKENIZER_BYTES}")
+    return check_tokenizer(path.read_bytes(), language, f"{directory.resolve().name}/{TOKENIZER}")
+
+
+def tokenizer_for(config: TicVlaConfig, loaded: LoadedCheckpoint | None) -> bytes:
+    """tokenizer.json for the artifacts: the checkpoint's own, else the one whose ids the network has.
+
+    Raises CheckpointError when the ids are neither InternVL3's nor those of preset `nano`.
+    """
+    if loaded is not None and loaded.tokenizer is not None:
+        return loaded.tokenizer
+    ids = special_ids(config.language)
+    if ids == special_ids(PRESETS["nano"].language):
+        return check_tokenizer(NANO_TOKENIZER.read_bytes(), config.language, NANO_TOKENIZER.name)
+    if ids == special_ids(PRESETS["1b"].language):
+        try:
+            return check_tokenizer(build_tokenizer(), config.language, "InternVL3's tokenizer")
+        except TokenizerError as error:
+            raise CheckpointError(str(error)) from error
+    raise CheckpointError(f"no tokenizer for token ids {ids}; give the checkpoint's directory with its {TOKENIZER}")
