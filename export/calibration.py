@@ -7,6 +7,7 @@ A name is a set that ships in `export/calibration_sets/`, `folder:PATH` (a user'
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import sys
 from dataclasses import dataclass
@@ -65,7 +66,7 @@ class Clip:
 
     def __post_init__(self) -> None:
         stamps = [frame.stamp_ns / 1e9 for frame in self.frames]
-        gaps = [b - a for a, b in zip(stamps, stamps[1:], strict=False)]
+        gaps = [b - a for a, b in itertools.pairwise(stamps)]
         length_s = stamps[-1] - stamps[0] if stamps else 0.0
         if length_s < CLIP_S - 1e-6:
             raise CalibrationError(f"clip {self.name}: {length_s:.1f} s long, at least {CLIP_S:.0f} s are needed")

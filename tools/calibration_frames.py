@@ -1,6 +1,6 @@
 """Renders the calibration sets that ship: `python -m tools.calibration_frames --out DIR` writes DIR/corridor-go2.
 
-A simulated Go2 walks a corridor among people; what its camera sees once a second is kept with where it was and how fast.
+A simulated Go2 walks a corridor among people; what its camera sees once a second is kept with its pose and velocity.
 The same call writes the same files again (on the same machine and versions, to the byte).
 """
 

@@ -1,0 +1,141 @@
+"""Runs parts of the torch model as if their weights were rounded, one layer at a time and without changing the model.
+
+A layer's weight is replaced only while that layer computes, by hooks: nothing is copied but the layer at work, and the
+model holds its own tensors again whenever no layer is running.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from export.precision import block_size
+from export.quantize import Blocks, Channels, quantise_blocks, quantise_channels
+
+Linear = (nn.Linear, nn.Conv2d, nn.Embedding)
+
+
+class Rounder:
+    """Rounds weights once and keeps the packed results of at most `keep_bytes`, the oldest leaving first."""
+
+    def __init__(self, keep_bytes: int = 700_000_000) -> None:
+        self._keep_bytes = keep_bytes
+        self._kept: OrderedDict[tuple[int, str], Blocks | Channels] = OrderedDict()
+        self._bytes = 0
+
+    def weight(self, parameter: nn.Parameter, precision: str) -> Tensor:
+        """The parameter [out, …] as a kernel of that precision sees it."""
+        if precision == "fp32":
+            return parameter.data
+        if precision == "fp16":
+            return parameter.data.half().float()
+        # By identity: the search holds the model, so an id cannot come to mean another parameter.
+        key = (id(parameter), precision)
+        packed = self._kept.get(key)
+        if packed is None:
+            matrix = parameter.data.reshape(parameter.shape[0], -1).numpy()
+            packed = quantise_channels(matrix) if precision == "int8" else quantise_blocks(matrix, precision)
+            self._keep(key, packed)
+        return torch.from_numpy(packed.dequantised()).reshape(parameter.shape)
+
+    def _keep(self, key: tuple[int, str], packed: Blocks | Channels) -> None:
+        size = _bytes(packed)
+        while self._kept and self._bytes + size > self._keep_bytes:
+            self._bytes -= _bytes(self._kept.popitem(last=False)[1])
+        if size <= self._keep_bytes:
+            self._kept[key] = packed
+            self._bytes += size
+
+    @contextmanager
+    def applied(
+        self, part: nn.Module, precision_of: Callable[[str], str], *, prefix: str = "", activations: bool = True
+    ) -> Iterator[None]:
+        """While active, every linear layer inside `part` computes in `precision_of(prefix + its name)`.
+
+        With `activations`, `int8` layers also get their input rounded to 8 bits with one range a call, as the dynamic
+        kernels do, and `fp16` layers get theirs in 16 bits. The model is as before afterwards, also on an error.
+        """
+        handles = []
+        originals: list[tuple[nn.Parameter, Tensor]] = []
+        for name, module in part.named_modules():
+            precision = precision_of(prefix + name) if isinstance(module, Linear) else "fp32"
+            if precision != "fp32":
+                assert isinstance(module.weight, nn.Parameter)
+                originals.append((module.weight, module.weight.data))
+                handles += self._hook(module, precision, activations)
+        try:
+            yield
+        finally:
+            for handle in handles:
+                handle.remove()
+            for parameter, data in originals:
+                parameter.data = data
+
+    def _hook(self, module: nn.Module, precision: str, activations: bool) -> list[Any]:
+        parameter = module.weight
+        assert isinstance(parameter, nn.Parameter)
+        original = parameter.data
+        if isinstance(module, nn.Embedding):
+            # Only the rows that were looked up are rounded: the table is as large as the rest of the language model.
+            return [module.register_forward_hook(lambda _module, _inputs, rows: _table_rows(rows, precision))]
+
+        def before(_module: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...] | None:
+            rounded = self.weight(parameter, precision)
+            parameter.data = rounded
+            if not activations or isinstance(module, nn.Conv2d) or precision not in ("int8", "fp16"):
+                return None
+            x = inputs[0]
+            return (x.half().float() if precision == "fp16" else round_u8(x), *inputs[1:])
+
+        def after(_module: nn.Module, _inputs: object, _output: object) -> None:
+            parameter.data = original
+
+        return [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
+
+
+def round_u8(x: Tensor) -> Tensor:
+    """x rounded to 256 steps between its smallest and largest value, zero among them (`DynamicQuantizeLinear`)."""
+    low, high = float(x.min().clamp(max=0)), float(x.max().clamp(min=0))
+    if high == low:
+        return x
+    scale = (high - low) / 255
+    zero = round(-low / scale)
+    return (torch.clamp(torch.round(x / scale) + zero, 0, 255) - zero) * scale
+
+
+def _table_rows(rows: Tensor, precision: str) -> Tensor:
+    """Looked-up rows of an embedding table, which is stored in 16 bits or in 8 bits with one scale a row."""
+    if precision == "fp16":
+        return rows.half().float()
+    flat = rows.reshape(-1, rows.shape[-1]).numpy()
+    return torch.from_numpy(quantise_channels(flat).dequantised()).reshape(rows.shape)
+
+
+def _bytes(packed: Blocks | Channels) -> int:
+    values = packed.packed if isinstance(packed, Blocks) else packed.values
+    return int(values.nbytes + packed.scales.nbytes)
+
+
+def head_choices(weight: nn.Parameter, hidden: Tensor, precision: str, slab_rows: int = 8192) -> Tensor:
+    """Most likely token [n] of hidden states [n, d], the vocabulary's matrix rounded slab by slab."""
+    best = torch.full((hidden.shape[0],), -torch.inf)
+    choice = torch.zeros(hidden.shape[0], dtype=torch.long)
+    x = round_u8(hidden) if precision == "int8" else hidden
+    for start in range(0, weight.shape[0], slab_rows):
+        rows = weight.data[start : start + slab_rows].numpy()
+        if precision == "fp16":
+            rows = rows.astype(np.float16).astype(np.float32)
+        elif precision == "int8":
+            rows = quantise_channels(rows).dequantised()
+        elif block_size(precision) is not None:
+            rows = quantise_blocks(rows, precision).dequantised()
+        value, index = (x @ torch.from_numpy(rows).T).max(dim=-1)
+        better = value > best
+        best, choice = torch.where(better, value, best), torch.where(better, index + start, choice)
+    return choice
