@@ -29,16 +29,18 @@ class GraphError(RuntimeError):
 
 
 class Graph:
-    """A session with a stated number of threads on the execution provider that the manifest names.
+    """A session on the execution provider and with the threads that the manifest names, unless told otherwise.
 
     Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run. Weights in data files
     are mapped, not read; the files' identity is checked again once the session holds them.
     """
 
-    def __init__(self, artifacts: Artifacts, name: str, *, threads: int, provider: str | None = None) -> None:
+    def __init__(
+        self, artifacts: Artifacts, name: str, *, threads: int | None = None, provider: str | None = None
+    ) -> None:
         contract = artifacts.graphs[name]
         options = ort.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = threads or contract.session.threads or 1
         options.inter_op_num_threads = 1
         # A spinning worker would take the core that the other thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")

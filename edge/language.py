@@ -116,7 +116,7 @@ class _Call:
 class LanguageModel:
     """Prefill and greedy decoding over KV buffers that are allocated once."""
 
-    def __init__(self, artifacts: Artifacts, *, threads: int = 1, provider: str | None = None) -> None:
+    def __init__(self, artifacts: Artifacts, *, threads: int | None = None, provider: str | None = None) -> None:
         runtime = artifacts.runtime
         graphs = [Graph(artifacts, name, threads=threads, provider=provider) for name in artifacts.language_graphs]
         try:

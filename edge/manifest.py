@@ -356,7 +356,6 @@ def check_contract(artifacts: Artifacts) -> None:
     first, last = (artifacts.graphs[name] for name in (artifacts.language_graphs[0], artifacts.language_graphs[-1]))
     runtime = artifacts.runtime
     tokens = vision.output("visual_tokens")
-    keys, values = context.output("context_keys"), context.output("context_values")
     expected: list[tuple[GraphContract, TensorContract, str, tuple[int | str, ...]]] = [
         (vision, vision.input("frame"), "uint8", (1, runtime.image_px, runtime.image_px, 3)),
         (vision, tokens, "float", (1, *tokens.shape[1:])),
@@ -367,8 +366,7 @@ def check_contract(artifacts: Artifacts) -> None:
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),
         (action, action.input("latency"), "float", (1, 4)),
-        (action, action.input("context_keys"), keys.dtype, keys.shape),
-        (action, action.input("context_values"), values.dtype, values.shape),
+        *((action, action.input(tensor.name), *_form(tensor)) for tensor in context.outputs),
     ]
     for graph in (first, last):
         expected += [

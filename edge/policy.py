@@ -11,7 +11,7 @@ import numpy.typing as npt
 from edge.geometry import SE2
 from edge.graph import Graph
 from edge.manifest import Artifacts
-from edge.semantic import SemanticState
+from edge.semantic import Context, SemanticState
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -28,7 +28,7 @@ def fit_frame(rgb: npt.NDArray[np.uint8], image_px: int) -> npt.NDArray[np.uint8
 class Policy:
     """π of equation 1, in the three calls that run at different rates."""
 
-    def __init__(self, artifacts: Artifacts, *, threads: int = 1, provider: str | None = None) -> None:
+    def __init__(self, artifacts: Artifacts, *, threads: int | None = None, provider: str | None = None) -> None:
         def graph(name: str) -> Graph:
             return Graph(artifacts, name, threads=threads, provider=provider)
 
@@ -40,10 +40,9 @@ class Policy:
         """Frame [1, px, px, 3] → visual tokens [1, N, D] (every new frame, control thread)."""
         return cast(FloatArray, self._vision.run({"frame": frame})[0])
 
-    def semantic_context(self, last_layer_kv: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def semantic_context(self, last_layer_kv: FloatArray) -> Context:
         """K‖V [1, T, kv_dim] → keys and values for every layer (once a generation, reasoning thread)."""
-        keys, values = self._context.run({"last_layer_kv": last_layer_kv})
-        return cast(FloatArray, keys), cast(FloatArray, values)
+        return dict(zip(self._context.output_names, self._context.run({"last_layer_kv": last_layer_kv}), strict=True))
 
     def act(
         self,
@@ -58,7 +57,6 @@ class Policy:
             "visual_tokens": visual_tokens,
             "state": np.array([state], dtype=np.float32),
             "latency": np.array([[delay_s, offset.x_m, offset.y_m, offset.theta_rad]], dtype=np.float32),
-            "context_keys": semantic.context_keys,
-            "context_values": semantic.context_values,
+            **semantic.context,
         }
         return cast(FloatArray, self._action.run(feeds)[0][0])

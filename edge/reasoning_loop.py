@@ -88,7 +88,7 @@ class ReasoningLoop:
             cancelled=self._stop.is_set,
         )
         context_started_ns = time.monotonic_ns()
-        keys, values = self._policy.semantic_context(generation.last_layer_kv)
+        context = self._policy.semantic_context(generation.last_layer_kv)
         finished_ns = time.monotonic_ns()
         delay_s = self._release_delay_s()
         if self._stop.wait(delay_s):
@@ -101,8 +101,7 @@ class ReasoningLoop:
             T_odom_anchor=anchor.T_odom_base,
             ready_ns=ready_ns,
             last_layer_kv=generation.last_layer_kv,
-            context_keys=keys,
-            context_values=values,
+            context=context,
             text=generation.text,
             waypoints=waypoints,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,9 @@ import numpy.typing as npt
 
 from edge.geometry import SE2
 from edge.reasoning_text import Waypoints
+
+Context = Mapping[str, npt.NDArray[np.generic]]
+"""The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
 
 
 @dataclass(frozen=True)
@@ -24,9 +28,7 @@ class SemanticState:
     ready_ns: int
     last_layer_kv: npt.NDArray[np.float32]
     """K‖V of the language model's last layer, [1, T, kv_dim]."""
-    context_keys: npt.NDArray[np.float32]
-    """Keys for every cross-attention layer, [layers, 1, heads, T, d]."""
-    context_values: npt.NDArray[np.float32]
+    context: Context
     text: str
     waypoints: Waypoints | None
 

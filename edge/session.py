@@ -358,7 +358,7 @@ def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count:
     frame = np.zeros((1, image_px, image_px, 3), dtype=np.uint8)
     frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(frame_count)]
     generation = language.generate(language.prompt.build(frames, "stop"), max_new_tokens=4, cancelled=lambda: False)
-    keys, values = policy.semantic_context(generation.last_layer_kv)
-    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, keys, values, "", None)
+    context = policy.semantic_context(generation.last_layer_kv)
+    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, "", None)
     for _ in range(5):
         policy.act(policy.encode(frame), (0.0, 0.0, 0.0), 0.0, here, semantic)

@@ -13,7 +13,7 @@ Array = npt.NDArray[Any]
 Arrays = Mapping[str, Array]
 RunGraph = Callable[[Arrays], Arrays]
 
-PRIMARY_OUTPUTS = ("visual_tokens", "logits", "last_layer_kv", "context_values", "trajectory")
+PRIMARY_OUTPUTS = ("visual_tokens", "logits", "last_layer_kv", "context.0.value", "trajectory")
 """What must differ between two inputs; caches echo their input and would always differ."""
 
 

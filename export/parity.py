@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from export.graphs.action import context_shapes
 from export.graphs.language import ROLES, cache_names
 from export.metrics import Sample
 from export.model.config import TicVlaConfig
@@ -19,7 +20,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
     """The `index`-th test input of a graph: seeded, all different, with the lengths a run meets."""
     rng = np.random.default_rng([index, 7])
-    vision, action = config.vision, config.action
+    vision = config.vision
 
     def normal(*shape: int) -> npt.NDArray[np.float32]:
         return rng.standard_normal(shape).astype(np.float32)
@@ -35,13 +36,15 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
     if name == "semantic_context":
         return {"last_layer_kv": normal(1, 20 + 17 * index, config.kv_dim)}
     if name == "action_expert":
-        tokens, head_dim = 20 + 17 * index, action.hidden // action.heads
+        tokens = 20 + 17 * index
+        shapes = {
+            n: [axis if isinstance(axis, int) else tokens for axis in s] for n, s in context_shapes(config).items()
+        }
         return {
             "visual_tokens": normal(1, vision.tokens, vision.token_dim),
             "state": normal(1, 3),
             "latency": np.abs(normal(1, 4)) * np.float32(3),
-            "context_keys": normal(action.layers, action.heads, head_dim, tokens),
-            "context_values": normal(action.layers, action.heads, tokens, head_dim),
+            **{name: normal(*shape) for name, shape in shapes.items()},
         }
     raise ValueError(f"no test inputs for graph {name!r}")
 
@@ -90,13 +93,13 @@ def reference_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
         return {"visual_tokens": model.vision(tensors["frame"]).numpy()}
     if name in ROLES:
         return _language_outputs(model, name, feeds)
+    layers = range(model.config.action.layers)
     if name == "semantic_context":
         keys, values = model.action.context(tensors["last_layer_kv"])
-        return {
-            "context_keys": keys[:, 0].transpose(2, 3).contiguous().numpy(),
-            "context_values": values[:, 0].contiguous().numpy(),
-        }
-    keys, values = tensors["context_keys"].transpose(2, 3)[:, None], tensors["context_values"][:, None]
+        outputs = {f"context.{i}.key": keys[i].transpose(2, 3).contiguous().numpy() for i in layers}
+        return outputs | {f"context.{i}.value": values[i].contiguous().numpy() for i in layers}
+    keys = torch.stack([tensors[f"context.{i}.key"].transpose(2, 3) for i in layers])
+    values = torch.stack([tensors[f"context.{i}.value"] for i in layers])
     inputs = [tensors[key] for key in ("visual_tokens", "state", "latency")]
     return {"trajectory": model.action(*inputs, keys, values).numpy()}
 

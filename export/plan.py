@@ -31,9 +31,9 @@ def measure_plan(directory: Path) -> dict[str, Any]:
     segments = language.prompt.build(frames, "walk down the corridor and stop at the vending machine")
     started_ns = time.monotonic_ns()
     generation = language.generate(segments, max_new_tokens=runtime.max_new_tokens, cancelled=lambda: False)
-    keys, values = policy.semantic_context(generation.last_layer_kv)
+    context = policy.semantic_context(generation.last_layer_kv)
     generation_ms = (time.monotonic_ns() - started_ns) / 1e6
-    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, keys, values, generation.text, None)
+    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, generation.text, None)
     ticks_ms: list[float] = []
     for _ in range(TICKS):
         started_ns = time.monotonic_ns()

@@ -104,7 +104,7 @@ class Bench:
 
     def think(self, generation: int, x_m: float = 0.0) -> None:
         kv = np.zeros((1, 3, 8), dtype=np.float32)
-        self.slot.state = SemanticState(generation, self.now_ns, SE2(x_m, 0, 0), self.now_ns, kv, kv, kv, "", None)
+        self.slot.state = SemanticState(generation, self.now_ns, SE2(x_m, 0, 0), self.now_ns, kv, {}, "", None)
 
     def tick(self) -> tuple[float, str]:
         command = self.loop.tick(self.now_ns)

@@ -40,12 +40,12 @@ class FakeLanguage:
             self.broken -= 1
             raise GraphError("language_model: broken")
         self.prompts.append([frame.stamp_ns for frame in segments])
-        return Generation(TEXT, KV, 4, 1, 1.0, 1.0)
+        return Generation(TEXT, KV, (7,), 4, 1.0, 1.0)
 
 
 class FakePolicy:
-    def semantic_context(self, last_layer_kv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return last_layer_kv + 1, last_layer_kv + 2
+    def semantic_context(self, last_layer_kv: np.ndarray) -> dict[str, np.ndarray]:
+        return {"context.0.key": last_layer_kv + 1, "context.0.value": last_layer_kv + 2}
 
 
 class Bench:
@@ -98,7 +98,7 @@ def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame() -> None:
     assert state.anchor_ns == 2_000_000_000
     assert state.T_odom_anchor == SE2(2.0, 0.0, 0.0)
     assert state.waypoints == ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0))
-    assert (state.context_keys[0, 0, 0], state.context_values[0, 0, 0]) == (1.0, 2.0)
+    assert [part[0, 0, 0] for part in state.context.values()] == [1.0, 2.0]
 
 
 def test_the_same_frame_is_not_thought_about_twice() -> None:

@@ -17,6 +17,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from export.graphs.vision import array, layer_norm, merge_heads, split_heads
 from export.graphs.writer import Array, GraphWriter
 from export.model.action import ActionExpert, CrossAttentionLayer, KeyValue
+from export.model.config import TicVlaConfig
 from export.precision import Precision
 
 TOKENS = "T"
@@ -29,12 +30,21 @@ def _mlp(g: GraphWriter, x: str, name: str, module: nn.Sequential) -> str:
     return g.linear(x, f"{name}.2", array(second.weight), array(second.bias))
 
 
-def write_context(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
-    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → keys [L, H, d, T] and values [L, H, T, d]."""
-    c = action.config.action
+def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
+    """Tensors of the semantic context: a layer's keys lie as its product reads them, [1, H, d, T]."""
+    c = config.action
     head_dim = c.hidden // c.heads
-    name = "semantic_context"
-    with GraphWriter(directory, name, precision=precision, form=form, half=half, external=False) as g:
+    shapes: dict[str, tuple[int | str, ...]] = {}
+    for i in range(c.layers):
+        shapes[f"context.{i}.key"] = (1, c.heads, head_dim, TOKENS)
+        shapes[f"context.{i}.value"] = (1, c.heads, TOKENS, head_dim)
+    return shapes
+
+
+def write_context(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
+    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → each layer's keys [1, H, d, T], values [1, H, T, d]."""
+    c = action.config.action
+    with GraphWriter(directory, "semantic_context", precision=precision, form=form, half=half, external=False) as g:
         kv_dim = action.config.kv_dim
         x = g.input("last_layer_kv", TensorProto.FLOAT, (1, TOKENS, kv_dim))
         length = g.op("Shape", [x], start=1, end=2)
@@ -45,41 +55,37 @@ def write_context(action: ActionExpert, directory: Path, *, precision: Precision
         x = _mlp(g, x, "semantic_projection", action.semantic_projection)
         table = g.weight(array(action.semantic_position).astype(g.float), "semantic_position")
         x = g.op("Add", [x, g.op("Slice", [table, g.constant([0]), length, g.constant([1])])])
-        keys, values = [], []
         for i, pair in enumerate(action.key_values):
             assert isinstance(pair, KeyValue)
             k = g.linear(x, f"key_values.{i}.k", array(pair.k.weight), array(pair.k.bias))
             v = g.linear(x, f"key_values.{i}.v", array(pair.v.weight), array(pair.v.bias))
-            keys.append(split_heads(g, k, c.heads, keys=True))
-            values.append(split_heads(g, v, c.heads))
-        for parts, out, shape in (
-            (keys, "context_keys", (c.layers, c.heads, head_dim, TOKENS)),
-            (values, "context_values", (c.layers, c.heads, TOKENS, head_dim)),
-        ):
-            g.op("Concat", parts, axis=0, out=out)
-            g.output(out, g.float_type, shape)
+            split_heads(g, k, c.heads, keys=True, out=f"context.{i}.key")
+            split_heads(g, v, c.heads, out=f"context.{i}.value")
+        for name, shape in context_shapes(action.config).items():
+            g.output(name, g.float_type, shape)
         return g.finish()
 
 
 def write_action(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
     """Write action_expert.onnx: visual tokens, state, latency and semantic context → trajectory [1, steps, 3]."""
     c, vision = action.config.action, action.config.vision
-    head_dim = c.hidden // c.heads
     with GraphWriter(directory, "action_expert", precision=precision, form=form, half=half, external=False) as g:
         visual = g.input("visual_tokens", TensorProto.FLOAT, (1, vision.tokens, vision.token_dim))
         state = g.input("state", TensorProto.FLOAT, (1, 3))
         latency = g.input("latency", TensorProto.FLOAT, (1, 4))
-        context_keys = g.input("context_keys", g.float_type, (c.layers, c.heads, head_dim, TOKENS))
-        context_values = g.input("context_values", g.float_type, (c.layers, c.heads, TOKENS, head_dim))
+        for name, shape in context_shapes(action.config).items():
+            g.input(name, g.float_type, shape)
         now = _now_tokens(g, action, visual, state, latency)
-        split = g.op("Concat", [g.constant([vision.tokens + 2]), g.op("Shape", [context_keys], start=3, end=4)], axis=0)
+        split = g.op(
+            "Concat", [g.constant([vision.tokens + 2]), g.op("Shape", ["context.0.key"], start=3, end=4)], axis=0
+        )
         x: str | None = None
         for i, (pair, layer) in enumerate(zip(action.key_values, action.layers, strict=True)):
             assert isinstance(pair, KeyValue) and isinstance(layer, CrossAttentionLayer)
             k = g.linear(now, f"key_values.{i}.k", array(pair.k.weight), array(pair.k.bias))
             v = g.linear(now, f"key_values.{i}.v", array(pair.v.weight), array(pair.v.bias))
-            keys = (split_heads(g, k, c.heads, keys=True), _layer_of(g, context_keys, i))
-            values = (split_heads(g, v, c.heads), _layer_of(g, context_values, i))
+            keys = (split_heads(g, k, c.heads, keys=True), f"context.{i}.key")
+            values = (split_heads(g, v, c.heads), f"context.{i}.value")
             x = _cross_attention(g, action, layer, i, x, keys, values, split)
         assert x is not None
         x = layer_norm(g, x, action.norm, "norm")
@@ -90,11 +96,6 @@ def write_action(action: ActionExpert, directory: Path, *, precision: Precision,
         _trajectory(g, x, c.parameterisation)
         g.output("trajectory", TensorProto.FLOAT, (1, c.steps, 3))
         return g.finish()
-
-
-def _layer_of(g: GraphWriter, context: str, index: int) -> str:
-    """One layer of the context [1, H, ·, ·]."""
-    return g.op("Slice", [context, g.constant([index]), g.constant([index + 1]), g.constant([0])])
 
 
 def _now_tokens(g: GraphWriter, action: ActionExpert, visual: str, state: str, latency: str) -> str:

@@ -82,10 +82,10 @@ def layer_norm(g: GraphWriter, x: str, module: nn.LayerNorm, name: str) -> str:
     return g.op("LayerNormalization", [x, scale, shift], axis=-1, epsilon=module.eps)
 
 
-def split_heads(g: GraphWriter, x: str, heads: int, *, keys: bool = False) -> str:
+def split_heads(g: GraphWriter, x: str, heads: int, *, keys: bool = False, out: str | None = None) -> str:
     """[1, T, heads·d] → [1, heads, T, d], or [1, heads, d, T] for keys that are multiplied from the right."""
     x = g.op("Reshape", [x, g.constant([0, 0, heads, -1])])
-    return g.op("Transpose", [x], perm=[0, 2, 3, 1] if keys else [0, 2, 1, 3])
+    return g.op("Transpose", [x], perm=[0, 2, 3, 1] if keys else [0, 2, 1, 3], out=out)
 
 
 def merge_heads(g: GraphWriter, x: str) -> str:

@@ -33,8 +33,7 @@ HERE = SE2(0.0, 0.0, 0.0)
 def onnx_tick(directory: Path, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
     """The runner's own code path."""
     policy = Policy(load_artifacts(directory), threads=1)
-    keys, values = policy.semantic_context(kv)
-    semantic = SemanticState(0, 0, HERE, 0, kv, keys, values, "", None)
+    semantic = SemanticState(0, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
     return lambda: policy.act(policy.encode(image), (0.4, 0.0, 0.0), 2.0, HERE, semantic)
 
 
