@@ -7,11 +7,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
 from transformers import InternVLConfig, InternVLForConditionalGeneration
 
+from export.checkpoint import CheckpointError, load_checkpoint
 from export.model.config import ActionConfig, LanguageConfig, TicVlaConfig, VisionConfig
 
 CONFIG = TicVlaConfig(
@@ -149,9 +151,18 @@ def original_config() -> dict[str, Any]:
     }
 
 
-def save_original(model: Any, directory: Path) -> Path:
+def write_directory(directory: Path, tensors: dict[str, Tensor]) -> Path:
     """An InternVL directory in OpenGVLab's layout."""
     directory.mkdir()
-    save_file(original_tensors(model), str(directory / "model.safetensors"), metadata={"format": "pt"})
+    save_file(tensors, str(directory / "model.safetensors"))
     (directory / "config.json").write_text(json.dumps(original_config()), encoding="utf-8")
     return directory
+
+
+def refusal(*paths: Path, fill_seed: int | None = 0) -> str:
+    """The one line that a checkpoint is refused with."""
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(paths, CONFIG, fill_seed=fill_seed)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line

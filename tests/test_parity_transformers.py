@@ -12,7 +12,7 @@ from torch import Tensor
 
 from export.checkpoint import config_from_hf, load_checkpoint
 from export.model.network import TicVla
-from tests.internvl import CONFIG, hf_model, save_original
+from tests.internvl import CONFIG, hf_model, original_tensors, write_directory
 
 FRAMES = 3
 LAYOUTS = ("original", "hf", "hf shards", "lightning", "hf tied")
@@ -33,7 +33,7 @@ def pair(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     hf = hf_model(tied=request.param == "hf tied")
     path = tmp_path_factory.mktemp("internvl") / "checkpoint"
     if request.param == "original":
-        save_original(hf, path)
+        write_directory(path, original_tensors(hf))
     elif request.param == "lightning":
         path = path.with_suffix(".ckpt")
         torch.save({"epoch": 1, "state_dict": {f"vlm.{k}": v for k, v in hf.state_dict().items()}}, path)

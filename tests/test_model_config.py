@@ -1,0 +1,99 @@
+"""A network's numbers from a preset, a file or overrides; what is misspelt or of another type is refused by name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from export.model.config import PRESETS, ModelConfigError
+from export.model.config_file import config_for, config_from_file, with_overrides
+
+NANO = PRESETS["nano"]
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_preset_written_to_a_file_reads_back_the_same(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(PRESETS[name].to_dict()), encoding="utf-8")
+    assert config_for(str(path)) == config_for(name) == PRESETS[name]
+
+
+def test_what_a_file_leaves_out_has_the_size_of_the_paper(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text('{"name": "shallow", "action": {"layers": 3}}', encoding="utf-8")
+    config = config_from_file(path)
+    assert (config.action.layers, config.vision) == (3, PRESETS["1b"].vision)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+        ("[]", "expected an object with name, vision"),
+        ("{}", "name is None"),
+        ('{"name": "x", "colour": 1}', "colour is not known; expected one of: name, vision"),
+        ('{"name": "x", "action": []}', "action is list"),
+        ('{"name": "x", "action": {"layer": 3}}', "action.layer is not known; expected one of: hidden, layers"),
+        ('{"name": "x", "action": {"layers": "3"}}', "action.layers is '3', expected int"),
+        ('{"name": "x", "action": {"layers": true}}', "action.layers is True, expected int"),
+        ('{"name": "x", "action": {"layers": 0}}', "layers is 0, expected 1 to"),
+        ('{"name": "x", "action": {"layers": 1e99}}', "action.layers is 1e[+]99, expected int"),
+        ('{"name": "x", "action": {"step_s": NaN}}', "action.step_s is nan, expected float"),
+        ('{"name": "x", "vision": {"mean": [1, 2]}}', "expected a list of 3 float"),
+        ('{"name": "x", "language": {"im_end_id": -1}}', "special ids"),
+        ('{"name": "x", "vision": {"token_dim": 64}}', "token_dim 64 must equal"),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ModelConfigError, match=says) as caught:
+        config_from_file(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_and_an_unknown_preset_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelConfigError, match="cannot be read"):
+        config_for(str(tmp_path / "absent.json"))
+    with pytest.raises(ModelConfigError, match="'7b' is not known; expected one of: 1b, nano"):
+        config_for("7b")
+
+
+def test_overrides_are_read_as_what_the_field_is() -> None:
+    config = with_overrides(
+        NANO,
+        {
+            "action.layers": "3",
+            "action.semantic_interface": "values-only",
+            "action.latency_aware": "false",
+            "action.step_s": "1",
+            "vision.stem_channels": "8,16,32,64",
+            "vision.mean": "[0.5, 0.5, 0.5]",
+        },
+    )
+    assert (config.action.layers, config.action.semantic_interface) == (3, "values-only")
+    assert (config.action.latency_aware, config.action.step_s) == (False, 1.0)
+    assert (config.vision.stem_channels, config.vision.mean) == ((8, 16, 32, 64), (0.5, 0.5, 0.5))
+    assert config.language == NANO.language
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "says"),
+    [
+        ("action.layer", "3", "action.layer is not a number of the model; expected one of: action.hidden"),
+        ("name", "x", "name is not a number of the model"),
+        ("layers", "3", "layers is not a number of the model; expected one of: vision.image_px"),
+        ("action.layers", "three", "action.layers=three: expected int"),
+        ("action.layers", "2.5", "action.layers is 2.5, expected int"),
+        ("action.latency_aware", "yes", "action.latency_aware=yes: expected bool"),
+        ("action.semantic_interface", "telepathy", "expected one of"),
+        ("vision.stem_channels", "8,x", "expected a list"),
+    ],
+)
+def test_an_override_that_fits_no_field_is_refused(key: str, text: str, says: str) -> None:
+    with pytest.raises(ModelConfigError, match=says):
+        with_overrides(NANO, {key: text})
