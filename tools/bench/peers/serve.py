@@ -1,0 +1,124 @@
+"""The worker's side of the protocol: JSON lines on standard input and output, one contender a process.
+
+    {"load": {...}}                → {"ok": true, "tasks": [...], "versions": {...}}
+    {"run": TASK, "calls": N}      → {"ok": true, "values": {METRIC: [...]}, "wall_s": …, "cpu_s": …}
+    {"end": true}                  → the worker exits
+
+Standard output of the libraries goes to standard error: only answers may be read as answers.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Task = Callable[[], Mapping[str, float]]
+"""One timed call: metric → value (`…_ms`, `…_tokens_per_s`)."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a worker is asked to open."""
+
+    model: str
+    cache: Path
+    threads: int
+    parts: tuple[str, ...]
+    options: Mapping[str, str]
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Load:
+        """From a message; raises ValueError on fields that are missing or not known."""
+        if set(content) != {"model", "cache", "threads", "parts", "options"}:
+            raise ValueError(f"load: unexpected fields {sorted(content)}")
+        return cls(
+            str(content["model"]),
+            Path(content["cache"]),
+            int(content["threads"]),
+            tuple(content["parts"]),
+            dict(content["options"]),
+        )
+
+
+def timed_ms(call: Callable[[], object]) -> float:
+    """Milliseconds that a call takes."""
+    started_ns = time.monotonic_ns()
+    call()
+    return (time.monotonic_ns() - started_ns) / 1e6
+
+
+def encoder_task(encode: Callable[[], object]) -> Task:
+    """One frame through the encoder."""
+    return lambda: {"encoder_ms": timed_ms(encode)}
+
+
+def action_task(act: Callable[[], object]) -> Task:
+    """One step of the action expert."""
+    return lambda: {"action_ms": timed_ms(act)}
+
+
+def tick_task(tick: Callable[[], object]) -> Task:
+    """Encoder and action expert, one after the other."""
+    return lambda: {"tick_ms": timed_ms(tick)}
+
+
+def language_task(prefill: Callable[[], int], step: Callable[[int], int], steps: int) -> Task:
+    """A prefill that returns the next token, then `steps` steps that each take it and return the one after."""
+
+    def run() -> dict[str, float]:
+        started_ns = time.monotonic_ns()
+        token = prefill()
+        prefilled_ns = time.monotonic_ns()
+        for _ in range(steps):
+            token = step(token)
+        decode_s = (time.monotonic_ns() - prefilled_ns) / 1e9
+        return {"prefill_ms": (prefilled_ns - started_ns) / 1e6, "decode_tokens_per_s": steps / decode_s}
+
+    return run
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Installed versions of packages."""
+    return {name: importlib.metadata.version(name) for name in packages}
+
+
+def serve(load: Callable[[Load], Mapping[str, Task]], packages: Sequence[str]) -> int:
+    """Answer requests until the end; a failure is answered in one line and ends the worker with code 1."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    tasks: Mapping[str, Task] = {}
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "end" in request:
+            return 0
+        try:
+            if "load" in request:
+                tasks = load(Load.from_dict(request["load"]))
+                answer: dict[str, Any] = {"tasks": sorted(tasks), "versions": versions(packages)}
+            else:
+                answer = _run(tasks[request["run"]], int(request["calls"]))
+        except Exception as error:  # noqa: BLE001 - a runtime may raise anything; the parent reports it and goes on
+            first = (str(error).strip().splitlines() or [""])[0]
+            answers.write(json.dumps({"ok": False, "error": f"{type(error).__name__}: {first}"}) + "\n")
+            answers.flush()
+            return 1
+        answers.write(json.dumps({"ok": True, **answer}) + "\n")
+        answers.flush()
+    return 0
+
+
+def _run(task: Task, calls: int) -> dict[str, Any]:
+    values: dict[str, list[float]] = {}
+    started_ns, cpu_before = time.monotonic_ns(), time.process_time()
+    for _ in range(calls):
+        for metric, value in task().items():
+            values.setdefault(metric, []).append(value)
+    wall_s, cpu_s = (time.monotonic_ns() - started_ns) / 1e9, time.process_time() - cpu_before
+    return {"values": values, "wall_s": wall_s, "cpu_s": cpu_s}
