@@ -7,18 +7,18 @@ model holds its own tensors again whenever no layer is running.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from export.precision import block_size
+from export.precision import Precision
 from export.quantize import Blocks, Channels, quantise_blocks, quantise_channels
 
 Linear = (nn.Linear, nn.Conv2d, nn.Embedding)
+SLAB_ROWS = 8192
 
 
 class Rounder:
@@ -26,25 +26,41 @@ class Rounder:
 
     def __init__(self, keep_bytes: int = 700_000_000) -> None:
         self._keep_bytes = keep_bytes
-        self._kept: OrderedDict[tuple[int, str], Blocks | Channels] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, str, int], Blocks | Channels] = OrderedDict()
         self._bytes = 0
 
     def weight(self, parameter: nn.Parameter, precision: str) -> Tensor:
         """The parameter [out, …] as a kernel of that precision sees it."""
+        return self._rows(parameter, precision, 0, parameter.shape[0])
+
+    def _rows(self, parameter: nn.Parameter, precision: str, start: int, stop: int) -> Tensor:
+        rows = parameter.data[start:stop]
         if precision == "fp32":
-            return parameter.data
+            return rows
         if precision == "fp16":
-            return parameter.data.half().float()
+            return rows.half().float()
         # By identity: the search holds the model, so an id cannot come to mean another parameter.
-        key = (id(parameter), precision)
+        key = (id(parameter), precision, start)
         packed = self._kept.get(key)
         if packed is None:
-            matrix = parameter.data.reshape(parameter.shape[0], -1).numpy()
+            matrix = rows.reshape(rows.shape[0], -1).numpy()
             packed = quantise_channels(matrix) if precision == "int8" else quantise_blocks(matrix, precision)
             self._keep(key, packed)
-        return torch.from_numpy(packed.dequantised()).reshape(parameter.shape)
+        return torch.from_numpy(packed.dequantised()).reshape(rows.shape)
 
-    def _keep(self, key: tuple[int, str], packed: Blocks | Channels) -> None:
+    def choices(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
+        """Most likely token [n] of hidden states [n, d] by a vocabulary matrix, which is rounded slab by slab."""
+        best = torch.full((hidden.shape[0],), -torch.inf)
+        choice = torch.zeros(hidden.shape[0], dtype=torch.long)
+        x = round_u8(hidden) if precision == "int8" else hidden
+        for start in range(0, parameter.shape[0], SLAB_ROWS):
+            rows = self._rows(parameter, precision, start, min(start + SLAB_ROWS, parameter.shape[0]))
+            value, index = (x @ rows.T).max(dim=-1)
+            better = value > best
+            best, choice = torch.where(better, value, best), torch.where(better, index + start, choice)
+        return choice
+
+    def _keep(self, key: tuple[int, str, int], packed: Blocks | Channels) -> None:
         size = _bytes(packed)
         while self._kept and self._bytes + size > self._keep_bytes:
             self._bytes -= _bytes(self._kept.popitem(last=False)[1])
@@ -54,21 +70,21 @@ class Rounder:
 
     @contextmanager
     def applied(
-        self, part: nn.Module, precision_of: Callable[[str], str], *, prefix: str = "", activations: bool = True
+        self, part: nn.Module, precision: Precision, layers: Collection[str], *, activations: bool = True
     ) -> Iterator[None]:
-        """While active, every linear layer inside `part` computes in `precision_of(prefix + its name)`.
+        """While active, every linear layer inside `part` that `layers` names computes in its precision.
 
         With `activations`, `int8` layers also get their input rounded to 8 bits with one range a call, as the dynamic
         kernels do, and `fp16` layers get theirs in 16 bits. The model is as before afterwards, also on an error.
         """
         handles = []
         originals: list[tuple[nn.Parameter, Tensor]] = []
-        for name, module in part.named_modules():
-            precision = precision_of(prefix + name) if isinstance(module, Linear) else "fp32"
-            if precision != "fp32":
-                assert isinstance(module.weight, nn.Parameter)
+        for name in layers:
+            module = part.get_submodule(name)
+            assert isinstance(module, Linear) and isinstance(module.weight, nn.Parameter)
+            if precision.of(name) != "fp32":
                 originals.append((module.weight, module.weight.data))
-                handles += self._hook(module, precision, activations)
+                handles += self._hook(module, precision.of(name), activations)
         try:
             yield
         finally:
@@ -120,22 +136,3 @@ def _table_rows(rows: Tensor, precision: str) -> Tensor:
 def _bytes(packed: Blocks | Channels) -> int:
     values = packed.packed if isinstance(packed, Blocks) else packed.values
     return int(values.nbytes + packed.scales.nbytes)
-
-
-def head_choices(weight: nn.Parameter, hidden: Tensor, precision: str, slab_rows: int = 8192) -> Tensor:
-    """Most likely token [n] of hidden states [n, d], the vocabulary's matrix rounded slab by slab."""
-    best = torch.full((hidden.shape[0],), -torch.inf)
-    choice = torch.zeros(hidden.shape[0], dtype=torch.long)
-    x = round_u8(hidden) if precision == "int8" else hidden
-    for start in range(0, weight.shape[0], slab_rows):
-        rows = weight.data[start : start + slab_rows].numpy()
-        if precision == "fp16":
-            rows = rows.astype(np.float16).astype(np.float32)
-        elif precision == "int8":
-            rows = quantise_channels(rows).dequantised()
-        elif block_size(precision) is not None:
-            rows = quantise_blocks(rows, precision).dequantised()
-        value, index = (x @ torch.from_numpy(rows).T).max(dim=-1)
-        better = value > best
-        best, choice = torch.where(better, value, best), torch.where(better, index + start, choice)
-    return choice

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from edge.prompt import Segment
+from export.graphs.build import linear_layers
 from export.model.network import TicVla
 from export.precision import Precision
 from export.rounding import Rounder
@@ -86,7 +87,8 @@ class TorchStages:
         precision = self._precisions.get(name)
         if precision is None:
             return nullcontext()
-        return self._rounder.applied(part, precision.of, activations=self._activations)
+        layers = linear_layers(self.model.config, name)
+        return self._rounder.applied(part, precision, layers, activations=self._activations)
 
 
 def _array(tensor: Tensor) -> Floats:
