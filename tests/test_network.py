@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
-from export.model.network import TicVla, build
+from export.model.network import TicVla, build, initialise
 from export.model.vision import fold_tokens, pixel_shuffle_v2
+from export.model.weights import weights_sha256
 
 NANO = PRESETS["nano"]
 
@@ -180,6 +181,19 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
     a, b, c = build(NANO, 3), build(NANO, 3), build(NANO, 4)
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     assert any(not torch.equal(x, y) for x, y in zip(a.parameters(), c.parameters(), strict=True))
+
+
+def test_leaving_out_torchs_own_initial_weights_changes_none_of_ours(model: TicVla) -> None:
+    twice = TicVla(NANO).eval()
+    initialise(twice, 0)
+    assert weights_sha256(model) == weights_sha256(twice)
+
+
+def test_one_part_alone_is_filled_without_touching_the_others(model: TicVla) -> None:
+    other = build(NANO, 0)
+    initialise(other, 1, ("action",))
+    a, b = model.state_dict(), other.state_dict()
+    assert {name.split(".")[0] for name in a if not torch.equal(a[name], b[name])} == {"action"}
 
 
 def test_dropout_acts_in_training_only(model: TicVla) -> None:
