@@ -15,9 +15,9 @@ import torch
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
 from edge.manifest import ArtifactError
 from export.artifacts import Export, GateError, build_artifacts, verify_directory
+from export.measure import measure_plan
 from export.model.network import build
 from export.model.weights import WeightsError, WeightsInfo, load_weights, preset, save_weights
-from export.plan import measure_plan
 from export.target import TargetError, list_targets, load_target
 
 EXAMPLES = """examples:

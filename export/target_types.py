@@ -309,6 +309,7 @@ class Measured:
     date: str
     ms: float | None = None
     tokens_per_s: float | None = None
+    overrides: Mapping[str, str] = field(default_factory=dict)
     tokens: int | None = None
     """Prompt or context tokens it was taken at; None where time does not depend on them."""
     chunk_tokens: int | None = None
