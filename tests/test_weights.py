@@ -10,9 +10,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from export.model.config import PRESETS
+from export.checkpoint import CheckpointError, LoadedCheckpoint, load_checkpoint
+from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
-from export.model.weights import WeightsError, WeightsInfo, load_weights, save_weights, weights_sha256
+from export.model.weights import WeightsInfo, save_weights, weights_sha256
 
 NANO = PRESETS["nano"]
 
@@ -29,10 +30,16 @@ def file(model: TicVla, tmp_path: Path) -> Path:
     return path
 
 
+def load(path: Path, config: TicVlaConfig = NANO) -> LoadedCheckpoint:
+    return load_checkpoint([path], config, fill_seed=None)
+
+
 def test_what_was_saved_is_loaded(model: TicVla, file: Path) -> None:
-    loaded, info = load_weights(file, NANO)
-    assert weights_sha256(loaded) == weights_sha256(model)
-    assert info == WeightsInfo(trained=False, origin="random seed 0")
+    loaded = load(file)
+    assert weights_sha256(loaded.model) == weights_sha256(model)
+    assert not loaded.info.trained
+    assert loaded.info.origin.startswith("nano.safetensors (sha256 ")
+    assert loaded.info.origin.endswith(", random seed 0)")
 
 
 def test_nothing_but_the_file_is_left_behind(file: Path) -> None:
@@ -48,8 +55,8 @@ def test_one_changed_weight_changes_the_hash(model: TicVla) -> None:
 
 def test_weights_of_another_configuration_are_refused(file: Path) -> None:
     other = dataclasses.replace(NANO, action=dataclasses.replace(NANO.action, layers=3))
-    with pytest.raises(WeightsError, match="another configuration"):
-        load_weights(file, other)
+    with pytest.raises(CheckpointError, match=r"another configuration .*action\.layers is 6, expected 3"):
+        load(file, other)
 
 
 @pytest.mark.parametrize("damage", ["missing", "extra", "shape", "nan"])
@@ -70,19 +77,26 @@ def test_tensors_that_do_not_fit_are_refused(model: TicVla, tmp_path: Path, dama
     with safe_open(str(path), "pt") as opened:
         metadata = opened.metadata()
     save_file(tensors, str(path), metadata=metadata)
-    with pytest.raises(WeightsError):
-        load_weights(path, NANO)
+    with pytest.raises(CheckpointError):
+        load(path)
 
 
 def test_a_pickle_is_refused_without_being_opened_as_one(tmp_path: Path) -> None:
-    path = tmp_path / "weights.pt"
+    path = tmp_path / "nano.safetensors"
     path.write_bytes(pickle.dumps({"a": 1}))
-    with pytest.raises(WeightsError, match="not a readable safetensors"):
-        load_weights(path, NANO)
+    with pytest.raises(CheckpointError, match="not a readable safetensors"):
+        load(path)
 
 
 def test_a_safetensors_file_of_somebody_else_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, str(path))
-    with pytest.raises(WeightsError, match="format"):
-        load_weights(path, NANO)
+    with pytest.raises(CheckpointError, match=r"tensors of no layout that is known \(a\)"):
+        load(path)
+
+
+def test_another_version_of_our_format_is_refused(model: TicVla, tmp_path: Path) -> None:
+    path = tmp_path / "nano.safetensors"
+    save_file(model.state_dict(), str(path), metadata={"format": "tic-vla-edge/2"})
+    with pytest.raises(CheckpointError, match="format 'tic-vla-edge/2', expected 'tic-vla-edge/1'"):
+        load(path)

@@ -14,11 +14,12 @@ from torch import Tensor
 from export.checkpoint.coverage import CheckpointError, Coverage, SourceCoverage
 from export.checkpoint.hf_config import check_config
 from export.checkpoint.layouts import find_layouts
-from export.checkpoint.sources import Source, file_sha256, open_source
+from export.checkpoint.sources import Source, open_source
 from export.checkpoint.tokenizer import directory_tokenizer
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, empty_network, initialise
 from export.model.weights import FORMAT, WeightsInfo
+from export.stages import file_sha256
 
 EMBED, LM_HEAD = "language.embed.weight", "language.lm_head.weight"
 VALUE_SEED = 0

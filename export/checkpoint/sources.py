@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -58,15 +57,6 @@ def open_source(path: Path) -> Source:
         return _open_torch(path)
     suffixes = ", ".join((".safetensors", *TORCH_SUFFIXES))
     raise CheckpointError(f"{path}: not a checkpoint; expected a directory or a file ending in {suffixes}")
-
-
-def file_sha256(path: Path) -> str:
-    """Hash of a file, read in pieces."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(1 << 20):
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _from_files(label: str, paths: dict[str, Path], weight_map: dict[str, str], directory: Path | None) -> Source:

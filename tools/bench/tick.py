@@ -24,8 +24,8 @@ from edge.geometry import SE2
 from edge.manifest import ArtifactError, load_artifacts, read_manifest
 from edge.policy import Policy
 from edge.semantic import SemanticState
+from export.model.config_file import config_for
 from export.model.network import build
-from export.model.weights import preset
 
 HERE = SE2(0.0, 0.0, 0.0)
 
@@ -40,7 +40,7 @@ def onnx_tick(directory: Path, image: np.ndarray, kv: np.ndarray) -> Callable[[]
 def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
     """The same network in PyTorch eager mode on one thread."""
     torch.set_num_threads(1)
-    model = build(preset(model_name), 0)
+    model = build(config_for(model_name), 0)
     frame, state, latency = torch.from_numpy(image), torch.tensor([[0.4, 0.0, 0.0]]), torch.tensor([[2.0, 0, 0, 0]])
     with torch.no_grad():
         keys, values = model.action.context(torch.from_numpy(kv))
