@@ -1,56 +1,47 @@
-"""Building an artifact directory: graphs, gate, manifest, report; written aside, then renamed into place."""
+"""Building an artifact directory: files from the cache, gate, manifest; written aside, then renamed into place."""
 
 from __future__ import annotations
 
-import hashlib
-import html
-import importlib.metadata
 import json
-import os
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from edge.graph import Graph
-from edge.manifest import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, load_artifacts, read_manifest
-from export.graphs import GraphSpec, export_graph, graph_contract, graph_parameters, graph_specs
+from edge.manifest import (
+    MANIFEST_NAME,
+    SCHEMA_VERSION,
+    ArtifactError,
+    load_artifacts,
+    read_manifest,
+)
+from export.gates import WARN, GateResult, require
+from export.graphs.build import graph_contract, graph_parameters
+from export.job import Job
 from export.model.config import TicVlaConfig
-from export.model.network import TicVla
-from export.model.tokenizer import NANO_TOKENIZER
-from export.model.weights import WeightsInfo, weights_sha256
-from export.parity import ParityResult, check_graph
+from export.pipeline import Pipeline, build_stages
+from export.plan import Plan, plan
+from export.progress import Progress
+from export.report import report_html
+from export.stages import StageCache, file_sha256, fsync_path, package_versions
 from export.target import Target
 
-PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "tokenizers")
-Progress = Callable[[str], None]
+REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 
 
-class GateError(Exception):
-    """A graph that is not the same model; its text says which and by how much."""
-
-
-@dataclass(frozen=True)
-class Export:
-    """What an export was made of."""
-
-    target: Target
-    model: TicVla
-    info: WeightsInfo
-
-
-def manifest_runtime(target: Target, config: TicVlaConfig) -> dict[str, Any]:
-    """The manifest's `runtime` section."""
-    language = config.language
+def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, Any]:
+    """The manifest's `runtime` section; a plan that fits says how many tokens a generation may have."""
+    language, policy = config.language, target.runtime
+    planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
     return {
         "image_px": config.vision.image_px,
         "frame_tokens": config.frame_tokens,
         "kv_dim": config.kv_dim,
         "max_context": language.max_context,
-        "max_new_tokens": target.runtime.max_new_tokens,
-        "frame_offsets_s": list(target.runtime.frame_offsets_s),
-        "tick_period_ms": target.runtime.tick_period_ms,
+        "max_new_tokens": planned,
+        "prefill_chunk_tokens": policy.prefill_chunk_tokens,
+        "frame_offsets_s": list(policy.frame_offsets_s),
+        "tick_period_ms": policy.tick_period_ms,
         "step_s": config.action.step_s,
         "im_start_id": language.im_start_id,
         "im_end_id": language.im_end_id,
@@ -60,42 +51,25 @@ def manifest_runtime(target: Target, config: TicVlaConfig) -> dict[str, Any]:
     }
 
 
-def _file_entry(path: Path) -> dict[str, Any]:
-    return {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def build_artifacts(export: Export, out: Path, progress: Progress) -> dict[str, Any]:
-    """Write `out`, return its manifest; raises GateError, ArtifactError or OSError and then leaves nothing behind."""
+def build_artifacts(job: Job, out: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+    """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
+    nothing behind but finished stages in the cache."""
     partial = out.with_name(out.name + ".partial")
-    _check_replaceable(out)
+    check_replaceable(out)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        manifest = _write_directory(export, partial, progress)
-        _sync(partial)
-        _check_replaceable(out)  # once more: building took its time
-        retired = out.with_name(out.name + ".old.partial")
-        shutil.rmtree(retired, ignore_errors=True)
-        if out.exists():
-            out.rename(retired)
-        try:
-            partial.rename(out)
-        except BaseException:
-            if retired.exists():
-                retired.rename(out)
-            raise
-        _sync_one(out.parent)
-        shutil.rmtree(retired, ignore_errors=True)
-        return manifest
+        report = _write_directory(Pipeline(job, cache, progress), partial, progress)
+        for path in [*partial.iterdir(), partial]:
+            fsync_path(path)
+        check_replaceable(out)  # once more: building took its time
+        _swap(partial, out)
+        return report
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _check_replaceable(out: Path) -> None:
+def check_replaceable(out: Path) -> None:
     """An existing directory is replaced only if it is an artifact directory with nothing of the user's beside it."""
     if not out.exists():
         return
@@ -105,119 +79,118 @@ def _check_replaceable(out: Path) -> None:
         raise ArtifactError(f"{out / others[0]}: not ours, so {out} is not replaced; name another directory")
 
 
-def _write_directory(export: Export, directory: Path, progress: Progress) -> dict[str, Any]:
-    config = export.model.config
-    specs = graph_specs(export.model)
-    for spec in specs:
-        progress(f"exporting {spec.name}")
-        export_graph(spec, directory / f"{spec.name}.onnx")
-    shutil.copyfile(NANO_TOKENIZER, directory / "tokenizer.json")
+def _swap(partial: Path, out: Path) -> None:
+    retired = out.with_name(out.name + ".old.partial")
+    shutil.rmtree(retired, ignore_errors=True)
+    if out.exists():
+        out.rename(retired)
+    try:
+        partial.rename(out)
+    except BaseException:
+        if retired.exists():
+            retired.rename(out)
+        raise
+    fsync_path(out.parent)
+    shutil.rmtree(retired, ignore_errors=True)
+
+
+def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, Any]:
+    job = pipeline.job
+    weights = pipeline.weights()
+    (directory / TOKENIZER_NAME).write_bytes(pipeline.tokenizer())
+    pipeline.task_reference()
+    for name in job.target.graph_names:
+        pipeline.reference(name)
+    graphs: dict[str, Any] = {}
+    for name in job.target.graph_names:
+        files = pipeline.graph(name)
+        for path in files:
+            # Copied, never linked: what happens to the output must not reach the cache.
+            shutil.copyfile(path, directory / path.name)
+        graphs[name] = _graph_entry(pipeline, name, [directory / path.name for path in files])
+    made = plan(job.target, job.config, {name: pipeline.precision(name)[0] for name in job.target.graph_names})
+    if job.target.runtime.enforce_plan:
+        made.require()
     manifest: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
-        "target": export.target.name,
-        "model": {"name": config.name, "trained": export.info.trained, "config": config.to_dict()},
-        "runtime": manifest_runtime(export.target, config),
-        "graphs": {},
+        "target": job.target.name,
+        "model": {"name": job.config.name, "trained": weights.trained, "config": job.config.to_dict()},
+        "runtime": manifest_runtime(job.target, job.config, made),
+        "graphs": graphs,
+        "plan": made.to_dict(),
         "provenance": {
-            "weights_sha256": weights_sha256(export.model),
-            "weights_origin": export.info.origin,
-            "calibration": None,
-            "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
+            "weights_sha256": weights.sha256,
+            "weights_origin": weights.origin,
+            "calibration": job.calibration.to_dict(),
+            "packages": package_versions(),
+            "target": job.target.to_dict(),
         },
     }
-    for spec in specs:
-        path = directory / f"{spec.name}.onnx"
-        manifest["graphs"][spec.name] = {
-            "file": path.name,
-            **graph_contract(path),
-            "params": graph_parameters(path),
-            "precision": export.target.precision[spec.name],
-            "precision_reason": f"target {export.target.name} asks for it",
-        }
     _write_manifest(directory, manifest)
-    results = check_directory(export, directory, specs, progress)
-    for name, result in results.items():
-        manifest["graphs"][name]["parity"] = result.to_dict()
-    _write_json(directory / "report.json", {key: manifest[key] for key in ("target", "model", "graphs", "provenance")})
-    (directory / "report.html").write_text(report_html(manifest), encoding="utf-8")
-    _write_manifest(directory, manifest)
-    return manifest
+    for name, result in check_directory(pipeline, directory, progress).items():
+        graphs[name]["parity"] = result.to_dict()
+    with progress.stage("plan and report"):
+        report = {**{k: v for k, v in manifest.items() if k != "files"}, "coverage": weights.coverage}
+        _write_json(directory / REPORT_JSON, report)
+        (directory / REPORT_HTML).write_text(report_html(report), encoding="utf-8")
+        _write_manifest(directory, manifest)
+    return report
+
+
+def _graph_entry(pipeline: Pipeline, name: str, files: list[Path]) -> dict[str, Any]:
+    target, (precision, reason) = pipeline.job.target, pipeline.precision(name)
+    graph_file = next(path for path in files if path.suffix == ".onnx")
+    contract = graph_contract(graph_file)
+    return {
+        "file": graph_file.name,
+        "data_files": [path.name for path in files if path != graph_file],
+        **contract,
+        "params": graph_parameters(graph_file),
+        "bytes": sum(path.stat().st_size for path in files),
+        "precision": precision.to_dict(),
+        "precision_reason": reason,
+        "form": target.graphs[name].form,
+        "session": target.session(name, contract["inputs"]),
+    }
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
     names = sorted(path.name for path in directory.iterdir() if path.name != MANIFEST_NAME)
-    manifest["files"] = {name: _file_entry(directory / name) for name in names}
+    manifest["files"] = {
+        name: {"sha256": file_sha256(directory / name), "bytes": (directory / name).stat().st_size} for name in names
+    }
     _write_json(directory / MANIFEST_NAME, manifest)
 
 
-def check_directory(
-    export: Export, directory: Path, specs: list[GraphSpec], progress: Progress
-) -> dict[str, ParityResult]:
-    """Run the gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
+def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, GateResult]:
+    """The gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
     artifacts = load_artifacts(directory)
-    results: dict[str, ParityResult] = {}
-    for spec in specs:
-        progress(f"checking {spec.name} against PyTorch")
-        graph = Graph(artifacts, spec.name, threads=1)
-        result = check_graph(export.model, spec, graph.run, export.target.parity)
-        if result.verdict != "PASS":
-            gate = export.target.parity
-            raise GateError(
-                f"{spec.name}: cosine {result.cosine:.6f} (≥ {gate.min_cosine}), max-abs {result.max_abs:.2e} "
-                f"(≤ {gate.max_abs}), difference between inputs {result.min_difference:.2e} (≥ {gate.min_difference}): "
-                f"not the same model, nothing was written"
-            )
-        results[spec.name] = result
+    results: dict[str, GateResult] = {}
+    for name in pipeline.job.target.graph_names:
+        result = results[name] = pipeline.gate(artifacts, name)
+        require(name, result.verdict)
+        if result.verdict.level == WARN:
+            progress.say(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
     return results
 
 
-def _sync(directory: Path) -> None:
-    for path in [*directory.iterdir(), directory]:
-        _sync_one(path)
-
-
-def _sync_one(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def report_html(manifest: Mapping[str, Any]) -> str:
-    """One table a person can read."""
-    rows = "".join(
-        f"<tr><td>{html.escape(name)}</td><td>{graph['params']:,}</td><td>{graph['precision']}</td>"
-        f"<td>{graph['parity']['cosine']:.7f}</td><td>{graph['parity']['max_abs']:.1e}</td>"
-        f"<td>{graph['parity']['min_difference']:.1e}</td><td>{graph['parity']['verdict']}</td></tr>"
-        for name, graph in manifest["graphs"].items()
-    )
-    model = manifest["model"]
-    trained = "trained" if model["trained"] else "untrained: initial weights, they do not navigate"
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>edge-export</title>'
-        "<style>body{font:16px system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding:0 1rem}"
-        "table{border-collapse:collapse}td,th{padding:.3rem .8rem;border-bottom:1px solid #ddd;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}</style>"
-        f"<h1>{html.escape(model['name'])} for {html.escape(manifest['target'])}</h1>"
-        f"<p>Weights: {html.escape(manifest['provenance']['weights_origin'])} ({trained}).</p>"
-        "<table><tr><th>graph</th><th>parameters</th><th>precision</th><th>cosine</th><th>max-abs</th>"
-        f"<th>between inputs</th><th>verdict</th></tr>{rows}</table>"
-        "<p>Measured: every graph ran in ONNX Runtime from the bytes in this directory, compared with PyTorch.</p>"
-        "</html>\n"
-    )
-
-
-def verify_directory(
-    directory: Path, rebuild: Callable[[dict[str, Any]], Export], progress: Progress
-) -> dict[str, Any]:
-    """Hashes, contract and parity of an existing directory once more; raises ArtifactError or GateError."""
+def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+    """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
     load_artifacts(directory)
     manifest = read_manifest(directory)
-    if not isinstance(manifest["provenance"], dict):
-        raise ArtifactError(f"{directory / MANIFEST_NAME}: provenance must be an object")
-    export = rebuild(manifest)
-    if weights_sha256(export.model) != manifest["provenance"].get("weights_sha256"):
-        raise ArtifactError(f"{directory}: was made from other weights than {export.info.origin}; pass --checkpoint")
-    results = check_directory(export, directory, graph_specs(export.model), progress)
+    pipeline = Pipeline(job, cache, progress)
+    weights = pipeline.weights()
+    if weights.sha256 != manifest["provenance"].get("weights_sha256"):
+        raise ArtifactError(f"{directory}: was made from other weights than {weights.origin}; pass --checkpoint")
+    pipeline.task_reference()
+    for name in job.target.graph_names:
+        pipeline.reference(name)
+    results = check_directory(pipeline, directory, progress)
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
+
+
+__all__ = ["build_artifacts", "build_stages", "check_directory", "check_replaceable", "verify_directory"]

@@ -3,31 +3,49 @@
 from __future__ import annotations
 
 import argparse
-import re
-import resource
+import os
 import sys
+import tempfile
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
+from rich.console import Console
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
-from edge.manifest import ArtifactError
-from export.artifacts import Export, GateError, build_artifacts, verify_directory
-from export.measure import measure_plan
-from export.model.network import build
-from export.model.weights import WeightsError, WeightsInfo, load_weights, preset, save_weights
-from export.target import TargetError, list_targets, load_target
+from edge.manifest import ArtifactError, load_artifacts
+from export.artifacts import build_artifacts, check_replaceable, verify_directory
+from export.calibration import CalibrationError, load_calibration
+from export.gates import GateError
+from export.job import Job, WeightSource
+from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config_file import config_for, with_overrides
+from export.model.weights import WeightsError, save_weights
+from export.pipeline import build_stages
+from export.plan import PlanError, plan
+from export.plan_table import plan_lines, plan_table
+from export.progress import Progress, peak_rss_bytes
+from export.stages import StageCache, default_cache_dir, open_cache
+from export.target import Target, TargetError, list_targets, load_target, with_settings
+from export.verify import job_of
 
+COMMAND = "edge-export"
+MODEL_PREFIX = "model."
+DEFAULT_CALIBRATION = "corridor-go2"
 EXAMPLES = """examples:
   edge-export --target cpu --model nano --out out/nano
-  edge-export --target cpu --model nano --checkpoint nano.safetensors --out out/nano
+  edge-export --target orin --model 1b --checkpoint InternVL3-1B/ --checkpoint action.safetensors --out out/orin
+  edge-export --target orin --model 1b --random-weights 0 --out out/orin
+  edge-export --target orin --model 1b --set power.mode=25W --dry-run
   edge-export verify out/nano
   edge-export --list-targets
 
-exit codes: 0 done, 1 a graph is not the same model, 2 bad arguments or input, 130 interrupted
+exit codes: 0 done, 1 a graph is not the same model, a plan does not fit or an artifact is damaged,
+            2 bad arguments or input, 130 interrupted (what was finished is kept in the cache)
 """
+BAD_INPUT = (ArtifactError, CalibrationError, ModelConfigError, WeightsError, TargetError, OSError)
 
 
 class UsageError(ValueError):
@@ -37,88 +55,150 @@ class UsageError(ValueError):
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-export`."""
     p = argparse.ArgumentParser(
-        "edge-export", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        COMMAND, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: hashes, contract and gates once more")
+    p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
+    p.add_argument("--target", default="cpu", metavar="NAME|FILE.toml", help="device to export for (default: cpu)")
+    p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
+    p.add_argument("--model", default="nano", metavar="nano|1b|FILE.json", help="network (default: nano)")
+    p.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="PATH",
+        action="append",
+        default=[],
+        help="weights: safetensors, .ckpt/.pt or a Hugging Face directory; repeat it for parts in several files",
     )
     p.add_argument(
-        "command", nargs="?", choices=["verify"], help="verify DIR: hashes, I/O contract and parity once more"
-    )
-    p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
-    p.add_argument("--target", default="cpu", help="device to export for (default: cpu)")
-    p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
-    p.add_argument("--model", default="nano", help="preset (default: nano; 1b is not exported yet)")
-    source = p.add_mutually_exclusive_group()
-    source.add_argument("--checkpoint", type=Path, metavar="PATH", help="weights as safetensors (see --save-weights)")
-    source.add_argument(
-        "--random-weights", type=int, metavar="SEED", help="untrained weights of this seed (default: 0)"
+        "--random-weights",
+        type=int,
+        metavar="SEED",
+        help="untrained weights of this seed (default: 0), or for an action expert that no --checkpoint has",
     )
     p.add_argument("--save-weights", type=Path, metavar="PATH", help="also write the weights as safetensors")
+    p.add_argument("--calibration", metavar="NAME", help="calibration set, folder:PATH or video:PATH")
+    p.add_argument(
+        "--set",
+        dest="settings",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="change the target (power.mode=25W) or the network (model.action.layers=3); repeatable",
+    )
     p.add_argument("--out", type=Path, metavar="DIR", help="artifact directory to write")
+    p.add_argument("--dry-run", action="store_true", help="print the plan and build nothing")
+    cache = p.add_mutually_exclusive_group()
+    cache.add_argument("--cache", type=Path, metavar="DIR", help="where finished stages are kept")
+    cache.add_argument("--no-cache", action="store_true", help="keep nothing, use nothing")
+    p.add_argument("--cache-gb", type=float, default=20.0, metavar="GB", help="size the cache is cut to (default: 20)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
-def _load(args: argparse.Namespace, target_name: str, model_name: str) -> Export:
-    target, config = load_target(target_name), preset(model_name)
-    if config.name != "nano":
-        raise WeightsError(f"model {config.name!r} has no tokenizer in this version; expected: nano")
-    if args.checkpoint is not None:
-        model, info = load_weights(args.checkpoint, config)
-        return Export(target, model, info)
-    seed = 0 if args.random_weights is None else args.random_weights
-    if not 0 <= seed < 2**63:
-        raise WeightsError(f"--random-weights {seed}: expected a seed between 0 and 2^63 - 1")
-    return Export(target, build(config, seed), WeightsInfo(trained=False, origin=f"random seed {seed}"))
-
-
-def _rebuilder(args: argparse.Namespace) -> Any:
-    def rebuild(manifest: dict[str, Any]) -> Export:
-        seed = re.fullmatch(r"random seed (\d{1,19})", str(manifest["provenance"].get("weights_origin", "")))
-        if args.checkpoint is None and args.random_weights is None and seed is not None:
-            args.random_weights = int(seed[1])
-        return _load(args, str(manifest["target"]), str(manifest["model"].get("name")))
-
-    return rebuild
-
-
 def _say(line: str) -> None:
-    sys.stderr.write(f"edge-export: {line}\n")
+    sys.stderr.write(f"{COMMAND}: {line}\n")
 
 
-def _run(args: argparse.Namespace) -> dict[str, Any]:
-    if args.command == "verify":
-        if args.directory is None:
-            raise UsageError("verify: which directory? expected: edge-export verify DIR")
-        manifest = verify_directory(args.directory, _rebuilder(args), _say)
-        return _result(manifest)
-    if args.out is None:
+def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
+    settings = [(s, s.partition("=")[0].strip()) for s in args.settings]
+    model = {k.removeprefix(MODEL_PREFIX): s.partition("=")[2] for s, k in settings if k.startswith(MODEL_PREFIX)}
+    config = with_overrides(config_for(args.model), model)
+    target = load_target(args.target, config.name)
+    return with_settings(target, [s for s, key in settings if not key.startswith(MODEL_PREFIX)]), config
+
+
+def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> dict[str, Any] | None:
+    """Refuse at once what cannot fit; with --dry-run, the result."""
+    try:
+        made = plan(target, config)
+    except PlanError as error:
+        raise UsageError(str(error)) from error
+    if args.dry_run:
+        console = Console(stderr=True)
+        if console.is_terminal:
+            console.print(plan_table(made))
+        else:
+            sys.stderr.write("\n".join(plan_lines(made)) + "\n")
+        write_result(args.json, {"target": target.name, "model": config.name, "plan": made.to_dict()})
+    if target.runtime.enforce_plan:
+        made.require()
+    return made.to_dict() if args.dry_run else None
+
+
+def _export(args: argparse.Namespace) -> dict[str, Any] | None:
+    if args.out is None and not args.dry_run:
         raise UsageError("--out is missing: expected a directory to write, e.g. --out out/nano")
     check_result_target(args.json)
-    args.out = args.out.absolute()
-    if not args.out.name:
-        raise UsageError(f"--out {args.out}: expected a directory that can be made")
-    export = _load(args, args.target, args.model)
-    if not export.info.trained:
-        _say(f"weights are untrained ({export.info.origin}): the robot will move, it will not navigate")
-    if args.save_weights is not None:
-        save_weights(export.model, args.save_weights, export.info)
-    manifest = build_artifacts(export, args.out, _say)
-    return {**_result(manifest), "plan": measure_plan(args.out), "out": str(args.out)}
+    target, config = _target_and_config(args)
+    if _check_plan(target, config, args) is not None:
+        return None
+    out = args.out.absolute()
+    if not out.name:
+        raise UsageError(f"--out {out}: expected a directory that can be made")
+    check_replaceable(out)
+    weights = WeightSource(config, args.checkpoint, args.random_weights)
+    job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION))
+    with _cache(args, out.parent) as cache:
+        run = f"{target.name} {config.name}"
+        progress = Progress(COMMAND, build_stages(job, cache.timings(run)))
+        try:
+            with progress:
+                report = build_artifacts(job, out, cache, progress)
+                if args.save_weights is not None:
+                    loaded = job.weights.get()
+                    save_weights(loaded.model, args.save_weights, loaded.info)
+        finally:
+            cache.remember_timings(run, progress.built_s)
+    if not report["model"]["trained"]:
+        _say("weights are untrained: the robot will move, it will not navigate")
+    return {**_result(report), "out": str(args.out), "stage_s": progress.built_s}
 
 
-def _result(manifest: dict[str, Any]) -> dict[str, Any]:
+def _verify(args: argparse.Namespace) -> dict[str, Any]:
+    if args.directory is None:
+        raise UsageError("verify: which directory? expected: edge-export verify DIR")
+    check_result_target(args.json)
+    load_artifacts(args.directory)
+    job, notes = job_of(args.directory, args.checkpoint, args.random_weights, args.calibration)
+    for note in notes:
+        _say(note)
+    with _cache(args, None) as cache:
+        run = f"verify {job.target.name} {job.config.name}"
+        progress = Progress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
+        with progress:
+            report = verify_directory(job, args.directory, cache, progress)
+        cache.remember_timings(run, progress.built_s)
+    return {**_result(report), "stage_s": progress.built_s}
+
+
+@contextmanager
+def _cache(args: argparse.Namespace, beside: Path | None) -> Iterator[StageCache]:
+    if not 0 < args.cache_gb < 1e6:
+        raise UsageError(f"--cache-gb {args.cache_gb:g}: expected a size above 0")
+    limit_bytes = round(args.cache_gb * 1e9)
+    if args.no_cache:
+        if beside is not None:
+            beside.mkdir(parents=True, exist_ok=True)
+        with (
+            tempfile.TemporaryDirectory(prefix=".edge-export-", dir=beside) as directory,
+            open_cache(Path(directory), limit_bytes, _say) as cache,
+        ):
+            yield cache
+        return
+    with open_cache(args.cache or default_cache_dir(os.environ), limit_bytes, _say) as cache:
+        yield cache
+
+
+def _result(report: dict[str, Any]) -> dict[str, Any]:
     graphs = {
-        name: {
-            "params": graph["params"],
-            "bytes": manifest["files"][graph["file"]]["bytes"],
-            "precision": graph["precision"],
-            "parity": graph["parity"],
-        }
-        for name, graph in manifest["graphs"].items()
+        name: {key: graph[key] for key in ("params", "bytes", "precision", "precision_reason", "parity")}
+        for name, graph in report["graphs"].items()
     }
-    return {"target": manifest["target"], "model": manifest["model"]["name"], "graphs": graphs}
+    return {"target": report["target"], "model": report["model"]["name"], "graphs": graphs, "plan": report["plan"]}
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
@@ -126,27 +206,27 @@ def main(argv: list[str] | None = None) -> int:
         for name in list_targets():
             sys.stdout.write(f"{name}\t{load_target(name).description}\n")
         return EXIT_DONE
-    # One thread: the order of floating-point sums, and with it every reported number, is then the same on each run.
-    torch.set_num_threads(1)
     try:
-        result = _run(args)
-        result["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        result["wall_s"] = (time.monotonic_ns() - started_ns) / 1e9
-        write_result(args.json, result)
-    except GateError as error:
+        result = _verify(args) if args.command == "verify" else _export(args)
+        if result is not None:
+            result["peak_rss_bytes"] = peak_rss_bytes()
+            result["wall_s"] = (time.monotonic_ns() - started_ns) / 1e9
+            write_result(args.json, result)
+    except (GateError, PlanError) as error:
         _say(str(error))
         return EXIT_CHECK_FAILED
-    except (UsageError, ArtifactError, WeightsError, TargetError, OSError) as error:
+    except (UsageError, *BAD_INPUT) as error:
         _say(str(error))
         # An artifact that does not verify is a failed check; anything else here is bad input.
         return EXIT_CHECK_FAILED if args.command == "verify" and isinstance(error, ArtifactError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted")
+        _say("interrupted; finished stages are in the cache")
         return EXIT_INTERRUPTED
-    if args.json != "-":
+    if result is not None and args.json != "-":
         for name, graph in result["graphs"].items():
             parity = graph["parity"]
             _say(f"{name}: {graph['params']:,} parameters, cosine {parity['cosine']:.7f}, {parity['verdict']}")
+        _say(f"{result['wall_s']:.1f} s, peak memory {result['peak_rss_bytes'] / 1e9:.2f} GB")
     return EXIT_DONE
 
 

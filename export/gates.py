@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from export.metrics import ParityResult
 from export.target_types import GraphGate, TaskGate
+from export.task_error import TaskError
 
 PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
-CPU_PROVIDER = "CPUExecutionProvider"
 
 
 class GateError(Exception):
@@ -19,16 +20,38 @@ class GateError(Exception):
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What a graph's rounding does to the robot: worst case over the delays of the semantic state."""
+    """What a graph's rounding does to the robot: the worst moment over all delays of the semantic state."""
 
     waypoint_cm: float
     heading_deg: float
     speed_mps: float
     turn_radps: float
+    relative: float | None
+    """Mean deviation as a share of how much the model's own plans vary; None when they do not vary."""
+    by_delay_cm: tuple[tuple[float, float], ...]
+    """(Δt in s, worst moment's waypoint deviation in cm) in order of Δt."""
 
-    def to_dict(self) -> dict[str, float]:
+    @classmethod
+    def of(cls, error: TaskError) -> TaskResult:
+        """The gate's figures of a measured task error."""
+        return cls(
+            waypoint_cm=error.waypoint_cm,
+            heading_deg=error.heading_deg,
+            speed_mps=error.speed_mps,
+            turn_radps=error.turn_radps,
+            relative=error.relative if math.isfinite(error.relative) else None,
+            by_delay_cm=tuple((delay_s, errors.waypoint_mean_cm.max) for delay_s, errors in error.by_delay),
+        )
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> TaskResult:
+        """Inverse of `to_dict`."""
+        pairs = tuple((float(delay_s), float(cm)) for delay_s, cm in content["by_delay_cm"])
+        return cls(**{**content, "by_delay_cm": pairs})
+
+    def to_dict(self) -> dict[str, Any]:
         """Plain JSON form."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {**vars(self), "by_delay_cm": [list(pair) for pair in self.by_delay_cm]}
 
 
 @dataclass(frozen=True)

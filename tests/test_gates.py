@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ TASK_GATE = TaskGate(
     waypoint_cm=5, heading_deg=2, speed_mps=0.05, turn_radps=0.1, warn_waypoint_cm=2, warn_heading_deg=1
 )
 GOOD = ParityResult(inputs=2, cosine=0.9999, max_abs=0.01, min_difference=0.5, top1=1.0)
-STEADY = TaskResult(waypoint_cm=1, heading_deg=0.5, speed_mps=0.01, turn_radps=0.01)
+STEADY = TaskResult(1, 0.5, 0.01, 0.01, relative=0.02, by_delay_cm=((0.0, 0.5), (10.0, 1.0)))
 
 
 def samples(count: int = 3) -> list[Sample]:
@@ -102,7 +103,12 @@ def test_numbers_within_every_threshold_pass() -> None:
 
 def test_a_threshold_itself_still_passes() -> None:
     edge = ParityResult(inputs=2, cosine=0.999, max_abs=0.1, min_difference=1e-3, top1=0.9)
-    assert judge(edge, TaskResult(2, 1, 0.05, 0.1), GATE, TASK_GATE).level == "PASS"
+    assert (
+        judge(
+            edge, replace(STEADY, waypoint_cm=2, heading_deg=1, speed_mps=0.05, turn_radps=0.1), GATE, TASK_GATE
+        ).level
+        == "PASS"
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,3 +190,7 @@ def test_a_gate_on_another_provider_than_the_one_that_ships_is_recorded_as_such(
     assert result["shipping_provider_checked"] is checked
     assert result["task"]["waypoint_cm"] == 1
     assert result["verdict"] == "PASS"
+
+
+def test_a_task_result_survives_json() -> None:
+    assert TaskResult.from_dict(json.loads(json.dumps(STEADY.to_dict()))) == STEADY

@@ -1,0 +1,182 @@
+"""Runs the graphs of a directory for the gate: from the verified bytes, on the provider that ships if it is here.
+
+What the network is compared with comes from PyTorch in fp32 (`parity.references`, `run_stages`) and is kept in files,
+so that the two never have to be in memory together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime as ort
+from safetensors.numpy import load_file, save_file
+
+from edge.graph import CPU_PROVIDER, DTYPES, Graph
+from edge.language import LanguageModel
+from edge.manifest import Artifacts
+from export.metrics import Arrays, ParityResult, Sample, compare
+from export.model.config import TicVlaConfig
+from export.task_error import StageOutputs, TaskError, plan, prompt_parts
+from export.task_error import compare as compare_task
+from export.task_samples import SampleSet, is_large
+from export.torch_stages import TorchStages
+
+Floats = npt.NDArray[np.float32]
+
+
+def threads_for(config: TicVlaConfig) -> int:
+    """Threads for everything that is measured on a model: always the same number, because another one may sum in
+    another order and report another last digit. A small model's kernels are too short for two."""
+    return 2 if is_large(config) else 1
+
+
+def save_samples(samples: Sequence[Sample], path: Path) -> None:
+    """Write test inputs and expected outputs to one safetensors file."""
+    tensors = {
+        f"{index}/{kind}/{name}": np.ascontiguousarray(array)
+        for index, sample in enumerate(samples)
+        for kind, arrays in (("feed", sample.feeds), ("expected", sample.expected))
+        for name, array in arrays.items()
+    }
+    save_file(tensors, path)
+
+
+def load_samples(path: Path) -> list[Sample]:
+    """Inverse of `save_samples`."""
+    samples: dict[int, Sample] = {}
+    for key, array in load_file(path).items():
+        index, kind, name = key.split("/", 2)
+        sample = samples.setdefault(int(index), Sample({}, {}))
+        (sample.feeds if kind == "feed" else sample.expected)[name] = array
+    return [samples[index] for index in sorted(samples)]
+
+
+def save_outputs(outputs: StageOutputs, path: Path) -> None:
+    """Write the reference of the task error to one safetensors file."""
+    tensors = {
+        f"{kind}/{index}": np.ascontiguousarray(array)
+        for kind in ("visual", "kv", "trajectories", "swapped")
+        for index, array in enumerate(getattr(outputs, kind))
+    }
+    tensors |= {f"token_ids/{index}": np.array(ids, dtype=np.int64) for index, ids in enumerate(outputs.token_ids)}
+    save_file(tensors, path)
+
+
+def load_outputs(path: Path) -> StageOutputs:
+    """Inverse of `save_outputs`."""
+    tensors = load_file(path)
+
+    def of(kind: str) -> tuple[Any, ...]:
+        count = sum(key.startswith(f"{kind}/") for key in tensors)
+        return tuple(tensors[f"{kind}/{index}"] for index in range(count))
+
+    token_ids = tuple(tuple(int(token) for token in ids) for ids in of("token_ids"))
+    return StageOutputs(of("visual"), of("kv"), token_ids, of("trajectories"), of("swapped"))
+
+
+def gate_provider(shipping: str) -> str:
+    """The provider that the gate runs a graph on: the shipping one if ONNX Runtime has it here, else the CPU's."""
+    return shipping if shipping in ort.get_available_providers() else CPU_PROVIDER
+
+
+class OpenGraph:
+    """A graph of the directory as the gate runs it: arrays by name, in and out in fp32 whatever it computes in."""
+
+    def __init__(self, artifacts: Artifacts, name: str, threads: int) -> None:
+        shipping = artifacts.graphs[name].session.provider
+        self.provider = gate_provider(shipping)
+        # With its own options on its own provider; the CPU's has none of the shipping one's.
+        self._graph = Graph(
+            artifacts, name, threads=threads, provider=None if self.provider == shipping else self.provider
+        )
+        self._dtypes = {tensor.name: DTYPES[tensor.dtype] for tensor in artifacts.graphs[name].inputs}
+
+    def __call__(self, feeds: Arrays) -> Arrays:
+        """Run once; raises edge.graph.GraphError."""
+        typed = {name: np.asarray(feeds[name]).astype(dtype, copy=False) for name, dtype in self._dtypes.items()}
+        found = self._graph.run(typed)
+        return {
+            name: array.astype(np.float32) if array.dtype == np.float16 else array
+            for name, array in zip(self._graph.output_names, found, strict=True)
+        }
+
+
+def check_parity(graph: OpenGraph, name: str, samples: Sequence[Sample]) -> ParityResult:
+    """The graph against PyTorch; raises ParityError."""
+    return compare(name, samples, graph)
+
+
+class TaskCheck:
+    """What the robot does differently when one graph is the shipped one and the others are PyTorch's in fp32."""
+
+    def __init__(self, torch_stages: TorchStages, reference: StageOutputs, samples: SampleSet) -> None:
+        self._torch = torch_stages
+        self._reference = reference
+        self._samples = samples
+
+    def vision(self, graph: OpenGraph) -> TaskError:
+        """Of the shipped encoder."""
+        visual = [graph({"frame": frame})["visual_tokens"] for frame in self._samples.frames]
+        kv = [self._torch.language(prompt_parts(s, visual), 0)[0] for s in self._samples.samples]
+        return self._compare(visual, kv, [self._torch.context(x) for x in kv])
+
+    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
+        """Of the shipped language model: one graph, or the pair as it runs together."""
+        model = LanguageModel(artifacts, threads=threads, provider=provider)
+        kv = []
+        for sample in self._samples.samples:
+            segments = prompt_parts(sample, self._reference.visual)
+            kv.append(model.generate(segments, max_new_tokens=0, cancelled=lambda: False).last_layer_kv)
+        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv])
+
+    def context(self, graph: OpenGraph) -> TaskError:
+        """Of the shipped semantic context."""
+        contexts = [_unpacked(graph({"last_layer_kv": kv})) for kv in self._reference.kv]
+        return self._compare(self._reference.visual, self._reference.kv, contexts)
+
+    def action(self, graph: OpenGraph) -> TaskError:
+        """Of the shipped action expert."""
+        contexts = [self._torch.context(kv) for kv in self._reference.kv]
+        return self._compare(self._reference.visual, self._reference.kv, contexts, _ShippedAction(graph))
+
+    def _compare(
+        self,
+        visual: Sequence[Floats],
+        kv: Sequence[Floats],
+        contexts: Sequence[tuple[Floats, Floats]],
+        act: _ShippedAction | None = None,
+    ) -> TaskError:
+        stages: Any = self._torch if act is None else act
+        trajectories = tuple(plan(stages, s, visual, c) for s, c in zip(self._samples.samples, contexts, strict=True))
+        no_text: tuple[tuple[int, ...], ...] = tuple(() for _ in kv)
+        found = StageOutputs(tuple(visual), tuple(kv), no_text, trajectories, ())
+        return compare_task(self._reference, found, self._samples)
+
+
+def _unpacked(context: Arrays) -> tuple[Floats, Floats]:
+    """Keys and values [layers, 1, heads, T, d] of the graphs' layout (a tensor a layer, keys transposed)."""
+    layers = range(len(context) // 2)
+    keys = np.stack([context[f"context.{i}.key"].swapaxes(2, 3) for i in layers])
+    return np.ascontiguousarray(keys), np.stack([context[f"context.{i}.value"] for i in layers])
+
+
+class _ShippedAction:
+    """`act` of `Stages` through the shipped graph, whose context has the layout that it reads fastest."""
+
+    def __init__(self, graph: OpenGraph) -> None:
+        self._graph = graph
+
+    def act(self, visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
+        feeds: Mapping[str, npt.NDArray[Any]] = {
+            "visual_tokens": visual_tokens,
+            "state": state,
+            "latency": latency,
+            **{f"context.{i}.key": layer.swapaxes(2, 3) for i, layer in enumerate(keys)},
+            **{f"context.{i}.value": layer for i, layer in enumerate(values)},
+        }
+        result: Floats = self._graph(feeds)["trajectory"]
+        return result

@@ -1,0 +1,245 @@
+"""The stages of a build, each under the hash of what it follows from; PyTorch is loaded by the first that needs it."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edge.graph import GraphError
+from edge.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE, Artifacts
+from export.checkpoint.tokenizer import tokenizer_for
+from export.gate_run import (
+    OpenGraph,
+    TaskCheck,
+    check_parity,
+    gate_provider,
+    load_outputs,
+    load_samples,
+    save_outputs,
+    save_samples,
+    threads_for,
+)
+from export.gates import GateError, GateResult, TaskResult, judge
+from export.graphs.build import write_graph
+from export.job import Job
+from export.metrics import ParityError, ParityResult
+from export.model.weights import weights_sha256
+from export.parity import references
+from export.precision import Precision
+from export.progress import Progress, Stage
+from export.stages import ENTRY_NAME, StageCache, file_sha256, stage_key
+from export.task_error import StageOutputs, TaskErrorError, run_stages
+from export.task_samples import SampleSet, is_large, samples_from
+from export.torch_stages import TorchStages
+
+WEIGHTS_FILE = "weights.json"
+TOKENIZER_FILE = "tokenizer.json"
+SAMPLES_FILE = "samples.safetensors"
+OUTPUTS_FILE = "outputs.safetensors"
+
+EXPECTED_S = {
+    "weights": (0.3, 30.0),
+    "task reference": (3.0, 120.0),
+    "precision": (1.0, 300.0),
+    "reference": (0.5, 20.0),
+    "graph": (0.5, 15.0),
+    "gate": (2.0, 45.0),
+    "plan and report": (0.2, 1.0),
+}
+"""Seconds to expect of each kind of stage before it was ever measured here: for a small and for a large model."""
+
+
+def machine_name() -> str:
+    """What decides which kernels compute: a result that was measured here is not one of another processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    features = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return f"{platform.machine()} {features}"
+
+
+def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True) -> list[Stage]:
+    """All stages in their order (without those that write graphs), with the seconds they took last time or usually."""
+    column = int(is_large(job.config))
+    names = ["weights", "task reference"]
+    kinds = ("reference", "graph", "gate") if graphs else ("reference", "gate")
+    names += [f"{kind} {graph}" for kind in kinds for graph in job.target.graph_names]
+    names += ["plan and report"] if graphs else []
+    usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
+    return [Stage(name, known_s.get(name, usual[name])) for name in names]
+
+
+@dataclass(frozen=True)
+class WeightsRecord:
+    """What the weights stage found."""
+
+    sha256: str
+    trained: bool
+    origin: str
+    coverage: dict[str, Any]
+
+
+class Pipeline:
+    """One build's stages; every method returns what is in the cache or makes it."""
+
+    def __init__(self, job: Job, cache: StageCache, progress: Progress) -> None:
+        self.job = job
+        self._cache = cache
+        self._progress = progress
+        self._entries: dict[str, Path] = {}
+        self._threads = threads_for(job.config)
+        torch.set_num_threads(self._threads)
+
+    def _stage(self, title: str, key: str, build: Callable[[Path], None]) -> Path:
+        """One stage in the cache, shown as it runs; within a build it is verified once."""
+        if key not in self._entries:
+            with self._progress.stage(title) as watch:
+                self._entries[key], cached = self._cache.fetch_or_build(key, build)
+                if cached:
+                    watch.from_cache()
+        return self._entries[key]
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        return self.job.weights.fingerprint()
+
+    def weights(self) -> WeightsRecord:
+        """Hash and origin of the weights; raises CheckpointError."""
+        return WeightsRecord(**json.loads((self._weights_entry() / WEIGHTS_FILE).read_text(encoding="utf-8")))
+
+    def tokenizer(self) -> bytes:
+        """tokenizer.json that goes with the weights."""
+        return (self._weights_entry() / TOKENIZER_FILE).read_bytes()
+
+    def _weights_entry(self) -> Path:
+        def build(directory: Path) -> None:
+            loaded = self.job.weights.get()
+            record = {
+                "sha256": weights_sha256(loaded.model),
+                "trained": loaded.info.trained,
+                "origin": loaded.info.origin,
+                "coverage": loaded.coverage.to_dict(),
+            }
+            (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
+            (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded))
+
+        return self._stage("weights", stage_key("weights", self._fingerprint), build)
+
+    def _parts(self, **more: Any) -> dict[str, Any]:
+        """Parts of every key that depends on the network: its weights (with what they mean) and the rest."""
+        return {"weights": self._fingerprint, **more}
+
+    # ---- what PyTorch gives
+
+    def _reference_key(self, graph: str) -> str:
+        return stage_key("reference", self._parts(graph=graph, inputs=self.job.target.gate(graph).inputs))
+
+    def reference(self, graph: str) -> Path:
+        """Test inputs of a graph and PyTorch's outputs."""
+
+        def build(directory: Path) -> None:
+            model = self.job.weights.get().model
+            save_samples(references(model, graph, self.job.target.gate(graph).inputs), directory / SAMPLES_FILE)
+
+        return self._stage(f"reference {graph}", self._reference_key(graph), build) / SAMPLES_FILE
+
+    @cached_property
+    def samples(self) -> SampleSet:
+        """Situations from the calibration set in which the robot is driven by an old semantic state."""
+        return samples_from(self.job.calibration, self.job.config, self.job.target.runtime, self.tokenizer())
+
+    def _task_key(self) -> str:
+        offsets = list(self.job.target.runtime.frame_offsets_s)
+        return stage_key("task", self._parts(calibration=self.job.calibration.sha256, frame_offsets_s=offsets))
+
+    def task_reference(self) -> Path:
+        """PyTorch's plans in those situations."""
+
+        def build(directory: Path) -> None:
+            stages = TorchStages(self.job.weights.get().model)
+            save_outputs(run_stages(stages, self.samples), directory / OUTPUTS_FILE)
+
+        return self._stage("task reference", self._task_key(), build) / OUTPUTS_FILE
+
+    @cached_property
+    def _task_outputs(self) -> StageOutputs:
+        return load_outputs(self.task_reference())
+
+    # ---- what ships
+
+    def precision(self, graph: str) -> tuple[Precision, str]:
+        """Precision of a graph's layers and the reason for it."""
+        return self.job.target.precision(graph), f"target {self.job.target.name} asks for it"
+
+    def graph(self, graph: str) -> list[Path]:
+        """The graph's files."""
+        policy, half = self.job.target.graphs[graph], self.job.target.half
+        precision, _ = self.precision(graph)
+        key = stage_key("graph", self._parts(graph=graph, precision=precision.to_dict(), form=policy.form, half=half))
+
+        def build(directory: Path) -> None:
+            model = self.job.weights.get().model
+            write_graph(model, graph, precision, policy.form, directory, half=half)
+
+        entry = self._stage(f"graph {graph}", key, build)
+        return sorted(path for path in entry.iterdir() if path.name != ENTRY_NAME)
+
+    # ---- whether it is the same model
+
+    def gate(self, artifacts: Artifacts, graph: str) -> GateResult:
+        """Run a graph of the directory against PyTorch and hold it to the target's thresholds; raises GateError."""
+        contract, gate = artifacts.graphs[graph], self.job.target.gate(graph)
+        provider = gate_provider(contract.session.provider)
+        try:
+            with self._progress.stage(f"gate {graph}") as watch:
+                parity, parity_cached = self._cache.result(
+                    self._gate_key("parity", artifacts, (graph,), self._reference_key(graph)),
+                    lambda: self._parity(artifacts, graph).to_dict(),
+                )
+                together = LANGUAGE_PAIR if graph in LANGUAGE_PAIR else (graph,)
+                task, task_cached = self._cache.result(
+                    self._gate_key("task", artifacts, together, self._task_key()),
+                    lambda: self._task(artifacts, graph).to_dict(),
+                )
+                if parity_cached and task_cached:
+                    watch.from_cache()
+        except (ParityError, GraphError, TaskErrorError) as error:
+            raise GateError(f"{error}; nothing was written") from error
+        measured, moved = ParityResult(**parity), TaskResult.from_dict(task)
+        verdict = judge(measured, moved, gate, self.job.target.task_gate)
+        return GateResult(measured, moved, verdict, provider, contract.session.provider)
+
+    def _gate_key(self, what: str, artifacts: Artifacts, graphs: tuple[str, ...], reference: str) -> str:
+        files = [n for graph in graphs for n in (artifacts.graphs[graph].file, *artifacts.graphs[graph].data_files)]
+        return stage_key(
+            what,
+            {
+                "files": {name: file_sha256(artifacts.directory / name) for name in files},
+                "sessions": [vars(artifacts.graphs[graph].session) for graph in graphs],
+                "providers": [gate_provider(artifacts.graphs[graph].session.provider) for graph in graphs],
+                "reference": reference,
+                "threads": self._threads,
+                "machine": machine_name(),
+            },
+        )
+
+    def _parity(self, artifacts: Artifacts, graph: str) -> ParityResult:
+        return check_parity(OpenGraph(artifacts, graph, self._threads), graph, load_samples(self.reference(graph)))
+
+    def _task(self, artifacts: Artifacts, graph: str) -> TaskResult:
+        check = TaskCheck(TorchStages(self.job.weights.get().model), self._task_outputs, self.samples)
+        if graph in (*LANGUAGE_WHOLE, *LANGUAGE_PAIR):
+            shipping = artifacts.graphs[graph].session.provider
+            provider = gate_provider(shipping)
+            return TaskResult.of(check.language(artifacts, self._threads, None if provider == shipping else provider))
+        opened = OpenGraph(artifacts, graph, self._threads)
+        run = {"vision_encoder": check.vision, "semantic_context": check.context, "action_expert": check.action}
+        return TaskResult.of(run[graph](opened))
