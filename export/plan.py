@@ -236,7 +236,7 @@ def _share(target: Target, tick_alone_ms: float) -> _Share:
 
 
 def _load(target: Target, stages: tuple[str, ...]) -> float:
-    threads = [target.graphs[stage_graph(target, stage)].threads or target.device.cores for stage in stages]
+    threads = [target.graphs[stage_graph(target, stage)].threads or 1 for stage in stages]
     return min(1.0, max(threads) / target.device.cores)
 
 

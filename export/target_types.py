@@ -210,7 +210,7 @@ class GraphPolicy:
     candidates: tuple[str, ...] = ()
     """Precisions that the sensitivity search may choose from, from the most to the least exact."""
     threads: int | None = None
-    """Intra-op threads; None: all cores."""
+    """Intra-op threads; None: one, where it matters."""
     profile: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     """Free axis → (min, opt, max) lengths that an engine is built for."""
 

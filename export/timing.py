@@ -160,7 +160,7 @@ def _at(stage: str, work: Work, point: Measured) -> Work:
 def _point(target: Target, model: str, graph: str, stage: str, precision: Precision) -> Measured | None:
     """The newest measurement of exactly this, the last one listed among equals."""
     policy = target.graphs[graph]
-    threads = policy.threads or target.device.cores
+    threads = policy.threads or 1
     # A whole language model's points say by their unit which of its two stages they are.
     per_token = {"prefill": False, "decode": True}.get(stage)
     found = [
@@ -238,7 +238,7 @@ def _call_ms(
 def _cores_share(target: Target, graph: str, provider: Provider) -> float:
     if not provider.uses_cores:
         return 1.0
-    return min(target.graphs[graph].threads or target.device.cores, target.device.cores) / target.device.cores
+    return min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
 
 
 def _together(*errors: float | None) -> float | None:

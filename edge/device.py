@@ -1,0 +1,145 @@
+"""What the program runs on, read from the files in which Linux and Jetson say so; the root can be another folder."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import onnxruntime as ort
+
+TENSORRT, CUDA, OPENVINO = "TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider"
+_PACKAGES = {
+    TENSORRT: ("tensorrt", "tensorrt-cu12", "tensorrt-cu13"),
+    OPENVINO: ("openvino", "onnxruntime-ep-openvino", "onnxruntime-openvino"),
+}
+_LIBRARIES = {TENSORRT: "libnvinfer.so.*"}
+_LIBRARY_FOLDERS = ("usr/lib/aarch64-linux-gnu", "usr/lib/x86_64-linux-gnu", "usr/local/lib")
+
+
+class DeviceError(ValueError):
+    """A device that is not the one that is needed; its text is the one line to show."""
+
+
+@dataclass(frozen=True)
+class DeviceFacts:
+    """Everything that a compiled engine depends on besides the model; nothing in it changes with the power mode."""
+
+    architecture: str
+    device: str
+    """What computes, by its own name: the Jetson module, else the graphics card; the processor for its providers."""
+    l4t: str | None
+    """Jetson Linux release, e.g. `36.4.3`."""
+    onnxruntime: str
+    provider_version: str | None
+    """Version of TensorRT or OpenVINO; None if it does not say."""
+
+    def to_dict(self) -> dict[str, str | None]:
+        """Plain JSON form."""
+        return asdict(self)
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed Python package, None without it."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def available_providers() -> list[str]:
+    """Execution providers that this ONNX Runtime has."""
+    return list(ort.get_available_providers())
+
+
+def read_device(
+    provider: str, root: Path = Path("/"), version_of: Callable[[str], str | None] = package_version
+) -> DeviceFacts:
+    """Facts of the device below `root` that matter to a provider's engines."""
+    return DeviceFacts(
+        architecture=platform.machine(),
+        device=_device(provider, root) or "unknown",
+        l4t=l4t_release(_text(root / "etc/nv_tegra_release")),
+        onnxruntime=str(ort.__version__),
+        provider_version=_provider_version(provider, root, version_of),
+    )
+
+
+def l4t_release(text: str) -> str | None:
+    """`36.4.3` from the first line of `/etc/nv_tegra_release`; None if it is not such a file."""
+    found = re.search(r"R(\d+) \(release\), REVISION: ([\d.]+)", text)
+    return f"{found[1]}.{found[2]}" if found else None
+
+
+def _device(provider: str, root: Path) -> str | None:
+    if provider in (TENSORRT, CUDA):
+        return _board(root) or _graphics_card(root)
+    return _processor(root)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _board(root: Path) -> str | None:
+    """Compatible string of a Jetson module, e.g. `nvidia,p3767-0000`."""
+    names = _text(root / "proc/device-tree/compatible").split("\0")
+    return next((name for name in names if re.fullmatch(r"nvidia,p\d{4}-\d{4}.*", name)), None)
+
+
+def _graphics_card(root: Path) -> str | None:
+    cards = sorted((root / "proc/driver/nvidia/gpus").glob("*/information"))
+    models = [re.search(r"^Model:\s*(.+?)\s*$", _text(card), re.MULTILINE) for card in cards]
+    return next((model[1] for model in models if model), None)
+
+
+def _processor(root: Path) -> str | None:
+    found = re.search(r"^(?:model name|Model|CPU part)\s*:\s*(.+?)\s*$", _text(root / "proc/cpuinfo"), re.MULTILINE)
+    return found[1] if found else None
+
+
+def _provider_version(provider: str, root: Path, version_of: Callable[[str], str | None]) -> str | None:
+    for package in _PACKAGES.get(provider, ()):
+        version = version_of(package)
+        if version is not None:
+            return version
+    pattern = _LIBRARIES.get(provider)
+    if pattern is None:
+        return None
+    libraries = [path.name for folder in _LIBRARY_FOLDERS for path in (root / folder).glob(pattern)]
+    versions = [name.partition(".so.")[2] for name in libraries]
+    # libnvinfer.so.10 is a link to libnvinfer.so.10.3.0: the longest says most.
+    return max(versions, key=len, default=None)
+
+
+def power_modes(conf: str) -> Mapping[str, int]:
+    """Power modes by name from the text of an `nvpmodel` configuration."""
+    found = re.findall(r"<\s*POWER_MODEL\s+ID=(\d+)\s+NAME=(\S+)\s*>", conf)
+    return {name: int(number) for number, name in found}
+
+
+def current_power_mode(query: str) -> str | None:
+    """Name of the mode that `nvpmodel -q` reports; None if its text names none."""
+    found = re.search(r"^\s*NV Power Mode:\s*(\S+)\s*$", query, re.MULTILINE)
+    return found[1] if found else None
+
+
+def check_power_mode(wanted: str, *, conf: str, query: str) -> None:
+    """Raise DeviceError unless the board has a mode of that name and is in it; ids differ between modules."""
+    modes, current = power_modes(conf), current_power_mode(query)
+    if wanted not in modes:
+        raise DeviceError(
+            f"power mode {wanted!r} is not on this board; it has {', '.join(modes) or 'none'}: export for one of these "
+            f"with --set power.mode=NAME"
+        )
+    if current != wanted:
+        raise DeviceError(
+            f"power mode is {current or 'not reported'}, the plan was made for {wanted}: "
+            f"sudo nvpmodel -m {modes[wanted]}"
+        )
