@@ -281,15 +281,17 @@ def spread(trajectories: Floats) -> tuple[float, float]:
 def cosine(a: Floats, b: Floats) -> float:
     """Cosine of two arrays as vectors; 1 only for equal ones when a norm is zero."""
     x, y = a.ravel().astype(np.float64), b.ravel().astype(np.float64)
-    norm = float(np.linalg.norm(x) * np.linalg.norm(y))
-    return float(x @ y) / norm if norm > 0 else float(np.array_equal(x, y))
+    # Plain sums: a threaded BLAS would add in an order that depends on the machine, and on a busy one takes longer.
+    norm = math.sqrt(float((x * x).sum()) * float((y * y).sum()))
+    return float((x * y).sum()) / norm if norm > 0 else float(np.array_equal(x, y))
 
 
 def relative_error(reference: Floats, found: Floats) -> float:
     """‖found − reference‖ / ‖reference‖; raises TaskErrorError for another shape or values that are not finite."""
     if reference.shape != found.shape or not np.isfinite(found).all():
         raise TaskErrorError(f"semantic state is not finite or {list(found.shape)}, expected {list(reference.shape)}")
-    return float(np.linalg.norm((found - reference).ravel()) / max(float(np.linalg.norm(reference.ravel())), 1e-30))
+    squares = [float((x.astype(np.float64) ** 2).sum()) for x in (found - reference, reference)]
+    return math.sqrt(squares[0] / max(squares[1], 1e-60))
 
 
 def _agreement(a: Sequence[int], b: Sequence[int]) -> float:
