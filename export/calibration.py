@@ -155,11 +155,15 @@ def _check_keys(content: object, keys: set[str], where: str) -> None:
 def _clip(item: Any, contents: dict[str, bytes], where: str) -> Clip:
     _check_keys(item, {"name", "instruction", "frames"}, where)
     frames = []
+    if not isinstance(item["frames"], list):
+        raise CalibrationError(f"{where}: frames of a clip must be an array")
     for row in item["frames"]:
         _check_keys(row, {"file", "stamp_s", "pose", "velocity"}, where)
         file, pose, velocity = row["file"], row["pose"], row["velocity"]
         if file not in contents:
             raise CalibrationError(f"{where}: {file} is missing")
+        if not isinstance(pose, list) or not isinstance(velocity, list):
+            raise CalibrationError(f"{where}: {file}: pose and velocity must be arrays")
         numbers = [row["stamp_s"], *pose, *velocity]
         finite = all(isinstance(v, int | float) and math.isfinite(v) for v in numbers)
         if len(pose) != 3 or len(velocity) != 3 or not finite:
