@@ -173,6 +173,12 @@ def _hashes(folder: Path) -> dict[str, str]:
     return hashes
 
 
+def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    """What changes when a compiled file is written again, even with the same bytes."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix not in (TIMING_SUFFIX, ".profile"))
+    return {path.relative_to(folder).as_posix(): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+
 def build(artifacts: Artifacts, directory: Path, say: Progress, machine: Machine | None = None) -> dict[str, Any]:
     """Build every engine that is missing or another device's; returns per graph whether it was built and how long.
 
@@ -233,13 +239,16 @@ def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machin
         partial.rename(final)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+    stamps = _stamps(final)
     _open_and_run(artifacts, name, final, machine)
     after = _hashes(final)
-    changed = sorted(file for file in {*built, *after} if built.get(file) != after.get(file))
+    # Compiling again may give the very same bytes: the time of writing tells.
+    rewritten = {file for file, stamp in _stamps(final).items() if stamps.get(file) != stamp}
+    changed = sorted(rewritten | {file for file in {*built, *after} if built.get(file) != after.get(file)})
     if changed:
         raise EngineError(
-            f"{name}: {changed[0]} was built anew when the engine was opened again: it would be at run time too; "
-            f"check the graph's profiles in its target"
+            f"{name}: {changed[0]} was built anew when the engine was opened again: it would be at run time too, so "
+            f"{artifacts.graphs[name].session.provider} cannot be used for this graph here"
         )
     return after
 
