@@ -267,7 +267,7 @@ def test_a_timing_cache_may_change_later(orin: Artifacts, engines: Path) -> None
 def test_an_engine_that_would_be_built_anew_each_time_is_refused(
     orin: Artifacts, engines: Path, same_bytes: bool
 ) -> None:
-    """OpenVINO's provider 1.24.1 does just that on a processor: it writes its cache at every opening, and reads none."""
+    """OpenVINO's provider 1.24.1 does that on a processor: it writes its cache at every opening and reads none."""
     with pytest.raises(EngineError, match="was built anew when the engine was opened again"):
         build(orin, engines, silent, FakeTensorRt(ignores_cache=True, same_bytes=same_bytes).machine())
 
