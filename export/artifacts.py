@@ -101,6 +101,9 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
     pipeline.task_reference()
     for name in job.target.graph_names:
         pipeline.reference(name)
+    made = plan(job.target, job.config, {name: pipeline.precision(name)[0] for name in job.target.graph_names})
+    if job.target.runtime.enforce_plan:
+        made.require()
     graphs: dict[str, Any] = {}
     for name in job.target.graph_names:
         files = pipeline.graph(name)
@@ -108,9 +111,6 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
             # Copied, never linked: what happens to the output must not reach the cache.
             shutil.copyfile(path, directory / path.name)
         graphs[name] = _graph_entry(pipeline, name, [directory / path.name for path in files])
-    made = plan(job.target, job.config, {name: pipeline.precision(name)[0] for name in job.target.graph_names})
-    if job.target.runtime.enforce_plan:
-        made.require()
     manifest: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "target": job.target.name,
@@ -130,7 +130,9 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
     for name, result in check_directory(pipeline, directory, progress).items():
         graphs[name]["parity"] = result.to_dict()
     with progress.stage("plan and report"):
-        report = {**{k: v for k, v in manifest.items() if k != "files"}, "coverage": weights.coverage}
+        decisions = {name: pipeline.decision(name) for name in job.target.graph_names}
+        found = {"coverage": weights.coverage, "sensitivity": {k: v for k, v in decisions.items() if v is not None}}
+        report = {**{k: v for k, v in manifest.items() if k != "files"}, **found}
         _write_json(directory / REPORT_JSON, report)
         (directory / REPORT_HTML).write_text(report_html(report), encoding="utf-8")
         _write_manifest(directory, manifest)

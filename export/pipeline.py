@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,9 @@ from export.job import Job
 from export.metrics import ParityError, ParityResult
 from export.model.weights import weights_sha256
 from export.parity import references
-from export.precision import Precision
+from export.precision import PRECISIONS, Precision
 from export.progress import Progress, Stage
+from export.sensitivity import Limits, Search, search_samples
 from export.stages import ENTRY_NAME, StageCache, file_sha256, stage_key
 from export.task_error import StageOutputs, TaskErrorError, run_stages
 from export.task_samples import SampleSet, is_large, samples_from
@@ -43,17 +45,29 @@ WEIGHTS_FILE = "weights.json"
 TOKENIZER_FILE = "tokenizer.json"
 SAMPLES_FILE = "samples.safetensors"
 OUTPUTS_FILE = "outputs.safetensors"
+DECISION_FILE = "decision.json"
 
 EXPECTED_S = {
     "weights": (0.3, 30.0),
     "task reference": (3.0, 120.0),
-    "precision": (1.0, 300.0),
+    "precision": (1.0, 150.0),
     "reference": (0.5, 20.0),
     "graph": (0.5, 15.0),
     "gate": (2.0, 45.0),
     "plan and report": (0.2, 1.0),
 }
 """Seconds to expect of each kind of stage before it was ever measured here: for a small and for a large model."""
+
+
+COMPUTING = ("vision_encoder", "language_model.prefill")
+"""Graphs whose time goes into products rather than into reading weights."""
+
+
+def with_exceptions(chosen: Precision, asked: Precision) -> Precision:
+    """What the search chose, and the exceptions that the target asks for where they are more exact than that."""
+    order = PRECISIONS.index
+    exact = tuple((layer, kind) for layer, kind in asked.overrides if order(kind) < order(chosen.default))
+    return Precision(chosen.default, (*chosen.overrides, *exact))
 
 
 def machine_name() -> str:
@@ -70,8 +84,13 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
     """All stages in their order (without those that write graphs), with the seconds they took last time or usually."""
     column = int(is_large(job.config))
     names = ["weights", "task reference"]
-    kinds = ("reference", "graph", "gate") if graphs else ("reference", "gate")
-    names += [f"{kind} {graph}" for kind in kinds for graph in job.target.graph_names]
+    names += [f"reference {graph}" for graph in job.target.graph_names]
+    if graphs:
+        searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
+        names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
+    names += [
+        f"{kind} {graph}" for kind in (("graph", "gate") if graphs else ("gate",)) for graph in job.target.graph_names
+    ]
     names += ["plan and report"] if graphs else []
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
@@ -107,18 +126,15 @@ class Pipeline:
                     watch.from_cache()
         return self._entries[key]
 
-    @cached_property
-    def _fingerprint(self) -> dict[str, Any]:
-        return self.job.weights.fingerprint()
-
     def weights(self) -> WeightsRecord:
         """Hash and origin of the weights; raises CheckpointError."""
-        return WeightsRecord(**json.loads((self._weights_entry() / WEIGHTS_FILE).read_text(encoding="utf-8")))
+        return WeightsRecord(**json.loads((self._weights_entry / WEIGHTS_FILE).read_text(encoding="utf-8")))
 
     def tokenizer(self) -> bytes:
         """tokenizer.json that goes with the weights."""
-        return (self._weights_entry() / TOKENIZER_FILE).read_bytes()
+        return (self._weights_entry / TOKENIZER_FILE).read_bytes()
 
+    @cached_property
     def _weights_entry(self) -> Path:
         def build(directory: Path) -> None:
             loaded = self.job.weights.get()
@@ -131,11 +147,11 @@ class Pipeline:
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
             (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded))
 
-        return self._stage("weights", stage_key("weights", self._fingerprint), build)
+        return self._stage("weights", stage_key("weights", self.job.weights.fingerprint()), build)
 
     def _parts(self, **more: Any) -> dict[str, Any]:
-        """Parts of every key that depends on the network: its weights (with what they mean) and the rest."""
-        return {"weights": self._fingerprint, **more}
+        """Parts of every key that depends on the network: its weights, wherever they came from, and the rest."""
+        return {"weights": self.weights().sha256, "config": self.job.config.to_dict(), **more}
 
     # ---- what PyTorch gives
 
@@ -158,14 +174,16 @@ class Pipeline:
 
     def _task_key(self) -> str:
         offsets = list(self.job.target.runtime.frame_offsets_s)
-        return stage_key("task", self._parts(calibration=self.job.calibration.sha256, frame_offsets_s=offsets))
+        calibration, tokenizer = self.job.calibration.sha256, hashlib.sha256(self.tokenizer()).hexdigest()
+        return stage_key("task", self._parts(calibration=calibration, tokenizer=tokenizer, frame_offsets_s=offsets))
 
     def task_reference(self) -> Path:
         """PyTorch's plans in those situations."""
 
         def build(directory: Path) -> None:
             stages = TorchStages(self.job.weights.get().model)
-            save_outputs(run_stages(stages, self.samples), directory / OUTPUTS_FILE)
+            outputs = run_stages(stages, self.samples, progress=self._progress.detail)
+            save_outputs(outputs, directory / OUTPUTS_FILE)
 
         return self._stage("task reference", self._task_key(), build) / OUTPUTS_FILE
 
@@ -175,9 +193,61 @@ class Pipeline:
 
     # ---- what ships
 
+    def decision(self, graph: str) -> dict[str, Any] | None:
+        """What the sensitivity search chose for a graph and why; None where the target leaves no choice."""
+        policy = self.job.target.graphs[graph]
+        if len(policy.candidates) < 2:
+            return None
+        task, top1 = self.job.target.task_gate, self.job.target.gate(graph).top1
+        limits = Limits(
+            # The search sees few situations: it has to stay clear of the gate, which sees all of them.
+            waypoint_cm=task.warn_waypoint_cm or task.waypoint_cm,
+            heading_deg=task.warn_heading_deg or task.heading_deg,
+            speed_mps=task.speed_mps,
+            turn_radps=task.turn_radps,
+            top1=top1,
+        )
+        points = [point for point in self.job.target.measured if point.model == self.job.config.name]
+        key = stage_key(
+            "precision",
+            {
+                "task": self._task_key(),
+                "graph": graph,
+                "candidates": list(policy.candidates),
+                "form": policy.form,
+                "limits": asdict(limits),
+                "measured": [asdict(point) for point in points],
+            },
+        )
+
+        def build(directory: Path) -> None:
+            decision = self._search.choose(
+                graph,
+                policy.candidates,
+                limits,
+                measured=points,
+                activations=policy.form == "fused",
+                speed_first=graph in COMPUTING,
+            )
+            (directory / DECISION_FILE).write_text(json.dumps(decision.to_dict(), allow_nan=False), encoding="utf-8")
+
+        entry = self._stage(f"precision {graph}", key, build)
+        content: dict[str, Any] = json.loads((entry / DECISION_FILE).read_text(encoding="utf-8"))
+        return content
+
+    @cached_property
+    def _search(self) -> Search:
+        loaded = self.job.weights.get()
+        samples = search_samples(self.job.calibration, self.job.config, self.job.target.runtime, self.tokenizer())
+        return Search(loaded.model, samples, trained=loaded.info.trained, progress=self._progress.detail)
+
     def precision(self, graph: str) -> tuple[Precision, str]:
         """Precision of a graph's layers and the reason for it."""
-        return self.job.target.precision(graph), f"target {self.job.target.name} asks for it"
+        decision, asked = self.decision(graph), self.job.target.precision(graph)
+        if decision is None:
+            return asked, f"target {self.job.target.name} leaves no other choice"
+        chosen = Precision.from_dict(decision["precision"])
+        return with_exceptions(chosen, asked), str(decision["reason"])
 
     def graph(self, graph: str) -> list[Path]:
         """The graph's files."""

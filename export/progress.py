@@ -17,6 +17,7 @@ from rich.spinner import Spinner
 from rich.text import Text
 
 _REDRAWS_PER_S = 4
+_PLAIN_PERIOD_S = 15.0
 _RATE_LIMITS = (0.05, 20.0)
 
 
@@ -67,6 +68,8 @@ class Progress:
         self._live: Live | None = None
         self._started_ns = self._stage_ns = time.monotonic_ns()
         self._index = -1
+        self._detail = ""
+        self._said_ns = 0
         self._built_s: dict[str, float] = {}
 
     def __enter__(self) -> Progress:
@@ -97,12 +100,21 @@ class Progress:
         """One line of its own, above the live one."""
         self._console.print(f"{self._command}: {escape(line)}")
 
+    def detail(self, text: str) -> None:
+        """What the stage is at: part of the live line, else a line of its own now and then."""
+        self._detail = text
+        now_ns = time.monotonic_ns()
+        if self._live is None and (now_ns - self._said_ns) / 1e9 >= _PLAIN_PERIOD_S:
+            self._said_ns = now_ns
+            self.say(self.line())
+
     @contextmanager
     def stage(self, name: str) -> Iterator[StageWatch]:
         """Around one stage; stages that were announced before it and never began count as done."""
         names = [stage.name for stage in self._stages]
         self._index = names.index(name)
-        self._stage_ns = time.monotonic_ns()
+        self._stage_ns = self._said_ns = time.monotonic_ns()
+        self._detail = ""
         watch = StageWatch()
         if self._live is None:
             self.say(self.line())
@@ -133,7 +145,7 @@ class Progress:
         return (
             f"[{self._index + 1}/{len(self._stages)}] {self._stages[self._index].name} · "
             f"{duration(elapsed_s)} so far, about {duration(self.remaining_s())} to go · "
-            f"peak memory {peak_rss_bytes() / 1e9:.1f} GB"
+            f"peak memory {peak_rss_bytes() / 1e9:.1f} GB{' · ' if self._detail else ''}{self._detail}"
         )
 
     def _renderable(self, spinner: Spinner) -> Spinner:

@@ -41,6 +41,16 @@ def test_every_stage_gets_a_line_when_it_begins_and_one_when_it_is_done(clock: l
     assert lines[3] == "edge-export: [2/3] graph: done, 1.0 s"
 
 
+def test_a_long_stage_says_now_and_then_what_it_is_at(clock: list[int]) -> None:
+    out = io.StringIO()
+    with Progress("edge-export", STAGES, out) as progress, progress.stage("graph"):
+        for step in range(60):
+            after(clock, 1)
+            progress.detail(f"step {step}")
+    details = [line for line in out.getvalue().splitlines() if "step" in line]
+    assert [line.rpartition(" · ")[2] for line in details] == ["step 14", "step 29", "step 44", "step 59"]
+
+
 def test_nothing_is_written_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("edge-export", STAGES) as progress, progress.stage("weights"):
         progress.say("a note")
