@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-PRECISIONS = ("fp32", "fp16", "int8", "int8-b128", "int8-b32", "int4-b128", "int4-b32")
+PRECISIONS = ("fp32", "fp16", "int8-b32", "int8-b128", "int8", "int4-b32", "int4-b128")
 """From the most to the least exact; `int8` also rounds activations, `-bN` are weight-only in blocks of N."""
 
 
