@@ -29,8 +29,10 @@ from export.target import Target
 from export.target_types import KV_DTYPES, MEASURED, MODELLED, PowerMode
 from export.timing import Estimate, StageTime, Work, stage_calls, stage_graph, stage_time, total
 
-TEXT_TOKENS = 76
-"""Tokens of a prompt beside its frames: chat template, instruction and past motion (1,100 in all at paper size)."""
+TEXT_TOKENS = {True: 110, False: 134}
+"""Tokens of a prompt beside its frames (chat template, an instruction of 10 words, past motion), counted with Qwen's
+tokenizer (large vocabulary) and with the small model's."""
+LARGE_VOCABULARY = 100_000
 GIB = 1 << 30
 TICK_STAGES = ("vision_encoder", "action_expert")
 GENERATION_STAGES = ("prefill", "decode", "semantic_context")
@@ -161,7 +163,7 @@ def plan(
     precisions: Mapping[str, Precision] | None = None,
     *,
     tokens: int | None = None,
-    text_tokens: int = TEXT_TOKENS,
+    text_tokens: int | None = None,
 ) -> Plan:
     """Size both threads of a model for a target (already `for_model`); pure: the same arguments give the same plan.
 
@@ -173,6 +175,8 @@ def plan(
     if unknown:
         raise PlanError(f"plan: no graph {unknown[0]!r}; expected some of {', '.join(target.graph_names)}")
     chosen = {name: wanted.get(name, target.precision(name)) for name in target.graph_names}
+    if text_tokens is None:
+        text_tokens = TEXT_TOKENS[config.language.vocab >= LARGE_VOCABULARY]
     prompt = len(target.runtime.frame_offsets_s) * config.frame_tokens + text_tokens
     room = config.language.max_context - prompt
     if text_tokens < 1 or (tokens is not None and not 0 <= tokens <= max(room, 0)):

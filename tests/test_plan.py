@@ -284,7 +284,7 @@ def test_the_model_of_a_cpu_comes_near_what_was_measured_there(
     assert each == pytest.approx(measured_ms, rel=tolerance)
 
 
-def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_at_most() -> None:
+def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_and_a_ninth() -> None:
     """Modelled for TensorRT fp16 at our power modes, over the paper's PyTorch at modes it does not give:
     control 0.65 on Orin NX and 0.89 on the RTX 4060."""
     ratios = {name: planned(name).tick_alone.ms / PAPER_MS[name][0] for name in PAPER_MS}
@@ -294,18 +294,18 @@ def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_at_m
 def test_against_the_paper_a_generation_alone_is_far_shorter() -> None:
     """0.12 of the paper's reasoning time on Orin NX, 0.085 on the RTX 4060, with 48 new tokens: the paper does not say
     how many it generates, and an eager PyTorch decoder is bound by launches, which a roofline does not see. Under the
-    power budget and beside control it is 0.54 and 0.36: too good to be believed before it is measured."""
+    power budget and beside control it is 0.54 and 0.37: too good to be believed before it is measured."""
     alone = {name: planned(name).generation_alone.ms / PAPER_MS[name][1] for name in PAPER_MS}
     assert alone == {"orin": pytest.approx(0.12, abs=0.005), "rtx4060": pytest.approx(0.085, abs=0.005)}
     beside = {name: planned(name).generation.ms / PAPER_MS[name][1] for name in PAPER_MS}
-    assert beside == {"orin": pytest.approx(0.54, abs=0.01), "rtx4060": pytest.approx(0.36, abs=0.01)}
+    assert beside == {"orin": pytest.approx(0.54, abs=0.01), "rtx4060": pytest.approx(0.37, abs=0.01)}
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ({"tokens": 5000}, "the model has room for 436"),
-        ({"tokens": -1}, "the model has room for 436"),
+        ({"tokens": 5000}, "the model has room for 402"),
+        ({"tokens": -1}, "the model has room for 402"),
         ({"text_tokens": 5000}, "the prompt of 6024 tokens exceeds the context of 1536"),
         ({"precisions": {"vision": FP32}}, "no graph 'vision'"),
     ],
