@@ -9,12 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 import pytest
 
 from edge.graph import Graph
 from edge.language import LanguageModel
 from edge.manifest import ArtifactError, load_artifacts
+from edge.policy import Policy
+from export.cli import main
 
 
 @pytest.fixture
@@ -78,7 +81,7 @@ def test_a_listed_path_that_leaves_the_directory_is_refused(copy: Path, name: st
         load_artifacts(copy)
 
 
-@pytest.mark.parametrize("version", [0, 2, "1", None])
+@pytest.mark.parametrize("version", [0, 1, 3, "2", None])
 def test_another_schema_version_is_refused(copy: Path, version: object) -> None:
     edit(copy, lambda m: m.update(schema_version=version))
     with pytest.raises(ArtifactError, match="schema version"):
@@ -174,3 +177,66 @@ def test_a_file_that_is_no_graph_is_refused_when_opened(copy: Path) -> None:
     edit(copy, lambda m: m["files"].update({"action_expert.onnx": entry}))
     with pytest.raises(ArtifactError, match="cannot open"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`nano` with its encoder's weights in a data file, as large graphs have them."""
+    out = tmp_path_factory.mktemp("mapped") / "nano"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("export.graphs.build.SINGLE_FILE_BYTES", 5_000_000)
+        assert main(["--target", "cpu", "--model", "nano", "--no-cache", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def mapped_copy(mapped: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(mapped, tmp_path / "mapped"))
+
+
+DATA = "vision_encoder.onnx.data"
+
+
+def test_weights_in_a_data_file_compute_the_same(mapped: Path, artifacts_dir: Path) -> None:
+    assert (mapped / DATA).exists() and not (artifacts_dir / DATA).exists()
+    frame = np.random.default_rng(0).integers(0, 256, (1, 128, 128, 3)).astype(np.uint8)
+    inside, outside = (Policy(load_artifacts(d)).encode(frame) for d in (artifacts_dir, mapped))
+    np.testing.assert_array_equal(inside, outside)
+
+
+def test_one_flipped_bit_in_a_data_file_is_refused_by_name(mapped_copy: Path) -> None:
+    data = bytearray((mapped_copy / DATA).read_bytes())
+    data[len(data) // 2] ^= 1
+    (mapped_copy / DATA).write_bytes(data)
+    with pytest.raises(ArtifactError, match=rf"{DATA}: sha256"):
+        load_artifacts(mapped_copy)
+
+
+def test_a_data_file_that_was_replaced_after_its_hash_was_checked_is_refused(mapped_copy: Path) -> None:
+    artifacts = load_artifacts(mapped_copy)
+    other = mapped_copy.parent / "other"
+    other.write_bytes((mapped_copy / DATA).read_bytes())
+    other.replace(mapped_copy / DATA)
+    with pytest.raises(ArtifactError, match=rf"{DATA}: changed while"):
+        Graph(artifacts, "vision_encoder", threads=1)
+
+
+def test_a_data_file_that_the_manifest_does_not_list_is_refused(mapped_copy: Path) -> None:
+    edit(mapped_copy, lambda m: m["files"].pop(DATA))
+    with pytest.raises(ArtifactError, match="not listed"):
+        load_artifacts(mapped_copy)
+
+
+@pytest.mark.parametrize(
+    "session", [None, {}, {"provider": 1, "options": {}, "threads": None, "engine": False}], ids=str
+)
+def test_a_graph_without_a_whole_session_entry_is_refused(copy: Path, session: object) -> None:
+    edit(copy, lambda m: m["graphs"]["vision_encoder"].update(session=session))
+    with pytest.raises(ArtifactError, match="session"):
+        load_artifacts(copy)
+
+
+def test_a_provider_that_this_machine_lacks_is_refused_by_name(copy: Path) -> None:
+    edit(copy, lambda m: m["graphs"]["vision_encoder"]["session"].update(provider="QNNExecutionProvider"))
+    with pytest.raises(ArtifactError, match="made for QNNExecutionProvider"):
+        Graph(load_artifacts(copy), "vision_encoder", threads=1)
