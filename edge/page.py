@@ -42,6 +42,7 @@ figcaption { color: var(--muted); font-size: 0.88rem; margin-top: 6px; }
 table { border-collapse: collapse; width: 100%; background: var(--card); font-size: 0.92rem; }
 th, td { text-align: left; padding: 7px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; background: #eef1f4; }
+th.number { text-align: right; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .pass { color: var(--good); font-weight: 600; } .fail { color: var(--bad); font-weight: 600; }
 @media (max-width: 640px) {
@@ -100,7 +101,8 @@ def tiles(items: Iterable[tuple[str, str]]) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: frozenset[int] = frozenset()) -> str:
     """A table; cells are HTML already. Columns in `numeric` are set right-aligned."""
     lines = ['<div class="scroll"><table><thead><tr>']
-    lines += [f"<th>{html.escape(cell)}</th>" for cell in head]
+    marks = [' class="number"' if i in numeric else "" for i in range(len(head))]
+    lines += [f"<th{mark}>{html.escape(cell)}</th>" for mark, cell in zip(marks, head, strict=True)]
     lines.append("</tr></thead><tbody>")
     for row in rows:
         cells = (f'<td class="number">{c}</td>' if i in numeric else f"<td>{c}</td>" for i, c in enumerate(row))
@@ -116,5 +118,5 @@ def document(title: str, body: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
         "style-src 'unsafe-inline'\">"
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\n</main></body></html>\n"
+        f"<title>{text_html(title)}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\n</main></body></html>\n"
     )

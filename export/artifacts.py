@@ -157,7 +157,8 @@ def _graph_entry(pipeline: Pipeline, name: str, files: list[Path]) -> dict[str, 
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+    # Not sorted: of a precision's exceptions the first that matches wins.
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:

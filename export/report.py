@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from edge.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
 from edge.page import document, table, text_html, tiles
-from export.report_plots import Line, line_plot
+from export.report_plots import Dot, Line, dot_plot, line_plot
 
 Report = Mapping[str, Any]
 
+GRAPH_ORDER = ("vision_encoder", *LANGUAGE_WHOLE, *LANGUAGE_PAIR, "semantic_context", "action_expert")
+LAYERS_SHOWN = 16
 MARKS = {"PASS": "pass", "WARN": "warn", "FAIL": "fail"}
 
 
 def report_html(report: Report) -> str:
     """The whole page; same report → same bytes."""
+    order = [name for name in GRAPH_ORDER if name in report["graphs"]]
+    report = {**report, "graphs": {name: report["graphs"][name] for name in order}}
     target = report["provenance"]["target"]
     title = f"{report['model']['name']} for {report['target']}"
     parts = [
@@ -73,7 +78,7 @@ def _untrained_notice(report: Report) -> str:
         return ""
     return (
         '<p class="notice"><b>The weights are untrained</b> (initial weights): a robot with them moves, it does not '
-        "navigate. Sizes, times and exactness are those of the trained model's graphs.</p>"
+        "navigate. Sizes and times are those of a trained model; what rounding does to one has to be measured anew.</p>"
     )
 
 
@@ -102,7 +107,7 @@ def _graph_table(report: Report) -> str:
     rows = []
     for name, graph in report["graphs"].items():
         session = graph["session"]
-        threads = "" if session["threads"] is None else f", {session['threads']} threads"
+        threads = "" if session["threads"] is None else f", threads: {session['threads']}"
         rows.append(
             (
                 text_html(name),
@@ -130,8 +135,8 @@ def _gate_table(report: Report) -> str:
                 _held(f"{parity['max_abs']:.2g}", f"≤ {gate['max_abs']:g}"),
                 _held(f"{parity['min_difference']:.2g}", f"≥ {gate['min_difference']:g}"),
                 "–" if parity["top1"] is None else _held(f"{100 * parity['top1']:.1f} %", _share(gate["top1"])),
-                "–" if task is None else f"{task['waypoint_cm']:.2f} cm",
-                "–" if task is None else f"{task['heading_deg']:.2f}°",
+                "–" if task is None else f"{_small(task['waypoint_cm'])} cm",
+                "–" if task is None else f"{_small(task['heading_deg'])}°",
                 text_html(parity["provider"].removesuffix("ExecutionProvider")),
             )
         )
@@ -147,6 +152,10 @@ def _gate_table(report: Report) -> str:
 
 def _mark(verdict: str) -> str:
     return f'<span class="{MARKS[verdict]}">{verdict}</span>'
+
+
+def _small(value: float) -> str:
+    return "&lt; 0.01" if value < 0.01 else f"{value:.2f}"
 
 
 def _held(value: str, limit: str) -> str:
@@ -167,15 +176,14 @@ def _warnings(report: Report) -> str:
 
 
 def _reasons(report: Report) -> str:
-    rows = []
+    lines = []
     for name, graph in report["graphs"].items():
         precision = graph["precision"]
-        layers = [f"{pattern}: {kind}" for pattern, kind in precision["overrides"].items()]
-        exceptions = "<br>".join(text_html(layer) for layer in layers) or "–"
-        rows.append(
-            (text_html(name), text_html(precision["default"]), exceptions, text_html(graph["precision_reason"]))
-        )
-    return table(("graph", "precision", "exceptions", "reason"), rows)
+        exceptions = ", ".join(f"{pattern} {kind}" for pattern, kind in precision["overrides"].items())
+        but = f", but {exceptions}" if exceptions else ""
+        chosen = text_html(f"{name}: {precision['default']}{but}")
+        lines.append(f"<p><b>{chosen}</b><br>{text_html(graph['precision_reason'], limit=2000)}</p>")
+    return "".join(lines)
 
 
 def _gate(report: Report, name: str) -> Mapping[str, Any]:
@@ -208,7 +216,24 @@ def _sensitivity(report: Report) -> str:
 
 
 def _layer_plots(report: Report) -> list[tuple[str, str]]:
-    return []
+    """For every graph that was searched: its most sensitive groups of layers, each rounded alone."""
+    plots = []
+    for name, decision in report["sensitivity"].items():
+        rows = [row for row in decision["table"] if row["group"] != "*"]
+        if not rows:
+            continue
+        raised = set(decision["precision"]["overrides"])
+        dots = [Dot(row["group"], row["waypoint_cm"], row["group"] in raised) for row in rows[:LAYERS_SHOWN]]
+        more = f" of {len(rows)}" if len(rows) > LAYERS_SHOWN else ""
+        kept = ", filled: kept more exact" if raised else ""
+        plots.append(
+            (
+                dot_plot(dots, "worst waypoint error in cm", _gate(report, "task")["waypoint_cm"]),
+                f"{name}: the {len(dots)}{more} most sensitive groups of layers, each rounded alone to "
+                f"{rows[0]['precision']}{kept}. Measured on the PyTorch model.",
+            )
+        )
+    return plots
 
 
 PLAN_ROWS = (
@@ -254,9 +279,11 @@ def _plan(plan: Mapping[str, Any]) -> str:
         for key, what, unit in PLAN_ROWS
         if plan[key] is not None
     ]
-    rows += [
-        (f"memory: {text_html(name)}", size_text(count)) for name, count in plan["memory"].items() if count is not None
-    ]
+    memory = plan["memory"]
+    parts = " + ".join(
+        f"{name} {size_text(memory[name])}" for name in ("weights", "caches", "activations", "workspace")
+    )
+    rows.append((f"memory: {parts}", f"{size_text(plan['memory_bytes'])} of {size_text(memory['available'])}"))
     stages = [
         (
             text_html(name),

@@ -65,7 +65,10 @@ def dot_plot(dots: Sequence[Dot], axis: str, limit: float | None = None) -> str:
 
 
 def line_plot(lines: Sequence[Line], x_axis: str, y_axis: str, limit: float | None = None) -> str:
-    """Lines from zero up, with their names above the plot; empty without points."""
+    """Lines from zero up, with their names above the plot; empty without points.
+
+    A limit far above all lines is only named: drawn to scale it would press them onto the axis.
+    """
     points = [point for line in lines for point in line.points]
     if not points:
         return ""
@@ -73,7 +76,9 @@ def line_plot(lines: Sequence[Line], x_axis: str, y_axis: str, limit: float | No
     top = 24 + 17 * len(lines)
     bottom = top + height
     x_high = max(max(x for x, _ in points), 1e-9)
-    y_high = _round_up(max([y for _, y in points] + [limit or 0.0]) or 1.0)
+    largest = max(y for _, y in points)
+    near = limit is not None and largest > 0 and limit <= 2 * largest
+    y_high = _round_up(max(largest, limit if near and limit else 0.0) or 1.0)
 
     def at(x: float, y: float) -> tuple[float, float]:
         return left + x / x_high * (WIDTH - left - right), bottom - min(y / y_high, 1.0) * height
@@ -87,9 +92,10 @@ def line_plot(lines: Sequence[Line], x_axis: str, y_axis: str, limit: float | No
     for x_value in sorted({x for x, _ in points}):
         parts.append(_text(at(x_value, 0)[0], bottom + 15, f"{x_value:g}", MUTED, "middle"))
     if limit is not None:
-        y = at(0, limit)[1]
-        parts.append(_line(left, y, WIDTH - right, y, LIMIT, "5 3"))
-        parts.append(_text(WIDTH - right, y - 4, f"gate: {limit:g}", LIMIT, "end"))
+        y = at(0, limit)[1] if near else top
+        beyond = "" if near else ", off the scale"
+        parts += [_line(left, y, WIDTH - right, y, LIMIT, "5 3")] if near else []
+        parts.append(_text(WIDTH - right, y - 4, f"gate: {limit:g}{beyond}", LIMIT, "end"))
     for index, line in enumerate(lines):
         colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (at(*point) for point in line.points))
