@@ -22,40 +22,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from export.cost import context_numbers
+from export.memory import GENERATION_STAGES, GIB, TICK_STAGES, Memory, graph_weights, memory_of
 from export.model.config import TicVlaConfig
 from export.precision import Precision
 from export.target import Target
-from export.target_types import KV_DTYPES, MEASURED, MODELLED, PowerMode
-from export.timing import Estimate, StageTime, Work, stage_calls, stage_graph, stage_time, total
+from export.target_types import MEASURED, MODELLED, PowerMode
+from export.timing import Estimate, StageTime, Work, stage_graph, stage_time, total
 
 TEXT_TOKENS = {True: 110, False: 134}
 """Tokens of a prompt beside its frames (chat template, an instruction of 10 words, past motion), counted with Qwen's
 tokenizer (large vocabulary) and with the small model's."""
 LARGE_VOCABULARY = 100_000
-GIB = 1 << 30
-TICK_STAGES = ("vision_encoder", "action_expert")
-GENERATION_STAGES = ("prefill", "decode", "semantic_context")
 
 
 class PlanError(ValueError):
     """A plan that cannot be made, or one that does not fit and must; its text is the one line to show."""
-
-
-@dataclass(frozen=True)
-class Memory:
-    """Bytes on the device that the model takes, by what for, and what there is for it."""
-
-    weights: int
-    caches: int
-    activations: int
-    workspace: int
-    available: int
-
-    @property
-    def needed(self) -> int:
-        """Sum of what it takes."""
-        return self.weights + self.caches + self.activations + self.workspace
 
 
 @dataclass(frozen=True)
@@ -83,6 +64,8 @@ class Plan:
     average_w: float | None
     average_w_error: float | None
     budget_w: float | None
+    rise_w: float | None
+    """Power that a running stage adds to idle power, at most."""
     memory: Memory
     weight_bytes: Mapping[str, int]
     reasons: tuple[str, ...]
@@ -144,6 +127,7 @@ class Plan:
             "ms": _rounded(stage.whole.ms),
             "call_ms": _rounded(stage.each.ms),
             "error": _rounded(stage.whole.error),
+            "energy_j": _rounded(None if self.rise_w is None else self.rise_w * stage.whole.ms / 1e3),
             "gflop": _rounded(stage.flops / 1e9),
             "moved_bytes": stage.moved_bytes,
             "weight_bytes": self.weight_bytes[stage.graph],
@@ -225,9 +209,9 @@ def _share(target: Target, tick_alone_ms: float) -> _Share:
         (1.0, 1.0) if one_device else (_load(target, TICK_STAGES), _load(target, ("decode",)))
     )
     reasoning = left
-    if power.idle_w is None or mode.busy_w is None:
+    rise = _rise_w(target)
+    if rise is None or power.idle_w is None or mode.busy_w is None:
         return _Share(control, left, reasoning, None, None)
-    rise = mode.busy_w.value - power.idle_w.value
     if power.budget_w is not None and rise > 0:
         allowed = (power.budget_w - power.idle_w.value) / rise - min(control, 1.0) * control_load
         reasoning = max(0.0, min(left, allowed / reasoning_load))
@@ -237,6 +221,11 @@ def _share(target: Target, tick_alone_ms: float) -> _Share:
         power.idle_w.error or 0.0
     ) * power.idle_w.value * (1 - busy)
     return _Share(control, left, reasoning, average, spread / average if spread else None)
+
+
+def _rise_w(target: Target) -> float | None:
+    idle, busy = target.power.idle_w, target.power.selected.busy_w
+    return None if idle is None or busy is None else max(0.0, busy.value - idle.value)
 
 
 def _load(target: Target, stages: tuple[str, ...]) -> float:
@@ -267,7 +256,7 @@ def _sized(
         generation = slowed if share.left == 1.0 else dataclasses.replace(slowed.times(1 / share.left), tag=MODELLED)
         delay_s = (generation.ms + slowed.ms / share.reasoning) / 1e3
         duty = share.reasoning / share.left
-    weights = {name: _weights(target, config, name, chosen[name], work) for name in target.graph_names}
+    weights = {name: graph_weights(target, config, name, chosen[name], work) for name in target.graph_names}
     made = Plan(
         target=target.name,
         model=config.name,
@@ -286,7 +275,8 @@ def _sized(
         average_w=share.average_w,
         average_w_error=share.error,
         budget_w=target.power.budget_w,
-        memory=_memory(target, config, work, sum(weights.values())),
+        rise_w=_rise_w(target),
+        memory=memory_of(target, config, work, sum(weights.values())),
         weight_bytes=weights,
         reasons=(),
         warnings=(),
@@ -299,36 +289,6 @@ def _sized(
         if better:
             reasons[-1] += f" (power.mode={' or '.join(better)} would fit)"
     return dataclasses.replace(made, reasons=tuple(reasons), warnings=tuple(_warnings(target, made, reasons)))
-
-
-def _weights(target: Target, config: TicVlaConfig, graph: str, precision: Precision, work: Work) -> int:
-    stage = {"language_model": "prefill", "language_model.prefill": "prefill", "language_model.decode": "decode"}
-    call = stage_calls(config, graph, stage.get(graph, graph), work)[0][0]
-    return call.weights(precision, target.provider(graph).activation_bytes)
-
-
-def _memory(target: Target, config: TicVlaConfig, work: Work, weights: int) -> Memory:
-    language = config.language
-    kv_bytes = KV_DTYPES[target.runtime.kv_dtype]
-    caches = 2 * language.layers * language.kv_heads * language.head_dim * language.max_context
-    # The context in use and the next one; the ring of encoded frames is kept in fp32.
-    contexts = 2 * context_numbers(config, work.context_tokens)
-    frames = (len(target.runtime.frame_offsets_s) + 1) * config.vision.tokens * config.vision.token_dim * 4
-    activations = max(
-        call.workspace * target.provider(graph).activation_bytes
-        for stage in (*TICK_STAGES, *GENERATION_STAGES)
-        for graph in (stage_graph(target, stage),)
-        for call, _ in stage_calls(config, graph, stage, work)
-    )
-    providers = {target.graphs[name].provider for name in target.graph_names}
-    workspace = sum(target.providers[name].workspace_gib.value for name in providers)
-    return Memory(
-        weights=weights,
-        caches=(caches + contexts) * kv_bytes + frames,
-        activations=2 * activations,  # both threads run
-        workspace=round(workspace * GIB),
-        available=round((target.device.memory_gib - target.device.reserved_gib) * GIB),
-    )
 
 
 def _reasons(target: Target, made: Plan, share: _Share) -> list[str]:

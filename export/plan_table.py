@@ -6,7 +6,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from export.plan import GIB, Plan
+from export.memory import GIB
+from export.plan import Plan
 from export.precision import Precision
 from export.timing import Estimate
 

@@ -162,7 +162,19 @@ def test_the_small_model_fits_a_cpu() -> None:
 
 
 def test_without_a_budget_no_power_is_claimed() -> None:
-    assert planned("cpu").average_w is None
+    made = planned("cpu")
+    assert made.average_w is None
+    assert {entry["energy_j"] for entry in made.to_dict()["per_graph"].values()} == {None}
+
+
+def test_average_power_is_idle_power_and_the_stages_energy_over_time() -> None:
+    made = planned("orin", "runtime.max_delay_s=60", tokens=32)
+    energy = {name: entry["energy_j"] for name, entry in made.to_dict()["per_graph"].items()}
+    control_w = (energy["vision_encoder"] + energy["action_expert"]) / (made.period_ms / 1e3)
+    generation_j = energy["prefill"] + energy["decode"] + energy["semantic_context"]
+    assert made.generation is not None
+    generation_w = generation_j / (made.generation.ms / 1e3 / made.duty)
+    assert 4.6 + control_w + generation_w == pytest.approx(made.average_w, rel=0.01)
 
 
 def with_point(base: Target, **changes: object) -> Target:
