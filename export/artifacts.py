@@ -185,7 +185,7 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Pro
     """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
     load_artifacts(directory)
     manifest = read_manifest(directory)
-    pipeline = Pipeline(job, cache, progress)
+    pipeline = Pipeline(job, cache, progress, run_gates=True)
     weights = pipeline.weights()
     if weights.sha256 != manifest["provenance"].get("weights_sha256"):
         raise ArtifactError(f"{directory}: was made from other weights than {weights.origin}; pass --checkpoint")
