@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -79,8 +80,8 @@ def convert(kind: Any, value: object, where: str) -> Any:
     if kind is Any:
         return value
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not kind:
+        value = float(value) if abs(value) < 2**53 else math.inf
+    if type(value) is not kind or (kind is float and not math.isfinite(typing.cast(float, value))):
         raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
     return value
 
@@ -117,7 +118,7 @@ def from_text(kind: Any, text: str, where: str) -> Any:
 
 def kind_name(kind: Any) -> str:
     """A type in words."""
-    names = {str: "a text", int: "a whole number", float: "a number", bool: "true or false"}
+    names = {str: "a text", int: "a whole number", float: "a finite number", bool: "true or false"}
     if kind in names:
         return names[kind]
     return " or ".join(kind_name(option) for option in typing.get_args(kind) if option is not type(None)) or str(kind)
