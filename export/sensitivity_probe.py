@@ -69,8 +69,8 @@ class Reference:
         return prompt_parts(self.samples.samples[index], self.visual)
 
     def reading(self, plans: Sequence[Floats], output_error: float, top1: float | None = None) -> Reading:
-        """Compare plans with the fp32 model's."""
-        errors = compare_plans(self.plans, plans, self.samples)
+        """Compare the plans of the first samples, or of all, with the fp32 model's."""
+        errors = compare_plans(self.plans[: len(plans)], plans, self.samples)
         waypoint, heading = errors["waypoint_mean_cm"], errors["heading_end_deg"]
         shares = [
             float(values.mean()) / of if of > 0 else 0.0 if values.max() == 0 else float("inf")
@@ -235,7 +235,8 @@ class LanguageProbe(Probe):
             return super().group(group, precision)
         language, start = self.reference.model.language, int(group.split(".")[1])
         found = []
-        for run in self._runs:
+        # One prompt ranks the layers of a large model; what is chosen in the end is read on all of them.
+        for run in self._runs[: 1 if is_large(self.reference.model.config) else None]:
             x, cos, sin, mask, *_ = run["inputs"][start]
             with torch.no_grad(), self._rounded(language, Precision("fp32", ((group, precision),))):
                 for i in range(start, len(language.layers)):
@@ -248,7 +249,7 @@ class LanguageProbe(Probe):
     def _reading(self, found: list[tuple[Tensor | None, Tensor]], head_precision: str) -> Reading:
         r = self.reference
         plans, errors, same = [], [], []
-        for index, (run, (kv, hidden)) in enumerate(zip(self._runs, found, strict=True)):
+        for index, (run, (kv, hidden)) in enumerate(zip(self._runs, found, strict=False)):
             whole = r.kv[index] if kv is None else kv.numpy()
             if kv is not None and run["head"] is not None:
                 whole = np.concatenate([run["head"], whole], axis=1)
