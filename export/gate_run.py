@@ -7,6 +7,7 @@ so that the two never have to be in memory together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,10 @@ from export.task_samples import SampleSet, is_large
 from export.torch_stages import TorchStages
 
 Floats = npt.NDArray[np.float32]
+
+
+NEW_TOKENS = 16
+"""Greedy tokens of every calibration prompt that are compared."""
 
 
 def threads_for(config: TicVlaConfig) -> int:
@@ -127,11 +132,13 @@ class TaskCheck:
     def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
         """Of the shipped language model: one graph, or the pair as it runs together."""
         model = LanguageModel(artifacts, threads=threads, provider=provider)
-        kv = []
+        kv, texts = [], []
         for sample in self._samples.samples:
             segments = prompt_parts(sample, self._reference.visual)
-            kv.append(model.generate(segments, max_new_tokens=0, cancelled=lambda: False).last_layer_kv)
-        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv])
+            found = model.generate(segments, max_new_tokens=NEW_TOKENS, cancelled=lambda: False)
+            kv.append(found.last_layer_kv[:, : found.prompt_tokens])
+            texts.append(found.token_ids)
+        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv], texts=texts)
 
     def context(self, graph: OpenGraph) -> TaskError:
         """Of the shipped semantic context."""
@@ -141,20 +148,23 @@ class TaskCheck:
     def action(self, graph: OpenGraph) -> TaskError:
         """Of the shipped action expert."""
         contexts = [self._torch.context(kv) for kv in self._reference.kv]
-        return self._compare(self._reference.visual, self._reference.kv, contexts, _ShippedAction(graph))
+        return self._compare(self._reference.visual, self._reference.kv, contexts, act=_ShippedAction(graph))
 
     def _compare(
         self,
         visual: Sequence[Floats],
         kv: Sequence[Floats],
         contexts: Sequence[tuple[Floats, Floats]],
+        *,
+        texts: Sequence[tuple[int, ...]] | None = None,
         act: _ShippedAction | None = None,
     ) -> TaskError:
         stages: Any = self._torch if act is None else act
         trajectories = tuple(plan(stages, s, visual, c) for s, c in zip(self._samples.samples, contexts, strict=True))
-        no_text: tuple[tuple[int, ...], ...] = tuple(() for _ in kv)
-        found = StageOutputs(tuple(visual), tuple(kv), no_text, trajectories, ())
-        return compare_task(self._reference, found, self._samples)
+        # Graphs that write no text are not held to any.
+        reference = self._reference if texts is not None else replace(self._reference, token_ids=tuple(() for _ in kv))
+        found = StageOutputs(tuple(visual), tuple(kv), tuple(texts or reference.token_ids), trajectories, ())
+        return compare_task(reference, found, self._samples)
 
 
 def _unpacked(context: Arrays) -> tuple[Floats, Floats]:

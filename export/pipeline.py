@@ -17,6 +17,7 @@ from edge.graph import GraphError
 from edge.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE, Artifacts
 from export.checkpoint.tokenizer import tokenizer_for
 from export.gate_run import (
+    NEW_TOKENS,
     OpenGraph,
     TaskCheck,
     check_parity,
@@ -187,7 +188,7 @@ class Pipeline:
 
         def build(directory: Path) -> None:
             stages = TorchStages(self.job.weights.get().model)
-            outputs = run_stages(stages, self.samples, progress=self._progress.detail)
+            outputs = run_stages(stages, self.samples, new_tokens=NEW_TOKENS, progress=self._progress.detail)
             save_outputs(outputs, directory / OUTPUTS_FILE)
 
         return self._stage("task reference", self._task_key(), build) / OUTPUTS_FILE
@@ -287,7 +288,7 @@ class Pipeline:
         except (ParityError, GraphError, TaskErrorError) as error:
             raise GateError(f"{error}; nothing was written") from error
         parity, task = ParityResult(**measured), TaskResult.from_dict(moved)
-        verdict = judge(parity, task, gate, self.job.target.task_gate)
+        verdict = judge(parity, task, gate, self.job.target.task_gate, trained=self.weights().trained)
         return GateResult(parity, task, verdict, provider, contract.session.provider)
 
     def _measured(

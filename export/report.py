@@ -135,15 +135,18 @@ def _gate_table(report: Report) -> str:
                 _held(f"{parity['max_abs']:.2g}", f"≤ {gate['max_abs']:g}"),
                 _held(f"{parity['min_difference']:.2g}", f"≥ {gate['min_difference']:g}"),
                 "–" if parity["top1"] is None else _held(f"{100 * parity['top1']:.1f} %", _share(gate["top1"])),
+                "–" if task is None or task["token_agreement"] is None else f"{100 * task['token_agreement']:.0f} %",
                 "–" if task is None else f"{_small(task['waypoint_cm'])} cm",
                 "–" if task is None else f"{_small(task['heading_deg'])}°",
                 text_html(parity["provider"].removesuffix("ExecutionProvider")),
             )
         )
-    head = ("graph", "", "cosine", "max-abs", "between inputs", "same token", "waypoint", "heading", "ran on")
+    numbers = ("cosine", "max-abs", "between inputs", "same token", "same text", "waypoint", "heading")
     limits = _gate(report, "task")
-    return table(head, rows, numeric=frozenset({2, 3, 4, 5, 6, 7})) + (
-        '<p class="quiet">Under a value: the threshold it is held to. What rounding may do to the robot, worst case '
+    return table(("graph", "", *numbers, "ran on"), rows, numeric=frozenset(range(2, 9))) + (
+        '<p class="quiet">Under a value: the threshold it is held to. Same text: mean share of the first greedy tokens '
+        "after every calibration prompt before the first that differs; not held to anything. What rounding may do to "
+        "the robot, worst case "
         f"over the delays of the semantic state: waypoints {limits['waypoint_cm']:g} cm, heading "
         f"{limits['heading_deg']:g}°, speed {limits['speed_mps']:g} m/s, turn rate {limits['turn_radps']:g} rad/s."
         "</p>"

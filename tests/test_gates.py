@@ -159,6 +159,13 @@ def test_a_failure_is_not_softened_by_a_warning() -> None:
     assert judge(replace(GOOD, cosine=0.5), replace(STEADY, waypoint_cm=3), GATE, TASK_GATE).level == "FAIL"
 
 
+def test_another_token_from_untrained_weights_only_warns() -> None:
+    unsure = replace(GOOD, top1=0.5)
+    assert judge(unsure, STEADY, GATE, TASK_GATE, trained=False).level == "WARN"
+    assert judge(unsure, STEADY, GATE, TASK_GATE, trained=True).level == "FAIL"
+    assert judge(replace(unsure, cosine=0.5), STEADY, GATE, TASK_GATE, trained=False).level == "FAIL"
+
+
 def test_a_graph_without_tokens_or_task_is_held_to_the_rest() -> None:
     assert judge(replace(GOOD, top1=None), None, GATE, TASK_GATE) == Verdict("PASS")
 
