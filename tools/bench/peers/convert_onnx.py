@@ -46,8 +46,8 @@ def write_action(workload: Workload, reference: Path, folder: Path, kind: str) -
         plain.unlink()
 
 
-def write_genai(reference: Path, folder: Path, kind: str) -> None:
-    """Run the builder of ONNX Runtime GenAI on the Hugging Face directory."""
+def write_genai(workload: Workload, reference: Path, folder: Path, kind: str) -> None:
+    """Run the builder of ONNX Runtime GenAI on the Hugging Face directory of the workload's model."""
     precision = kind.partition("-")[0]
     command = [sys.executable, "-m", "onnxruntime_genai.models.builder", "-i", str(reference / "language")]
     command += ["-o", str(folder), "-p", precision, "-e", "cpu", "-c", str(folder / "builder-cache")]

@@ -8,6 +8,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -72,7 +73,8 @@ class Worker:
             self._process.wait()
         for stream in (self._process.stdin, self._process.stdout, self._stream):
             if stream is not None:
-                stream.close()
+                with suppress(BrokenPipeError):  # what a dead worker was never told
+                    stream.close()
 
     @property
     def pid(self) -> int:
