@@ -19,7 +19,7 @@ from export.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
 from export.job import Job
 from export.model.config import TicVlaConfig
-from export.pipeline import Pipeline, build_stages
+from export.pipeline import Pipeline
 from export.plan import Plan, plan
 from export.progress import Progress
 from export.report import report_html
@@ -183,7 +183,6 @@ def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> 
 
 def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
     """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
-    load_artifacts(directory)
     manifest = read_manifest(directory)
     pipeline = Pipeline(job, cache, progress, run_gates=True)
     weights = pipeline.weights()
@@ -194,6 +193,3 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Pro
         pipeline.reference(name)
     results = check_directory(pipeline, directory, progress)
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
-
-
-__all__ = ["build_artifacts", "build_stages", "check_directory", "check_replaceable", "verify_directory"]

@@ -253,7 +253,10 @@ class Pipeline:
         if decision is None:
             return asked, f"target {self.job.target.name} leaves no other choice"
         chosen = Precision.from_dict(decision["precision"])
-        return with_exceptions(chosen, asked), str(decision["reason"])
+        precision = with_exceptions(chosen, asked)
+        added = [f"{layer} in {kind}" for layer, kind in precision.overrides[len(chosen.overrides) :]]
+        also = f"; {', '.join(added)} as target {self.job.target.name} asks" if added else ""
+        return precision, f"{decision['reason']}{also}"
 
     def graph(self, graph: str) -> list[Path]:
         """The graph's files."""

@@ -234,15 +234,6 @@ def test_verify_holds_a_directory_to_the_thresholds_it_was_built_under(
     assert main(["verify", str(copy)]) == 1
 
 
-def test_verify_names_a_damaged_file(artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
-    data = bytearray((copy / "vision_encoder.onnx").read_bytes())
-    data[-1] ^= 0x80
-    (copy / "vision_encoder.onnx").write_bytes(data)
-    assert main(["verify", str(copy)]) == 1
-    assert "vision_encoder.onnx" in capsys.readouterr().err
-
-
 def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", str(artifacts_dir), "--random-weights", "5"]) == 1
     assert "other weights" in capsys.readouterr().err
@@ -404,58 +395,3 @@ def test_a_setting_of_the_network_makes_that_network_and_a_small_cache_stays_sma
     names = [tensor["name"] for tensor in content["graphs"]["semantic_context"]["outputs"]]
     assert [name for name in names if name.endswith(".key")] == [f"context.{i}.key" for i in range(3)]
     assert 0 < sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) < 35e6
-
-
-# ---- the exported model is run as the robot runs it
-
-
-def test_the_exported_model_generates_the_same_text_as_pytorch(model: TicVla, artifacts: Artifacts) -> None:
-    """Greedy decoding over the runner's own prompt, segments and cache, against one uncached PyTorch pass a token."""
-    import torch
-
-    from edge.geometry import SE2
-    from edge.language import LanguageModel
-    from edge.policy import Policy
-    from edge.ring import EncodedFrame
-
-    policy, language = Policy(artifacts), LanguageModel(artifacts)
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (2, 1, 128, 128, 3)).astype(np.uint8)
-    frames = [EncodedFrame(i, SE2(float(i), 0, 0), policy.encode(image)) for i, image in enumerate(images)]
-    segments = language.prompt.build(frames, "go to the bench")
-    found = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
-
-    ids = [i for segment in segments for i in segment.ids]
-    tokens = torch.cat([torch.from_numpy(f.tokens) for f in frames])
-    c = NANO.language
-    new: list[int] = []
-    with torch.no_grad():
-        while len(new) < 12:
-            past = [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
-            token, _, kv, *_ = model.language(torch.tensor([ids + new]), tokens, past)
-            if int(token) == c.im_end_id:
-                break
-            new.append(int(token))
-    assert found.token_ids == tuple(new)
-    assert found.text == language._tokenizer.decode(new, skip_special_tokens=True)
-    full = found.last_layer_kv
-    assert full.shape == (1, len(ids) + len(new), NANO.kv_dim)
-    assert np.allclose(full[:, : kv.shape[1]], kv.numpy()[:, : full.shape[1]], atol=1e-3)
-
-
-def test_a_generation_stops_between_two_calls(artifacts: Artifacts) -> None:
-    from edge.geometry import SE2
-    from edge.language import CancelledError, LanguageModel
-    from edge.ring import EncodedFrame
-
-    language = LanguageModel(artifacts)
-    calls: list[int] = []
-
-    def cancelled() -> bool:
-        calls.append(1)
-        return len(calls) > 3
-
-    frames = [EncodedFrame(0, SE2(0, 0, 0), np.zeros((1, 64, 256), dtype=np.float32))]
-    with pytest.raises(CancelledError):
-        language.generate(language.prompt.build(frames, "go"), max_new_tokens=48, cancelled=cancelled)
-    assert len(calls) == 4
