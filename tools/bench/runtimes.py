@@ -225,7 +225,9 @@ def show(verdicts: Sequence[Verdict]) -> None:
             head, tail = (v.metric.title, verdict_text(v)) if i == 0 else ("", "")
             table.add_row(head, name, f"{row.median:.4g} {v.metric.unit}", span, tail)
         table.add_section()
-    Console().print(table)
+    console = Console()
+    # Into a file or a pipe, rich would fold the table to 80 columns.
+    (console if console.is_terminal else Console(width=150)).print(table)
 
 
 def arguments(argv: list[str] | None) -> argparse.Namespace:

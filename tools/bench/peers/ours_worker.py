@@ -54,8 +54,7 @@ def load(request: Load) -> Mapping[str, Task]:
     if {"encoder", "action"} & set(request.parts):
         policy = Policy(artifacts, threads=request.threads)
         frame, kv = workload.frame(), workload.last_layer_kv()
-        keys, values = policy.semantic_context(kv)
-        semantic = SemanticState(0, 0, HERE, 0, kv, keys, values, "", None)
+        semantic = SemanticState(0, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
         state = (0.4, 0.0, 0.0)
         tokens = policy.encode(frame)
         tasks["encoder"] = encoder_task(lambda: policy.encode(frame))

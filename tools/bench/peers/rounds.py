@@ -15,6 +15,8 @@ CALLS = {"action": 20}
 """Calls of a sample where one takes milliseconds; the sample is their median."""
 FOREIGN_CORES = 0.1
 """Processor time of others, in cores, from which a sample counts as disturbed."""
+GRAIN_S = 0.02
+"""The kernel counts busy time in steps of 0.01 s: a short sample must not be blamed for the steps at its ends."""
 SETTLE_S = 0.3
 """Runtimes keep their threads spinning for up to 0.2 s after a call: the next contender waits that out."""
 
@@ -91,7 +93,7 @@ def take(worker: Worker, task: str) -> Sample:
     before, started_ns = _machine_busy_s(), time.monotonic_ns()
     answer = worker.ask({"run": task, "calls": CALLS.get(task, 1)})
     busy, elapsed_s = _machine_busy_s() - before, (time.monotonic_ns() - started_ns) / 1e9
-    foreign = max(0.0, (busy - answer["cpu_s"]) / elapsed_s)
+    foreign = max(0.0, (busy - answer["cpu_s"] - GRAIN_S) / elapsed_s)
     values = {metric: middle(calls) for metric, calls in answer["values"].items()}
     return Sample(worker.name, task, values, answer["wall_s"], answer["cpu_s"], round(foreign, 3), answer["values"])
 
