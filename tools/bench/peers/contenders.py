@@ -46,7 +46,8 @@ def _openvino(parts: Sequence[str], forms: Mapping[str, tuple[str, str]], name: 
 
 def _language(name: str, stack: str, form: str, **options: str) -> Contender:
     given = {"language.form": form} | {f"language.{k}": v for k, v in options.items()}
-    assets = ("reference",) if stack == "torch" else (f"{stack}/language-{form}",)
+    folder = stack.partition("_")[0]
+    assets = ("reference",) if stack == "torch" else (f"{folder}/language-{form}",)
     return Contender(name, stack, ("language",), given, assets)
 
 
@@ -68,6 +69,10 @@ CONTENDERS = (
     _openvino(("language",), {"language": ("int8", "f32")}, "openvino language int8/f32"),
     _openvino(("language",), {"language": ("int4", "bf16")}, "openvino language int4/bf16"),
     _openvino(("language",), {"language": ("int4", "f32")}, "openvino language int4/f32"),
+    *(
+        _language(f"openvino genai {form}", "openvino_genai", form, INFERENCE_PRECISION_HINT="f32")
+        for form in ("int8", "int4")
+    ),
     _torch("bf16", CONTROL, "torch control bf16"),
     _torch("int8", CONTROL, "torch control int8"),
     _torch("fp32", ("action",), "torch action fp32"),

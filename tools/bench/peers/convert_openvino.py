@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 import openvino as ov
 import torch
 from openvino._offline_transformations import apply_make_stateful_transformation
+from openvino_tokenizers import convert_tokenizer
 from safetensors import safe_open
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+from transformers import AutoTokenizer
 
 from export.model.config import LanguageConfig
 from tools.bench.peers.unsplit import load_action, load_vision
@@ -177,6 +180,17 @@ def write_language(workload: Workload, reference: Path, folder: Path, kind: str)
         mode = nncf.CompressWeightsMode.INT4_SYM
         model = nncf.compress_weights(model, mode=mode, ratio=1.0, group_size=group, all_layers=True)
     _save(model, folder)
+    _add_genai_files(reference / "language", folder)
+
+
+def _add_genai_files(source: Path, folder: Path) -> None:
+    """OpenVINO GenAI opens a folder that also has the tokenizer as models and the checkpoint's configuration."""
+    tokenizer = AutoTokenizer.from_pretrained(source)
+    models = convert_tokenizer(tokenizer, with_detokenizer=True)
+    for name, model in zip(("openvino_tokenizer", "openvino_detokenizer"), models, strict=True):
+        ov.save_model(model, str(folder / f"{name}.xml"))
+    for name in ("config.json", "generation_config.json"):
+        shutil.copy(source / name, folder / name)
 
 
 def write_encoder(workload: Workload, reference: Path, folder: Path, kind: str) -> None:
