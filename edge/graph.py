@@ -65,6 +65,13 @@ class Graph:
                 f"{contract.file}: ONNX Runtime cannot open it ({str(error).splitlines()[0]})"
             ) from error
         artifacts.check_unchanged(contract.data_files)
+        opened = self._session.get_providers()[0]
+        if opened != self.provider:
+            # A provider whose libraries do not load is replaced by the CPU's with no more than a line in the log.
+            raise ArtifactError(
+                f"{contract.file}: ONNX Runtime opened it on {opened} instead of {self.provider}, whose libraries are "
+                f"missing or do not load; install those that its package names"
+            )
         self.name = name
         self.contract = contract
         for declared, found in (

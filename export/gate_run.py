@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 import onnxruntime as ort
 from safetensors.numpy import load_file, save_file
 
 from edge.graph import CPU_PROVIDER, DTYPES, Graph
 from edge.language import LanguageModel
 from edge.manifest import Artifacts
-from export.metrics import Arrays, ParityResult, Sample, compare
+from export.graphs.writer import IR_VERSION, OPSET
+from export.metrics import Arrays, Sample
 from export.model.config import TicVlaConfig
 from export.task_error import StageOutputs, TaskError, plan, prompt_parts
 from export.task_error import compare as compare_task
@@ -83,9 +86,28 @@ def load_outputs(path: Path) -> StageOutputs:
     return StageOutputs(of("visual"), of("kv"), token_ids, of("trajectories"), of("swapped"))
 
 
+@lru_cache
+def provider_loads(provider: str) -> bool:
+    """Whether ONNX Runtime can open a graph on that provider here: one may be listed whose libraries are missing."""
+    if provider not in ort.get_available_providers():
+        return False
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+    result = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Add", ["x", "x"], ["y"])], "probe", [value], [result])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)])
+    model.ir_version = IR_VERSION
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    try:
+        session = ort.InferenceSession(model.SerializeToString(), sess_options=options, providers=[provider])
+    except Exception:  # noqa: BLE001 - a provider fails in any way it likes; all that matters is that it does
+        return False
+    return bool(session.get_providers()[0] == provider)
+
+
 def gate_provider(shipping: str) -> str:
-    """The provider that the gate runs a graph on: the shipping one if ONNX Runtime has it here, else the CPU's."""
-    return shipping if shipping in ort.get_available_providers() else CPU_PROVIDER
+    """The provider that the gate runs a graph on: the shipping one if it loads here, else the CPU's."""
+    return shipping if provider_loads(shipping) else CPU_PROVIDER
 
 
 class OpenGraph:
@@ -108,11 +130,6 @@ class OpenGraph:
             name: array.astype(np.float32) if array.dtype == np.float16 else array
             for name, array in zip(self._graph.output_names, found, strict=True)
         }
-
-
-def check_parity(graph: OpenGraph, name: str, samples: Sequence[Sample]) -> ParityResult:
-    """The graph against PyTorch; raises ParityError."""
-    return compare(name, samples, graph)
 
 
 class TaskCheck:

@@ -20,7 +20,6 @@ from export.gate_run import (
     NEW_TOKENS,
     OpenGraph,
     TaskCheck,
-    check_parity,
     gate_provider,
     load_outputs,
     load_samples,
@@ -31,7 +30,7 @@ from export.gate_run import (
 from export.gates import GateError, GateResult, TaskResult, judge
 from export.graphs.build import write_graph
 from export.job import Job
-from export.metrics import ParityError, ParityResult
+from export.metrics import ParityError, ParityResult, compare
 from export.model.weights import weights_sha256
 from export.parity import references
 from export.precision import PRECISIONS, Precision
@@ -324,7 +323,7 @@ class Pipeline:
         )
 
     def _parity(self, artifacts: Artifacts, graph: str) -> ParityResult:
-        return check_parity(OpenGraph(artifacts, graph, self._threads), graph, load_samples(self.reference(graph)))
+        return compare(graph, load_samples(self.reference(graph)), OpenGraph(artifacts, graph, self._threads))
 
     def _task(self, artifacts: Artifacts, graph: str) -> TaskResult:
         check = TaskCheck(TorchStages(self.job.weights.get().model), self._task_outputs, self.samples)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import onnxruntime as ort
 import pytest
 import torch
 
 from edge.geometry import SE2
+from edge.graph import Graph
 from edge.language import CancelledError, LanguageModel
-from edge.manifest import Artifacts
+from edge.manifest import ArtifactError, Artifacts
 from edge.policy import Policy
 from edge.ring import EncodedFrame
+from export.gate_run import gate_provider
 from export.model.config import PRESETS
 from export.model.network import build
 
@@ -57,3 +60,22 @@ def test_a_generation_stops_between_two_calls(artifacts: Artifacts) -> None:
     with pytest.raises(CancelledError):
         language.generate(language.prompt.build(frames, "go"), max_new_tokens=48, cancelled=cancelled)
     assert len(calls) == 4
+
+
+def test_a_provider_that_does_not_load_is_refused_and_not_silently_the_cpu(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
+    with (
+        pytest.warns(UserWarning, match="not in available provider names"),
+        pytest.raises(ArtifactError, match="on CPUExecutionProvider instead of CUDAExecutionProvider"),
+    ):
+        Graph(artifacts, "action_expert", threads=1, provider="CUDAExecutionProvider")
+
+
+def test_the_gate_runs_on_the_cpu_where_the_shipping_provider_does_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gate_provider("CPUExecutionProvider") == "CPUExecutionProvider"
+    assert gate_provider("TensorrtExecutionProvider") == "CPUExecutionProvider"
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["ListedExecutionProvider", "CPUExecutionProvider"])
+    with pytest.warns(UserWarning, match="not in available provider names"):
+        assert gate_provider("ListedExecutionProvider") == "CPUExecutionProvider"
