@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -14,17 +15,17 @@ from export.timing import Estimate
 
 def plan_table(plan: Plan) -> RenderableType:
     """Stages, sums and verdict; print it on a Console of standard error."""
-    table = Table(title=f"{plan.model} on {plan.target}, power mode {plan.mode}", title_justify="left")
-    for name in ("stage", "precision", "weights", "calls", "products", "bytes moved", "time", "bound by", ""):
-        table.add_column(name, justify="left" if name in ("stage", "precision", "bound by", "") else "right")
+    title = f"{plan.model} on {plan.target}, power mode {plan.mode}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    # Fits 80 columns; calls, products and bytes moved are in the JSON and in the report.
+    for name in ("stage", "precision", "weights", "time", "bound by", ""):
+        left = name in ("stage", "precision", "bound by", "")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name != "precision")
     for stage in plan.stages:
         table.add_row(
             stage.stage,
             _precision(plan.precisions[stage.graph]),
             _size(plan.weight_bytes[stage.graph]),
-            str(stage.calls),
-            f"{stage.flops / 1e9:,.1f} GFLOP",
-            _size(stage.moved_bytes),
             _time(stage.whole),
             stage.bound,
             stage.whole.tag,

@@ -144,10 +144,10 @@ class Progress:
         elapsed_s = (time.monotonic_ns() - self._started_ns) / 1e9
         return (
             f"[{self._index + 1}/{len(self._stages)}] {self._stages[self._index].name} · "
-            f"{duration(elapsed_s)} so far, about {duration(self.remaining_s())} to go · "
-            f"peak memory {peak_rss_bytes() / 1e9:.1f} GB{' · ' if self._detail else ''}{self._detail}"
+            f"{duration(elapsed_s)} so far, {duration(self.remaining_s())} to go · "
+            f"peak {peak_rss_bytes() / 1e9:.1f} GB{' · ' if self._detail else ''}{self._detail}"
         )
 
     def _renderable(self, spinner: Spinner) -> Spinner:
-        spinner.update(text=Text(f"{self._command}: {self.line()}", overflow="ellipsis", no_wrap=True))
+        spinner.update(text=Text(self.line(), overflow="ellipsis", no_wrap=True))
         return spinner

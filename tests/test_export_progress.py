@@ -36,8 +36,8 @@ def test_every_stage_gets_a_line_when_it_begins_and_one_when_it_is_done(clock: l
                 after(clock, 1)
     lines = out.getvalue().splitlines()
     assert len(lines) == 6
-    assert lines[2].startswith("edge-export: [2/3] graph · 1 s so far, about ")
-    assert "peak memory" in lines[2]
+    assert lines[2].startswith("edge-export: [2/3] graph · 1 s so far, ")
+    assert "to go · peak " in lines[2]
     assert lines[3] == "edge-export: [2/3] graph: done, 1.0 s"
 
 
