@@ -12,6 +12,7 @@ from types import FrameType
 
 import cv2
 
+from edge import engines
 from edge.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
@@ -58,6 +59,9 @@ def parser() -> argparse.ArgumentParser:
         default="0",
         metavar="S|PROFILE",
         help="hold each finished generation back, as slower hardware would: seconds, or a JSON profile (default: 0)",
+    )
+    p.add_argument(
+        "--engines", type=Path, metavar="DIR", help="engines built by edge-install (default: ARTIFACTS.engines)"
     )
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
@@ -108,11 +112,16 @@ def main(argv: list[str] | None = None) -> int:
     try:
         robot, options = _read(args)
         artifacts = load_artifacts(args.artifacts)
+        if engines.needed(artifacts):
+            # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
+            folder = args.engines or engines.default_directory(args.artifacts)
+            engines.check(artifacts, folder)
+            artifacts = engines.with_engines(artifacts, folder)
         session = RunSession(artifacts, robot, options, _say)
     except (ConfigError, InstructionError, ReleaseDelayError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
-    except ArtifactError as error:
+    except (ArtifactError, engines.EngineError) as error:
         _say(str(error))
         return EXIT_REFUSED
     except OSError as error:

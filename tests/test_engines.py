@@ -399,3 +399,20 @@ def test_a_mode_that_the_board_does_not_have_is_refused_with_those_it_has() -> N
 def test_another_mode_is_refused_with_the_command_that_sets_it() -> None:
     with pytest.raises(DeviceError, match="power mode is 25W, the plan was made for 40W: sudo nvpmodel -m 4"):
         check_power_mode("40W", conf=CONF, query="NV Power Mode: 25W\n3\n")
+
+
+def test_a_runner_without_the_engines_refuses_before_anything_moves(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from edge.runner import main as run
+
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["graphs"]["vision_encoder"]["session"].update(provider="TensorrtExecutionProvider", engine=True)
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    robot = Path(__file__).parents[1] / "firmware_bridge/robots/go2_sim.toml"
+    code = run(["--artifacts", str(copy), "--robot", str(robot), "--instruction", "go", "--duration", "1"])
+    error = capsys.readouterr().err
+    assert code == 3
+    assert error.count("\n") == 1
+    assert "vision_encoder" in error and "edge-install engines" in error
