@@ -114,8 +114,11 @@ def hugging_face(work: Work) -> Arrays:
     model = InternVLForConditionalGeneration(config).eval()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            if parameter.ndim == 1:  # so that a lost bias or norm cannot go unnoticed
+            # transformers' own start values would make layers whisper, biases vanish and the text repeat one word.
+            if parameter.ndim == 1:
                 parameter.normal_(1.0 if "norm" in name and name.endswith("weight") else 0.0, 0.1)
+            else:
+                parameter.normal_(0.0, 1.0 if "embed_tokens" in name else parameter[0].numel() ** -0.5)
             # Parameters alone: the buffer of rotary frequencies is fp32 in every real run.
             parameter.data = parameter.data.bfloat16()
         model.save_pretrained(work.directory / "checkpoint")
