@@ -220,3 +220,22 @@ def test_the_pair_fills_the_same_buffers_as_the_whole_model(nano: TicVla, tmp_pa
     found = feed(decode, ids[:, -1:], ids.shape[1] - 1, carried(filled))
     np.testing.assert_allclose(found["logits"], expected["logits"], atol=2e-5)
     np.testing.assert_allclose(found["last_layer_kv"], expected["last_layer_kv"][:, -1:], atol=2e-5)
+
+
+def test_the_graphs_of_a_large_pair_share_one_token_table(
+    nano: TicVla, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("export.graphs.build.SINGLE_FILE_BYTES", 0)
+    files = [write_graph(nano, name, EXACT, "fused", tmp_path) for name in LANGUAGE_PAIR]
+    assert set(files[0]) & set(files[1]) == {"language_model.embed.fp32.onnx.data"}
+    table = nano.language.embed.weight.detach().numpy()
+    assert (tmp_path / "language_model.embed.fp32.onnx.data").read_bytes() == table.tobytes()
+    for name in LANGUAGE_PAIR:
+        session = run(tmp_path, name)
+        names = [o.name for o in session.get_outputs()]
+        result = compare(
+            name,
+            references(nano, name, 2),
+            lambda feeds, session=session, names=names: dict(zip(names, session.run(None, feeds), strict=True)),
+        )
+        assert result.max_abs < 5e-5

@@ -42,7 +42,7 @@ def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
 
 
 def write_context(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
-    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → each layer's keys [1, H, d, T], values [1, H, T, d]."""
+    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → the tensors of `context_shapes`."""
     c = action.config.action
     with GraphWriter(directory, "semantic_context", precision=precision, form=form, half=half, external=False) as g:
         kv_dim = action.config.kv_dim

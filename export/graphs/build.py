@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import onnx
+from onnx import TensorProto
 
 from export.graphs.action import write_action, write_context
 from export.graphs.language import ROLES, write_language
@@ -19,6 +20,9 @@ FORMS = ("fused", "plain")
 """`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+WEIGHT_TYPES = frozenset(
+    {TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT4, TensorProto.UINT4}
+)
 SINGLE_FILE_BYTES = 64_000_000
 """A graph with more weights than this keeps them in a data file of their own, which is mapped and not read."""
 
@@ -80,9 +84,18 @@ def graph_contract(path: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def graph_parameters(path: Path) -> int:
-    """Numbers that a graph file stores: weights, scales and tables (packed 4-bit weights count as bytes)."""
+    """Weights of the network that a graph file stores: packed ones one by one, without scales, tables and constants."""
     proto = onnx.load(str(path), load_external_data=False)
-    return sum(math.prod(tensor.dims) for tensor in proto.graph.initializer)
+    packed = {}
+    for node in proto.graph.node:
+        if node.op_type == "MatMulNBits":
+            sizes = {attribute.name: attribute.i for attribute in node.attribute}
+            packed[node.input[1]] = sizes["K"] * sizes["N"]
+    return sum(
+        packed.get(tensor.name, math.prod(tensor.dims))
+        for tensor in proto.graph.initializer
+        if tensor.data_type in WEIGHT_TYPES and not tensor.name.endswith((".scale", "_cache"))
+    )
 
 
 def linear_layers(config: TicVlaConfig, name: str) -> tuple[str, ...]:

@@ -35,6 +35,8 @@ ROLES = {
     "language_model.prefill": Role(images=True, token=False),
     "language_model.decode": Role(images=False, token=True),
 }
+EMBEDDING_FILE = "language_model.embed.{}.onnx.data"
+"""The token table, where it is large: both graphs of a pair read it, so it lies beside them once."""
 CAPACITY = "C"
 """Free axis of the KV buffers: their capacity, not the number of tokens in them."""
 
@@ -106,7 +108,7 @@ def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
     g.parameters += table.size
     if precision in ("fp32", "fp16"):
         stored = table.astype(np.float16 if precision == "fp16" else np.float32)
-        rows = g.op("Gather", [g.weight(stored, "embed.weight"), ids])
+        rows = g.op("Gather", [g.shared_weight(stored, "embed.weight", EMBEDDING_FILE.format(precision)), ids])
         return rows if stored.dtype == g.float else g.cast(rows, g.float_type)
     largest = np.abs(table).max(axis=1, keepdims=True)
     scales = np.where(largest > 0, largest / 127, 1).astype(np.float32)
@@ -114,7 +116,9 @@ def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
     for start in range(0, len(table), 8192):
         rows_ = slice(start, start + 8192)
         codes[rows_] = np.rint(table[rows_] / scales[rows_])
-    rows = g.cast(g.op("Gather", [g.weight(codes, "embed.weight"), ids]), g.float_type)
+    rows = g.cast(
+        g.op("Gather", [g.shared_weight(codes, "embed.weight", EMBEDDING_FILE.format(precision)), ids]), g.float_type
+    )
     scale = g.op("Gather", [g.weight(scales.astype(g.float), "embed.scale"), ids])
     return g.op("Mul", [rows, scale])
 

@@ -44,6 +44,7 @@ class GraphWriter:
         self._path = directory / f"{name}.onnx"
         self._data_path = directory / f"{name}.onnx.data" if external else None
         self._data = None if self._data_path is None else self._data_path.open("wb")
+        self._shared_path: Path | None = None
         self._nodes: list[onnx.NodeProto] = []
         self._initializers: list[TensorProto] = []
         self._names: set[str] = set()
@@ -61,7 +62,7 @@ class GraphWriter:
         if self._data is not None:
             self._data.close()
         if kind is not None:
-            for path in (self._path, self._data_path):
+            for path in (self._path, self._data_path, self._shared_path):
                 if path is not None:
                     path.unlink(missing_ok=True)
 
@@ -125,22 +126,32 @@ class GraphWriter:
         self._names.add(name)
         return self._store(value, name)
 
+    def shared_weight(self, value: Array, name: str, file: str) -> str:
+        """A weight in a data file of its own, which several graphs name and each of them writes alike."""
+        if self._data_path is None:
+            return self.weight(value, name)
+        self._names.add(name)
+        value = np.ascontiguousarray(value)
+        self._shared_path = self._data_path.with_name(file)
+        self._shared_path.write_bytes(value.data)
+        return self._refer(value, name, file, 0)
+
     def _store(self, value: Array, name: str) -> str:
         value = np.ascontiguousarray(value)
         if self._data is None or value.nbytes < EXTERNAL_BYTES:
             self._initializers.append(numpy_helper.from_array(value, name))
             return name
+        assert self._data_path is not None
         self._data.write(b"\0" * (-self._data.tell() % ALIGNMENT))
+        offset = self._data.tell()
+        self._data.write(value.data)
+        return self._refer(value, name, self._data_path.name, offset)
+
+    def _refer(self, value: Array, name: str, file: str, offset: int) -> str:
         tensor = TensorProto(name=name, data_type=helper.np_dtype_to_tensor_dtype(value.dtype), dims=value.shape)
         tensor.data_location = TensorProto.EXTERNAL
-        assert self._data_path is not None
-        for key, entry in (
-            ("location", self._data_path.name),
-            ("offset", str(self._data.tell())),
-            ("length", str(value.nbytes)),
-        ):
+        for key, entry in (("location", file), ("offset", str(offset)), ("length", str(value.nbytes))):
             tensor.external_data.add(key=key, value=entry)
-        self._data.write(value.data)
         self._initializers.append(tensor)
         return name
 
@@ -208,7 +219,7 @@ class GraphWriter:
         if self._data is not None:
             self._data.flush()
         self._path.write_bytes(proto.SerializeToString(deterministic=True))
-        return [self._path.name, *([] if self._data_path is None else [self._data_path.name])]
+        return [path.name for path in (self._path, self._data_path, self._shared_path) if path is not None]
 
 
 def most_exact(precisions: Sequence[str]) -> str:
