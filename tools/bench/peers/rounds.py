@@ -105,7 +105,7 @@ def run_rounds(
     quiet_wait_s: float,
     failed: Callable[[str, str], None],
 ) -> Iterator[Round]:
-    """Rounds until `repeats` of them were quiet, at most twice as many; a contender that fails leaves the field."""
+    """Rounds until `repeats` of them were quiet, at most half as many again; a contender that fails leaves the field."""
     alive = dict(workers)
     for worker, tasks in list(alive.values()):
         try:
@@ -115,7 +115,7 @@ def run_rounds(
             failed(worker.name, str(error))
             del alive[worker.name]
     quiet = 0
-    for index in range(2 * repeats):
+    for index in range(repeats + (repeats + 1) // 2):
         if quiet == repeats or not alive:
             return
         foreign = wait_for_quiet(quiet_wait_s)
