@@ -35,6 +35,7 @@ from export.model.weights import weights_sha256
 from export.parity import references
 from export.precision import PRECISIONS, Precision
 from export.progress import Progress, Stage
+from export.ranges import activation_ranges
 from export.sensitivity import Limits, Search, search_samples
 from export.stages import ENTRY_NAME, StageCache, file_sha256, stage_key
 from export.task_error import StageOutputs, TaskErrorError, run_stages
@@ -46,11 +47,15 @@ TOKENIZER_FILE = "tokenizer.json"
 SAMPLES_FILE = "samples.safetensors"
 OUTPUTS_FILE = "outputs.safetensors"
 DECISION_FILE = "decision.json"
+RANGES_FILE = "ranges.json"
+RANGE_FRAMES = 8
+"""Frames of the calibration set over which ranges of activations are taken, evenly spread."""
 
 EXPECTED_S = {
     "weights": (0.3, 30.0),
     "task reference": (3.0, 120.0),
     "precision": (1.0, 150.0),
+    "activation": (0.5, 40.0),
     "reference": (0.5, 20.0),
     "graph": (0.5, 15.0),
     "gate": (2.0, 45.0),
@@ -88,6 +93,9 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
     if graphs:
         searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
         names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
+        vision = job.target.graphs["vision_encoder"]
+        if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
+            names += ["activation ranges"]
     names += [
         f"{kind} {graph}" for kind in (("graph", "gate") if graphs else ("gate",)) for graph in job.target.graph_names
     ]
@@ -261,14 +269,31 @@ class Pipeline:
         """The graph's files."""
         policy, half = self.job.target.graphs[graph], self.job.target.half
         precision, _ = self.precision(graph)
-        key = stage_key("graph", self._parts(graph=graph, precision=precision.to_dict(), form=policy.form, half=half))
+        ranges = self._ranges(graph, precision)
+        parts = self._parts(graph=graph, precision=precision.to_dict(), form=policy.form, half=half, ranges=ranges)
+        key = stage_key("graph", parts)
 
         def build(directory: Path) -> None:
             model = self.job.weights.get().model
-            write_graph(model, graph, precision, policy.form, directory, half=half)
+            write_graph(model, graph, precision, policy.form, directory, half=half, ranges=ranges)
 
         entry = self._stage(f"graph {graph}", key, build)
         return sorted(path for path in entry.iterdir() if path.name != ENTRY_NAME)
+
+    def _ranges(self, graph: str, precision: Precision) -> dict[str, float] | None:
+        """Ranges of activations for an encoder whose form rounds them statically; None for all other graphs."""
+        rounds = graph == "vision_encoder" and self.job.target.graphs[graph].form == "plain"
+        if not rounds or "int8" not in (precision.default, *(kind for _, kind in precision.overrides)):
+            return None
+
+        def build(directory: Path) -> None:
+            frames = self.samples.frames[:: max(1, len(self.samples.frames) // RANGE_FRAMES)]
+            ranges = activation_ranges(self.job.weights.get().model.vision, frames)
+            (directory / RANGES_FILE).write_text(json.dumps(ranges, sort_keys=True, allow_nan=False), encoding="utf-8")
+
+        entry = self._stage("activation ranges", stage_key("ranges", {"task": self._task_key()}), build)
+        content: dict[str, float] = json.loads((entry / RANGES_FILE).read_text(encoding="utf-8"))
+        return content
 
     # ---- whether it is the same model
 

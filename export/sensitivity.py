@@ -18,7 +18,7 @@ from export.calibration import CalibrationSet
 from export.graphs.build import linear_layers
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
-from export.precision import Precision, weight_bytes
+from export.precision import Precision, bits, weight_bytes
 from export.rounding import Rounder
 from export.sensitivity_probe import Probe, Reading, Reference, probe
 from export.task_samples import Runtime, SampleSet, is_large, samples_from
@@ -257,6 +257,10 @@ def _time(graph: str, precision: str, measured: Sequence[MeasuredPoint]) -> floa
     return min(times) if times else None
 
 
+UNRANKED_BITS = 16
+"""Nobody needs to know which layer feels 16 bits most: a graph that keeps the limits in it is not searched."""
+
+
 class _Trial:
     """Readings of one graph, each taken once."""
 
@@ -301,6 +305,8 @@ def _smallest_within(trial: _Trial, kept: Sequence[str]) -> tuple[Precision, boo
     """The smallest candidate within the limits, with as few groups raised as that takes."""
     if len(kept) == 1:
         return Precision(kept[0]), _within(trial, Precision(kept[0]))
+    if bits(kept[-1]) >= UNRANKED_BITS and _within(trial, Precision(kept[-1])):
+        return Precision(kept[-1]), True
     # The groups are ranked once, where rounding hurts most: their order hardly depends on the precision.
     ranked = trial.rank(kept[-1])
     for index in range(len(kept) - 1, 0, -1):

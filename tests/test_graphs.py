@@ -19,6 +19,7 @@ from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
 from export.parity import Arrays, references, sample_inputs
 from export.precision import Precision
+from export.ranges import activation_ranges
 
 NANO = PRESETS["nano"]
 EXACT = Precision("fp32")
@@ -239,3 +240,29 @@ def test_the_graphs_of_a_large_pair_share_one_token_table(
             lambda feeds, session=session, names=names: dict(zip(names, session.run(None, feeds), strict=True)),
         )
         assert result.max_abs < 5e-5
+
+
+def test_the_plain_int8_encoder_rounds_the_inputs_of_products_and_nothing_else(tmp_path: Path) -> None:
+    model = build(SMALL, 1)
+    frames = [references(model, "vision_encoder", 4)[i].feeds["frame"] for i in range(4)]
+    ranges = activation_ranges(model.vision, frames)
+    assert set(ranges) == set(linear_layers(SMALL, "vision_encoder")) - {"embed"}
+    write_graph(model, "vision_encoder", Precision("int8", (("embed", "fp32"),)), "plain", tmp_path, ranges=ranges)
+    nodes = onnx.load(str(tmp_path / "vision_encoder.onnx")).graph.node
+    rounded = {out for node in nodes if node.op_type == "DequantizeLinear" for out in node.output}
+    products = [n for n in nodes if n.op_type == "MatMul" and n.input[1] in rounded]
+    assert len(products) == 6 * SMALL.vision.layers + 2
+    assert all(n.input[0] in rounded for n in products)
+    # Queries, keys and values read one rounding of their common input.
+    assert sum(n.op_type == "QuantizeLinear" for n in nodes) == 4 * SMALL.vision.layers + 2
+
+
+def test_static_rounding_costs_accuracy_but_not_the_function(tmp_path: Path) -> None:
+    model = build(SMALL, 1)
+    samples = references(model, "vision_encoder", 4)
+    ranges = activation_ranges(model.vision, [sample.feeds["frame"] for sample in samples])
+    write_graph(model, "vision_encoder", Precision("int8", (("embed", "fp32"),)), "plain", tmp_path, ranges=ranges)
+    session = run(tmp_path, "vision_encoder")
+    result = compare("vision_encoder", samples, lambda feeds: {"visual_tokens": session.run(None, feeds)[0]})
+    assert result.cosine > 0.999
+    assert 0 < result.max_abs < 0.2

@@ -12,6 +12,7 @@ from onnx import TensorProto
 from export.graphs.action import write_action, write_context
 from export.graphs.language import ROLES, write_language
 from export.graphs.vision import write_vision
+from export.graphs.writer import Ranges
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
 from export.precision import Precision, bits
@@ -34,17 +35,27 @@ def graph_names(pair: bool) -> tuple[str, ...]:
 
 
 def write_graph(
-    model: TicVla, name: str, precision: Precision, form: str, directory: Path, *, half: bool = False
+    model: TicVla,
+    name: str,
+    precision: Precision,
+    form: str,
+    directory: Path,
+    *,
+    half: bool = False,
+    ranges: Ranges | None = None,
 ) -> list[str]:
     """Write one graph and return the names of its files; same weights and precision → same bytes.
 
-    `half`: activations and KV buffers in fp16 (GPU targets). Raises ValueError for a name or form that is not known.
+    `half`: activations and KV buffers in fp16 (GPU targets). `ranges`: of the inputs of the encoder's layers, for its
+    plain int8 form. Raises ValueError for a name or form that is not known.
     """
     if form not in FORMS:
         raise ValueError(f"form {form!r} is not known; expected one of {FORMS}")
     if name == "vision_encoder":
         external = _weight_bytes(model.vision, precision) > SINGLE_FILE_BYTES
-        return write_vision(model.vision, directory, precision=precision, form=form, half=half, external=external)
+        return write_vision(
+            model.vision, directory, precision=precision, form=form, half=half, external=external, ranges=ranges
+        )
     if name in ROLES:
         vision = model.config.vision
         return write_language(

@@ -8,7 +8,7 @@ import numpy as np
 from onnx import TensorProto
 from torch import Tensor, nn
 
-from export.graphs.writer import Array, GraphWriter
+from export.graphs.writer import Array, GraphWriter, Ranges
 from export.model.vision import VisionBlock, VisionEncoder
 from export.precision import Precision
 
@@ -20,11 +20,21 @@ def array(tensor: Tensor) -> Array:
 
 
 def write_vision(
-    vision: VisionEncoder, directory: Path, *, precision: Precision, form: str, half: bool, external: bool
+    vision: VisionEncoder,
+    directory: Path,
+    *,
+    precision: Precision,
+    form: str,
+    half: bool,
+    external: bool,
+    ranges: Ranges | None = None,
 ) -> list[str]:
-    """Write vision_encoder.onnx: frame [1, px, px, 3] → visual_tokens [1, N, D]."""
-    c = vision.config
-    with GraphWriter(directory, "vision_encoder", precision=precision, form=form, half=half, external=external) as g:
+    """Write vision_encoder.onnx: frame [1, px, px, 3] → visual_tokens [1, N, D].
+
+    `ranges` let the plain int8 form round activations too.
+    """
+    c, name = vision.config, "vision_encoder"
+    with GraphWriter(directory, name, precision=precision, form=form, half=half, external=external, ranges=ranges) as g:
         frame = g.input("frame", TensorProto.UINT8, (1, c.image_px, c.image_px, 3))
         x = _stem(g, vision, frame) if c.stem_channels else _patches(g, vision, frame)
         position = array(vision.position)
@@ -109,7 +119,7 @@ def _block(g: GraphWriter, x: str, name: str, block: VisionBlock, eps: float) ->
                 f"{name}.{'qkv'[part]}",
                 weight[rows] * factor,
                 bias[rows] * factor,
-                precision=g.precision.of(f"{name}.qkv"),
+                of=f"{name}.qkv",
             )
         )
     if g.fused:

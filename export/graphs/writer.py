@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +16,8 @@ from export.precision import PRECISIONS, Precision, block_size
 from export.quantize import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
+Ranges = Mapping[str, float]
+"""Largest magnitude that calibration met at a layer's input, by layer name."""
 
 OPSET = 20
 IR_VERSION = 10
@@ -33,12 +35,22 @@ class GraphWriter:
     """A graph under construction; as a context manager it leaves NAME.onnx (and NAME.onnx.data) or nothing."""
 
     def __init__(
-        self, directory: Path, name: str, *, precision: Precision, form: str, half: bool, external: bool
+        self,
+        directory: Path,
+        name: str,
+        *,
+        precision: Precision,
+        form: str,
+        half: bool,
+        external: bool,
+        ranges: Ranges | None = None,
     ) -> None:
         self.name = name
         self.precision = precision
         self.fused = form == "fused"
         self.half = half
+        self._ranges = ranges or {}
+        self._rounded: dict[tuple[str, float], str] = {}
         self.float = np.dtype(np.float16 if half else np.float32)
         self.float_type = TensorProto.FLOAT16 if half else TensorProto.FLOAT
         self._path = directory / f"{name}.onnx"
@@ -155,16 +167,28 @@ class GraphWriter:
         self._initializers.append(tensor)
         return name
 
-    def linear(self, x: str, layer: str, weight: Array, bias: Array | None, *, precision: str | None = None) -> str:
-        """x [..., in] · weight [out, in]ᵀ + bias in the precision that the graph gives this layer."""
-        precision = precision or self.precision.of(layer)
+    def linear(
+        self,
+        x: str,
+        layer: str,
+        weight: Array,
+        bias: Array | None,
+        *,
+        of: str | None = None,
+        precision: str | None = None,
+    ) -> str:
+        """x [..., in] · weight [out, in]ᵀ + bias in the precision that the graph gives this layer.
+
+        `of`: the network's layer that this is a part of, by whose name precision and range are looked up.
+        """
+        precision = precision or self.precision.of(of or layer)
         self.parameters += weight.size + (0 if bias is None else bias.size)
         if precision == "int8" and self.fused:
             return self._dynamic_int8(x, layer, weight, bias)
         if block_size(precision) is not None:
             return self._blocks(x, layer, weight, bias, precision)
         if precision == "int8":
-            return self._weight_int8(x, layer, weight, bias)
+            return self._static_int8(x, layer, weight, bias, self._ranges.get(of or layer))
         y = self.op("MatMul", [x, self.weight(weight.T.astype(self.float), f"{layer}.weight")])
         return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
 
@@ -175,11 +199,27 @@ class GraphWriter:
             inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
         return self.op("DynamicQuantizeMatMul", inputs, contrib=True)
 
-    def _weight_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
+    def _static_int8(self, x: str, layer: str, weight: Array, bias: Array | None, largest: float | None) -> str:
+        """Quantise-dequantise around a product, in the one form that compilers turn into 8-bit kernels.
+
+        Input: one symmetric range a tensor, from calibration, rounded once for all layers that read it. Weights: 8 bits
+        a channel. Nothing around attention or additions: quantising those too is what made it slower, not faster.
+        Without a range only the weights are rounded.
+        """
         q = quantise_channels(weight)
         stored = [self.weight(q.values.T, f"{layer}.weight"), self.floats(q.scales, f"{layer}.scale")]
-        y = self.op("MatMul", [x, self.op("DequantizeLinear", stored, axis=1)])
-        return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
+        product = self.op("MatMul", [self._round(x, layer, largest), self.op("DequantizeLinear", stored, axis=1)])
+        return product if bias is None else self.op("Add", [product, self.floats(bias, f"{layer}.bias")])
+
+    def _round(self, x: str, layer: str, largest: float | None) -> str:
+        if not largest:
+            return x
+        if (x, largest) not in self._rounded:
+            scale = self.floats(np.float32(largest / 127), f"{layer}.input_scale")
+            zero = self.constant(np.zeros((), np.int8), "zero")
+            codes = self.op("QuantizeLinear", [x, scale, zero])
+            self._rounded[x, largest] = self.op("DequantizeLinear", [codes, scale, zero])
+        return self._rounded[x, largest]
 
     def _blocks(self, x: str, layer: str, weight: Array, bias: Array | None, precision: str) -> str:
         q = quantise_blocks(weight, precision)
