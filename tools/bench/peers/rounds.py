@@ -105,7 +105,7 @@ def run_rounds(
     quiet_wait_s: float,
     failed: Callable[[str, str], None],
 ) -> Iterator[Round]:
-    """Rounds until `repeats` of them were quiet, at most half as many again; a contender that fails leaves the field."""
+    """Rounds until `repeats` were quiet, at most half as many again; a contender that fails leaves the field."""
     alive = dict(workers)
     for worker, tasks in list(alive.values()):
         try:
