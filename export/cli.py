@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -202,6 +203,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
+    # Told to end, it ends as on Ctrl-C: what is half-written goes, what is finished stays.
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        return _main(args, started_ns)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _interrupt(_signal: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _main(args: argparse.Namespace, started_ns: int) -> int:
     if args.list_targets:
         for name in list_targets():
             sys.stdout.write(f"{name}\t{load_target(name).description}\n")

@@ -1,7 +1,6 @@
 """Runs the graphs of a directory for the gate: from the verified bytes, on the provider that ships if it is here.
 
-What the network is compared with comes from PyTorch in fp32 (`parity.references`, `run_stages`) and is kept in files,
-so that the two never have to be in memory together.
+What the network is compared with comes from PyTorch in fp32 (`parity.references`, `run_stages`).
 """
 
 from __future__ import annotations
@@ -9,20 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 import onnxruntime as ort
-from safetensors.numpy import load_file, save_file
 
 from edge.graph import CPU_PROVIDER, DTYPES, Graph
 from edge.language import LanguageModel
 from edge.manifest import Artifacts
 from export.graphs.writer import IR_VERSION, OPSET
-from export.metrics import Arrays, Sample
+from export.metrics import Arrays
 from export.model.config import TicVlaConfig
 from export.task_error import StageOutputs, TaskError, plan, prompt_parts
 from export.task_error import compare as compare_task
@@ -40,50 +37,6 @@ def threads_for(config: TicVlaConfig) -> int:
     """Threads for everything that is measured on a model: always the same number, because another one may sum in
     another order and report another last digit. A small model's kernels are too short for two."""
     return 2 if is_large(config) else 1
-
-
-def save_samples(samples: Sequence[Sample], path: Path) -> None:
-    """Write test inputs and expected outputs to one safetensors file."""
-    tensors = {
-        f"{index}/{kind}/{name}": np.ascontiguousarray(array)
-        for index, sample in enumerate(samples)
-        for kind, arrays in (("feed", sample.feeds), ("expected", sample.expected))
-        for name, array in arrays.items()
-    }
-    save_file(tensors, path)
-
-
-def load_samples(path: Path) -> list[Sample]:
-    """Inverse of `save_samples`."""
-    samples: dict[int, Sample] = {}
-    for key, array in load_file(path).items():
-        index, kind, name = key.split("/", 2)
-        sample = samples.setdefault(int(index), Sample({}, {}))
-        (sample.feeds if kind == "feed" else sample.expected)[name] = array
-    return [samples[index] for index in sorted(samples)]
-
-
-def save_outputs(outputs: StageOutputs, path: Path) -> None:
-    """Write the reference of the task error to one safetensors file."""
-    tensors = {
-        f"{kind}/{index}": np.ascontiguousarray(array)
-        for kind in ("visual", "kv", "trajectories", "swapped")
-        for index, array in enumerate(getattr(outputs, kind))
-    }
-    tensors |= {f"token_ids/{index}": np.array(ids, dtype=np.int64) for index, ids in enumerate(outputs.token_ids)}
-    save_file(tensors, path)
-
-
-def load_outputs(path: Path) -> StageOutputs:
-    """Inverse of `save_outputs`."""
-    tensors = load_file(path)
-
-    def of(kind: str) -> tuple[Any, ...]:
-        count = sum(key.startswith(f"{kind}/") for key in tensors)
-        return tuple(tensors[f"{kind}/{index}"] for index in range(count))
-
-    token_ids = tuple(tuple(int(token) for token in ids) for ids in of("token_ids"))
-    return StageOutputs(of("visual"), of("kv"), token_ids, of("trajectories"), of("swapped"))
 
 
 @lru_cache

@@ -21,10 +21,6 @@ from export.gate_run import (
     OpenGraph,
     TaskCheck,
     gate_provider,
-    load_outputs,
-    load_samples,
-    save_outputs,
-    save_samples,
     threads_for,
 )
 from export.gates import GateError, GateResult, TaskResult, judge
@@ -36,6 +32,7 @@ from export.parity import references
 from export.precision import PRECISIONS, Precision
 from export.progress import Progress, Stage
 from export.ranges import activation_ranges
+from export.sample_files import load_outputs, load_samples, save_outputs, save_samples
 from export.sensitivity import Limits, Search, search_samples
 from export.stages import ENTRY_NAME, StageCache, file_sha256, stage_key
 from export.task_error import StageOutputs, TaskErrorError, run_stages
@@ -50,6 +47,15 @@ DECISION_FILE = "decision.json"
 RANGES_FILE = "ranges.json"
 RANGE_FRAMES = 8
 """Frames of the calibration set over which ranges of activations are taken, evenly spread."""
+
+WEIGHTS_CODE = ("export.checkpoint.load", "export.checkpoint.tokenizer", "export.model.weights")
+REFERENCE_CODE = ("export.parity", "export.sample_files")
+TASK_CODE = ("export.task_samples", "export.torch_stages", "export.sample_files")
+PRECISION_CODE = ("export.sensitivity",)
+RANGES_CODE = ("export.ranges",)
+GRAPH_CODE = ("export.graphs.build",)
+GATE_CODE = ("export.gate_run", "export.gates", "export.sample_files")
+"""The modules that make each kind of stage; what they import counts too (`stages.source_sha256`)."""
 
 EXPECTED_S = {
     "weights": (0.3, 30.0),
@@ -160,7 +166,7 @@ class Pipeline:
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
             (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded))
 
-        return self._stage("weights", stage_key("weights", self.job.weights.fingerprint()), build)
+        return self._stage("weights", stage_key("weights", self.job.weights.fingerprint(), WEIGHTS_CODE), build)
 
     def _parts(self, **more: Any) -> dict[str, Any]:
         """Parts of every key that depends on the network: its weights, wherever they came from, and the rest."""
@@ -169,7 +175,8 @@ class Pipeline:
     # ---- what PyTorch gives
 
     def _reference_key(self, graph: str) -> str:
-        return stage_key("reference", self._parts(graph=graph, inputs=self.job.target.gate(graph).inputs))
+        parts = self._parts(graph=graph, inputs=self.job.target.gate(graph).inputs)
+        return stage_key("reference", parts, REFERENCE_CODE)
 
     def reference(self, graph: str) -> Path:
         """Test inputs of a graph and PyTorch's outputs."""
@@ -188,7 +195,10 @@ class Pipeline:
     def _task_key(self) -> str:
         offsets = list(self.job.target.runtime.frame_offsets_s)
         calibration, tokenizer = self.job.calibration.sha256, hashlib.sha256(self.tokenizer()).hexdigest()
-        return stage_key("task", self._parts(calibration=calibration, tokenizer=tokenizer, frame_offsets_s=offsets))
+        parts = self._parts(
+            calibration=calibration, tokenizer=tokenizer, frame_offsets_s=offsets, new_tokens=NEW_TOKENS
+        )
+        return stage_key("task", parts, TASK_CODE)
 
     def task_reference(self) -> Path:
         """PyTorch's plans in those situations."""
@@ -231,6 +241,7 @@ class Pipeline:
                 "limits": asdict(limits),
                 "measured": [asdict(point) for point in points],
             },
+            PRECISION_CODE,
         )
 
         def build(directory: Path) -> None:
@@ -271,7 +282,7 @@ class Pipeline:
         precision, _ = self.precision(graph)
         ranges = self._ranges(graph, precision)
         parts = self._parts(graph=graph, precision=precision.to_dict(), form=policy.form, half=half, ranges=ranges)
-        key = stage_key("graph", parts)
+        key = stage_key("graph", parts, GRAPH_CODE)
 
         def build(directory: Path) -> None:
             model = self.job.weights.get().model
@@ -291,7 +302,11 @@ class Pipeline:
             ranges = activation_ranges(self.job.weights.get().model.vision, frames)
             (directory / RANGES_FILE).write_text(json.dumps(ranges, sort_keys=True, allow_nan=False), encoding="utf-8")
 
-        entry = self._stage("activation ranges", stage_key("ranges", {"task": self._task_key()}), build)
+        entry = self._stage(
+            "activation ranges",
+            stage_key("ranges", {"task": self._task_key(), "frames": RANGE_FRAMES}, RANGES_CODE),
+            build,
+        )
         content: dict[str, float] = json.loads((entry / RANGES_FILE).read_text(encoding="utf-8"))
         return content
 
@@ -345,6 +360,7 @@ class Pipeline:
                 "threads": self._threads,
                 "machine": machine_name(),
             },
+            GATE_CODE,
         )
 
     def _parity(self, artifacts: Artifacts, graph: str) -> ParityResult:

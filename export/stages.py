@@ -7,13 +7,14 @@ one is rebuilt, not shipped. Files leave the cache by copy only: nothing done to
 
 from __future__ import annotations
 
+import ast
 import fcntl
 import hashlib
 import importlib.metadata
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -26,6 +27,7 @@ ENTRY_NAME = "entry.json"
 RESULT_NAME = "result.json"
 PACKAGES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "tokenizers", "torch")
 SOURCE_FOLDERS = ("edge", "export")
+DATA_SUFFIXES = (".json", ".toml")
 _LOCK_NAME = "lock"
 _TIMINGS_NAME = "timings.json"
 _CHUNK_BYTES = 1 << 22
@@ -50,14 +52,43 @@ def file_sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-@lru_cache(maxsize=1)
-def source_sha256() -> str:
-    """Hash of all our code and data that can change a result: another version of it finds none of the old entries."""
+@lru_cache
+def source_sha256(modules: tuple[str, ...]) -> str:
+    """Hash of our modules, of all of ours that they import, and of the data files beside these.
+
+    Another version of that code finds none of the old entries; an edit anywhere else leaves them valid.
+    """
     root, digest = Path(__file__).parents[1], hashlib.sha256()
-    files = (p for folder in SOURCE_FOLDERS for p in (root / folder).rglob("*") if "__pycache__" not in p.parts)
-    for path in sorted(p for p in files if p.is_file()):
+    waiting, found = list(modules), dict[str, Path]()
+    while waiting:
+        name = waiting.pop()
+        path = _module_file(root, name)
+        if path is not None and name not in found:
+            found[name] = path
+            waiting += [imported for imported in _imports(path) if imported.split(".")[0] in SOURCE_FOLDERS]
+    folders = {path.parent for path in found.values()}
+    data = {path for folder in folders for path in folder.iterdir() if path.suffix in DATA_SUFFIXES}
+    for path in sorted({*found.values(), *data}):
         digest.update(f"{path.relative_to(root).as_posix()}:{file_sha256(path)}\n".encode())
     return digest.hexdigest()
+
+
+def _module_file(root: Path, name: str) -> Path | None:
+    """A module's file; None for a name inside a module."""
+    stem = root.joinpath(*name.split("."))
+    candidates = [stem.with_suffix(".py"), stem / "__init__.py"]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _imports(path: Path) -> set[str]:
+    """Names that a file imports, at its top or inside functions; `from a import b` may mean the module a.b."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
 
 
 def package_versions() -> dict[str, str]:
@@ -65,9 +96,10 @@ def package_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
-def stage_key(stage: str, parts: Mapping[str, Any]) -> str:
-    """SHA-256 of everything that a stage's result follows from; `parts` is plain JSON."""
-    content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source_sha256()}
+def stage_key(stage: str, parts: Mapping[str, Any], modules: Sequence[str]) -> str:
+    """SHA-256 of everything that a stage's result follows from: `parts` (plain JSON) and the code of `modules`."""
+    source = source_sha256(tuple(sorted(modules)))
+    content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source}
     return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 

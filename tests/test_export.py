@@ -274,8 +274,9 @@ def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened
     subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
 
 
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM], ids=lambda told: told.name)
 def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
-    artifacts_dir: Path, tmp_path: Path
+    artifacts_dir: Path, tmp_path: Path, told: signal.Signals
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", "--out", str(out), "--cache", str(cache)]
@@ -285,7 +286,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
         for line in process.stderr:
             if "gate vision_encoder · " in line:
                 break
-        process.send_signal(signal.SIGINT)
+        process.send_signal(told)
         assert process.wait(timeout=60) == 130
     finally:
         process.kill()

@@ -16,6 +16,7 @@ from export import stages
 from export.stages import CacheError, StageCache, default_cache_dir, open_cache, stage_key
 
 GIB = 1 << 30
+CODE = ("export.precision",)
 
 
 class Notes:
@@ -51,7 +52,7 @@ def entries(directory: Path) -> list[str]:
 
 
 def test_the_same_parts_name_the_same_stage_in_any_order() -> None:
-    assert stage_key("graph", {"a": 1, "b": [2]}) == stage_key("graph", {"b": [2], "a": 1})
+    assert stage_key("graph", {"a": 1, "b": [2]}, CODE) == stage_key("graph", {"b": [2], "a": 1}, CODE)
 
 
 @pytest.mark.parametrize(
@@ -59,19 +60,57 @@ def test_the_same_parts_name_the_same_stage_in_any_order() -> None:
     [("gate", {"a": 1}), ("graph", {"a": 2}), ("graph", {"a": 1, "b": 0}), ("graph", {"a": "1"}), ("graph", {})],
 )
 def test_any_other_part_names_another_stage(stage: str, parts: dict[str, object]) -> None:
-    assert stage_key(stage, parts) != stage_key("graph", {"a": 1})
+    assert stage_key(stage, parts, CODE) != stage_key("graph", {"a": 1}, CODE)
 
 
 def test_another_package_version_names_another_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = stage_key("graph", {})
+    before = stage_key("graph", {}, CODE)
     monkeypatch.setattr(stages, "package_versions", lambda: {"onnx": "0.0"})
-    assert stage_key("graph", {}) != before
+    assert stage_key("graph", {}, CODE) != before
 
 
 def test_another_version_of_our_code_names_another_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = stage_key("graph", {})
-    monkeypatch.setattr(stages, "source_sha256", lambda: "edited")
-    assert stage_key("graph", {}) != before
+    before = stage_key("graph", {}, CODE)
+    monkeypatch.setattr(stages, "source_sha256", lambda _: "edited")
+    assert stage_key("graph", {}, CODE) != before
+
+
+@pytest.fixture
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A tree of ours in small: a imports b.c inside a function, d is nobody's."""
+    for name, text in {
+        "export/a.py": "def f():\n    from edge.b import c\n",
+        "edge/b/__init__.py": "",
+        "edge/b/c.py": "import numpy\n",
+        "edge/b/numbers.json": "{}",
+        "edge/d.py": "",
+        "export/stages.py": "",
+    }.items():
+        path = tmp_path / "root" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr(stages, "__file__", str(tmp_path / "root" / "export" / "stages.py"))
+    stages.source_sha256.cache_clear()
+    yield tmp_path / "root"
+    stages.source_sha256.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("edited", "counts"),
+    [
+        ("export/a.py", True),
+        ("edge/b/c.py", True),
+        ("edge/b/__init__.py", True),
+        ("edge/b/numbers.json", True),
+        ("edge/d.py", False),
+        ("export/stages.py", False),
+    ],
+)
+def test_an_edit_counts_where_the_stages_code_can_reach_it(sources: Path, edited: str, counts: bool) -> None:
+    before = stages.source_sha256(("export.a",))
+    (sources / edited).write_text((sources / edited).read_text() + " ")
+    stages.source_sha256.cache_clear()
+    assert (stages.source_sha256(("export.a",)) != before) is counts
 
 
 def test_a_stage_is_built_once(cache: StageCache) -> None:
