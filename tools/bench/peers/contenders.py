@@ -79,6 +79,9 @@ CONTENDERS = (
     _language("torch language bf16", "torch", "bf16"),
     _language("torch language int8", "torch", "int8"),
     _language("llama.cpp q4_0", "llama", "q4_0"),
+    # Repacked weights are a copy beside the mapped file: reading the file, or not repacking, may be leaner.
+    _language("llama.cpp q4_0 read", "llama", "q4_0", weights="read"),
+    _language("llama.cpp q4_0 lean", "llama", "q4_0", extra_buffers="false"),
     _language("llama.cpp q8_0", "llama", "q8_0"),
     _language("genai int4", "genai", "int4"),
     *(
