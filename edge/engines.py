@@ -20,10 +20,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from edge.artifact_files import HASH_BLOCK_BYTES, ArtifactError, read_manifest
 from edge.cli import write_whole
 from edge.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
 from edge.graph import DTYPES, Array, Graph, GraphError
-from edge.manifest import HASH_BLOCK_BYTES, ArtifactError, Artifacts, TensorContract, read_manifest
+from edge.manifest import Artifacts, TensorContract
 
 ENGINES_NAME = "engines.json"
 SCHEMA = 1

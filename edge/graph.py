@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from edge.manifest import ArtifactError, Artifacts, TensorContract
+from edge.artifact_files import ArtifactError
+from edge.manifest import Artifacts, TensorContract
 
 Array = npt.NDArray[np.generic]
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edge import engines
+from edge.artifact_files import ArtifactError
 from edge.cli import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -17,7 +18,7 @@ from edge.cli import (
     check_result_target,
     write_result,
 )
-from edge.manifest import ArtifactError, load_artifacts
+from edge.manifest import load_artifacts
 
 EXAMPLES = """examples:
   edge-install engines --artifacts out/orin

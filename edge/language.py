@@ -11,9 +11,10 @@ import numpy.typing as npt
 import onnxruntime as ort
 from tokenizers import Tokenizer
 
+from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
 from edge.graph import DTYPES, Graph, zeros
-from edge.manifest import ArtifactError, Artifacts
+from edge.manifest import Artifacts
 from edge.prompt import InstructionError, PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_TEXT_CHARS
 from edge.ring import EncodedFrame

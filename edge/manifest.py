@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SCHEMA_VERSION = 2
-MANIFEST_NAME = "manifest.json"
-MAX_MANIFEST_BYTES = 4_000_000
+from edge.artifact_files import MANIFEST_NAME, SEAL, ArtifactError, FileIdentity, hash_file, read_file, read_manifest
+
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
-HASH_BLOCK_BYTES = 1 << 20
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
-_SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "plan", "provenance")
 _POSITIVE = frozenset(
     {
         "image_px",
@@ -30,10 +23,6 @@ _POSITIVE = frozenset(
         "step_s",
     }
 )
-
-
-class ArtifactError(ValueError):
-    """An artifact directory that must not be run; its text is the one line to show."""
 
 
 @dataclass(frozen=True)
@@ -55,22 +44,6 @@ class SessionConfig:
     """Intra-op threads; None leaves them to the runner."""
     engine: bool
     """The provider compiles an engine, which has to be built on the device before any run."""
-
-
-@dataclass(frozen=True)
-class FileIdentity:
-    """What tells whether a file is still the one that was hashed."""
-
-    device: int
-    inode: int
-    size: int
-    modified_ns: int
-
-    @classmethod
-    def of(cls, path: Path) -> FileIdentity:
-        """Identity of the file at a path; raises OSError."""
-        found = path.stat(follow_symlinks=False)
-        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
 
 
 @dataclass(frozen=True)
@@ -166,11 +139,11 @@ class Artifacts:
 
 def load_artifacts(directory: Path) -> Artifacts:
     """Verify every file's size and SHA-256, the schema version and the I/O contract; raises ArtifactError."""
-    raw, manifest = _read_manifest(directory)
+    manifest = read_manifest(directory)
     files = _section(manifest, "files")
     data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
-    contents = {name: _read_file(directory, name, entry) for name, entry in files.items() if name not in data}
-    identities = {name: _hash_file(directory, name, entry) for name, entry in files.items() if name in data}
+    contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
+    identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
     unlisted = sorted(p.name for p in directory.iterdir() if p.name not in files and p.name != MANIFEST_NAME)
     if unlisted:
         raise ArtifactError(f"{directory / unlisted[0]}: not listed in the manifest; export again into a new directory")
@@ -192,7 +165,7 @@ def load_artifacts(directory: Path) -> Artifacts:
     model = _section(manifest, "model")
     artifacts = Artifacts(
         directory=directory,
-        manifest_sha256=hashlib.sha256(raw).hexdigest(),
+        manifest_sha256=str(manifest[SEAL]),
         target=str(manifest["target"]),
         model_name=str(model.get("name")),
         trained=model.get("trained") is True,
@@ -203,38 +176,6 @@ def load_artifacts(directory: Path) -> Artifacts:
     )
     check_contract(artifacts)
     return artifacts
-
-
-def read_manifest(directory: Path) -> dict[str, Any]:
-    """The manifest as JSON, checked for version and sections only; raises ArtifactError."""
-    return _read_manifest(directory)[1]
-
-
-def _read_manifest(directory: Path) -> tuple[bytes, dict[str, Any]]:
-    path = directory / MANIFEST_NAME
-    if not directory.is_dir():
-        raise ArtifactError(f"{directory}: not a directory; make one with edge-export --out {directory}")
-    try:
-        if path.stat().st_size > MAX_MANIFEST_BYTES:
-            raise ArtifactError(f"{path}: larger than {MAX_MANIFEST_BYTES} bytes, refused")
-        raw = path.read_bytes()
-        manifest: Any = json.loads(raw)
-    except OSError as error:
-        raise ArtifactError(
-            f"{path}: cannot be read ({error.strerror}); is this a directory of edge-export?"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise ArtifactError(f"{path}: not JSON ({error})") from error
-    if not isinstance(manifest, dict):
-        raise ArtifactError(f"{path}: expected a JSON object")
-    if manifest.get("schema_version") != SCHEMA_VERSION:
-        raise ArtifactError(
-            f"{path}: schema version {manifest.get('schema_version')!r}, expected {SCHEMA_VERSION}; export again"
-        )
-    missing = [section for section in _SECTIONS if section not in manifest]
-    if missing:
-        raise ArtifactError(f"{path}: sections {missing} are missing")
-    return raw, manifest
 
 
 def _section(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -250,48 +191,6 @@ def _data_files(graph: Any) -> list[str]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ArtifactError(f"{MANIFEST_NAME}: every graph must list its data_files")
     return names
-
-
-def _check_file(directory: Path, name: str, entry: Any) -> Path:
-    """Path of a listed file that is a regular file of the listed size; raises ArtifactError."""
-    if not _PLAIN_NAME.fullmatch(name) or name == MANIFEST_NAME:
-        raise ArtifactError(f"{MANIFEST_NAME}: file name {name!r} is not a plain name")
-    path = directory / name
-    if (
-        not isinstance(entry, dict)
-        or not isinstance(entry.get("bytes"), int)
-        or not isinstance(entry.get("sha256"), str)
-    ):
-        raise ArtifactError(f"{MANIFEST_NAME}: entry of {name} must give bytes and sha256")
-    if path.is_symlink() or not path.is_file():
-        raise ArtifactError(f"{path}: missing or not a regular file")
-    if path.stat().st_size != entry["bytes"]:
-        raise ArtifactError(f"{path}: {path.stat().st_size} bytes, the manifest says {entry['bytes']}; export again")
-    return path
-
-
-def _compare(path: Path, found: str, entry: Mapping[str, Any]) -> None:
-    if found != entry["sha256"]:
-        raise ArtifactError(f"{path}: sha256 {found[:12]}…, the manifest says {entry['sha256'][:12]}…; export again")
-
-
-def _read_file(directory: Path, name: str, entry: Any) -> bytes:
-    path = _check_file(directory, name, entry)
-    data = path.read_bytes()
-    _compare(path, hashlib.sha256(data).hexdigest(), entry)
-    return data
-
-
-def _hash_file(directory: Path, name: str, entry: Any) -> FileIdentity:
-    """Verify a file that is too large to be held; returns what it is recognised by afterwards."""
-    path = _check_file(directory, name, entry)
-    identity = FileIdentity.of(path)
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(HASH_BLOCK_BYTES):
-            digest.update(block)
-    _compare(path, digest.hexdigest(), entry)
-    return identity
 
 
 def _tensors(graph: str, entry: Mapping[str, Any], key: str) -> tuple[TensorContract, ...]:

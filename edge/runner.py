@@ -13,6 +13,7 @@ from types import FrameType
 import cv2
 
 from edge import engines
+from edge.artifact_files import ArtifactError
 from edge.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
@@ -22,7 +23,7 @@ from edge.cli import (
     check_result_target,
     write_result,
 )
-from edge.manifest import ArtifactError, load_artifacts
+from edge.manifest import load_artifacts
 from edge.prompt import InstructionError, check_instruction
 from edge.release import ReleaseDelayError, parse_release_delay
 from edge.session import RefusedError, RunOptions, RunSession, StoppedEarlyError

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import psutil
 
+from edge.artifact_files import ArtifactError
 from edge.camera import CameraPoller
 from edge.control_loop import ControlLoop
 from edge.controller import Controller, ControllerConfig
 from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.language import ContextOverflowError, LanguageModel
-from edge.manifest import ArtifactError, Artifacts
+from edge.manifest import Artifacts
 from edge.odometry import PoseHistory, StampedPose
 from edge.policy import Policy
 from edge.reasoning_loop import ReasoningLoop, SemanticSlot

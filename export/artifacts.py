@@ -8,13 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from edge.manifest import (
-    MANIFEST_NAME,
-    SCHEMA_VERSION,
-    ArtifactError,
-    load_artifacts,
-    read_manifest,
-)
+from edge.artifact_files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
+from edge.manifest import load_artifacts
 from export.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
 from export.job import Job
@@ -166,7 +161,7 @@ def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
     manifest["files"] = {
         name: {"sha256": file_sha256(directory / name), "bytes": (directory / name).stat().st_size} for name in names
     }
-    _write_json(directory / MANIFEST_NAME, manifest)
+    _write_json(directory / MANIFEST_NAME, seal(manifest))
 
 
 def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, GateResult]:

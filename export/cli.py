@@ -15,8 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
+from edge.artifact_files import ArtifactError
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
-from edge.manifest import ArtifactError, load_artifacts
+from edge.manifest import load_artifacts
 from export.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.calibration import CalibrationError, load_calibration
 from export.gates import GateError

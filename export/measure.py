@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from edge.artifact_files import ArtifactError, read_manifest
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
 from edge.device import read_device
 from edge.geometry import SE2
 from edge.language import Generation, LanguageModel
-from edge.manifest import ArtifactError, Artifacts, load_artifacts, read_manifest
+from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState

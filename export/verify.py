@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge.manifest import MANIFEST_NAME, ArtifactError, read_manifest
+from edge.artifact_files import MANIFEST_NAME, ArtifactError, read_manifest
 from export.calibration import load_calibration
 from export.job import Job, WeightSource
 from export.model.config import ModelConfigError

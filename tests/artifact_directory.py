@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from edge.manifest import MANIFEST_NAME, SCHEMA_VERSION
+from edge.artifact_files import MANIFEST_NAME, SCHEMA_VERSION, seal
 from export.graphs.build import graph_contract, graph_names, write_graph
 from export.model.network import TicVla
 from export.model.tokenizer import NANO_TOKENIZER
@@ -54,5 +54,5 @@ def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, preci
         "plan": {},
         "provenance": {},
     }
-    (directory / MANIFEST_NAME).write_text(json.dumps(manifest))
+    (directory / MANIFEST_NAME).write_text(json.dumps(seal(manifest)))
     return directory

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge.artifact_files import seal
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
 from edge.device import (
     OPENVINO,
@@ -86,7 +87,7 @@ def edit(directory: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path = directory / "manifest.json"
     manifest = json.loads(path.read_text())
     change(manifest)
-    path.write_text(json.dumps(manifest))
+    path.write_text(json.dumps(seal(manifest)))
 
 
 def for_orin(manifest: dict[str, Any]) -> None:
@@ -409,7 +410,7 @@ def test_a_runner_without_the_engines_refuses_before_anything_moves(
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
     manifest = json.loads((copy / "manifest.json").read_text())
     manifest["graphs"]["vision_encoder"]["session"].update(provider="TensorrtExecutionProvider", engine=True)
-    (copy / "manifest.json").write_text(json.dumps(manifest))
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
     robot = Path(__file__).parents[1] / "firmware_bridge/robots/go2_sim.toml"
     code = run(["--artifacts", str(copy), "--robot", str(robot), "--instruction", "go", "--duration", "1"])
     error = capsys.readouterr().err

@@ -15,6 +15,7 @@ import numpy as np
 import onnx
 import pytest
 
+from edge.artifact_files import seal
 from edge.manifest import Artifacts, load_artifacts
 from export.artifacts import build_artifacts
 from export.calibration import load_calibration
@@ -230,7 +231,7 @@ def test_verify_holds_a_directory_to_the_thresholds_it_was_built_under(
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
     content = manifest(copy)
     content["provenance"]["target"]["gates"]["action_expert"]["max_abs"] = 1e-12
-    (copy / "manifest.json").write_text(json.dumps(content))
+    (copy / "manifest.json").write_text(json.dumps(seal(content)))
     assert main(["verify", str(copy)]) == 1
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import onnx
 import pytest
 
+from edge.artifact_files import seal
 from export.cli import main
 
 Damage = Callable[[Path], None]
@@ -21,7 +22,7 @@ def edit(directory: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path = directory / "manifest.json"
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(seal(content)))
 
 
 def replace(directory: Path, name: str, data: bytes) -> None:

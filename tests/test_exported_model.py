@@ -7,10 +7,11 @@ import onnxruntime as ort
 import pytest
 import torch
 
+from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
 from edge.graph import Graph
 from edge.language import CancelledError, LanguageModel
-from edge.manifest import ArtifactError, Artifacts
+from edge.manifest import Artifacts
 from edge.policy import Policy
 from edge.ring import EncodedFrame
 from export.gate_run import gate_provider

@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from edge.artifact_files import ArtifactError, seal
 from edge.graph import Graph
 from edge.language import LanguageModel
-from edge.manifest import ArtifactError, load_artifacts
+from edge.manifest import load_artifacts
 from edge.policy import Policy
 from export.cli import main
 
@@ -29,7 +32,7 @@ def edit(directory: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path = directory / "manifest.json"
     manifest = json.loads(path.read_text())
     change(manifest)
-    path.write_text(json.dumps(manifest))
+    path.write_text(json.dumps(seal(manifest)))
 
 
 def test_a_fresh_export_is_accepted(artifacts_dir: Path) -> None:
@@ -45,6 +48,37 @@ def test_one_flipped_bit_anywhere_is_refused_by_name(copy: Path, name: str) -> N
     (copy / name).write_bytes(data)
     with pytest.raises(ArtifactError, match=rf"{name}: sha256"):
         load_artifacts(copy)
+
+
+@pytest.mark.parametrize("section", ["runtime", "graphs", "model", "provenance", "plan"])
+def test_a_change_anywhere_in_the_manifest_is_refused(copy: Path, section: str) -> None:
+    path = copy / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest[section]["tick_period_ms"] = 900
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(ArtifactError, match=r"manifest.json: sha256 of its content"):
+        load_artifacts(copy)
+
+
+@given(data=st.data())
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_flipped_bit_of_the_manifest_is_accepted(copy: Path, data: st.DataObject) -> None:
+    path = copy / "manifest.json"
+    whole = path.read_bytes()
+    position = data.draw(st.integers(0, len(whole) - 1))
+    flipped = bytearray(whole)
+    flipped[position] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        same = json.loads(bytes(flipped)) == json.loads(whole)
+    except ValueError:
+        same = False
+    path.write_bytes(bytes(flipped))
+    try:
+        if not same:  # a space that became a tab says the same
+            with pytest.raises(ArtifactError, match=r"manifest\.json"):
+                load_artifacts(copy)
+    finally:
+        path.write_bytes(whole)
 
 
 def test_a_truncated_file_is_refused(copy: Path) -> None:

@@ -29,8 +29,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from edge.artifact_files import ArtifactError
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
-from edge.manifest import ArtifactError, load_artifacts
+from edge.manifest import load_artifacts
 from tools.bench.peers.contenders import EVERYTHING, OURS, Contender, chosen
 from tools.bench.peers.process import ROOT, MemoryWatch, Peak, Worker, WorkerError, worker_command
 from tools.bench.peers.rounds import Round, run_rounds

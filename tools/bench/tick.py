@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from edge.artifact_files import ArtifactError, read_manifest
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, write_result
 from edge.geometry import SE2
-from edge.manifest import ArtifactError, load_artifacts, read_manifest
+from edge.manifest import load_artifacts
 from edge.policy import Policy
 from edge.semantic import SemanticState
 from export.model.config_file import config_for
