@@ -112,10 +112,10 @@ def main(argv: list[str] | None = None) -> int:
 
     try:
         robot, options = _read(args)
-        artifacts = load_artifacts(args.artifacts)
+        artifacts = load_artifacts(args.artifacts.absolute())
         if engines.needed(artifacts):
             # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
-            folder = args.engines or engines.default_directory(args.artifacts)
+            folder = args.engines or engines.default_directory(artifacts.directory)
             engines.check(artifacts, folder)
             artifacts = engines.with_engines(artifacts, folder)
         session = RunSession(artifacts, robot, options, _say)
