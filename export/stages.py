@@ -13,6 +13,7 @@ import hashlib
 import importlib.metadata
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,11 +26,16 @@ from edge.cli import write_whole
 
 ENTRY_NAME = "entry.json"
 RESULT_NAME = "result.json"
-PACKAGES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "tokenizers", "torch")
+PACKAGES = ("numpy", "onnx", "onnxscript", "safetensors", "tokenizers", "torch")
+VARIANTS = ("onnxruntime", "opencv-python")
+"""Packages that also come under longer names (`onnxruntime-gpu`, `opencv-python-headless`): every one counts."""
 SOURCE_FOLDERS = ("edge", "export")
 DATA_SUFFIXES = (".json", ".toml")
 _LOCK_NAME = "lock"
 _TIMINGS_NAME = "timings.json"
+_MARKER_NAME = ".tic-vla-edge-cache"
+_OURS = re.compile(r"[0-9a-f]{64}(\.partial|\.building)?", re.ASCII)
+"""Names of entries and of what is around one while it is built; nothing of another name is ever removed."""
 _CHUNK_BYTES = 1 << 22
 
 
@@ -91,9 +97,15 @@ def _imports(path: Path) -> set[str]:
     return names
 
 
+@lru_cache
 def package_versions() -> dict[str, str]:
     """Installed versions of the packages that a result depends on."""
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    for distribution in importlib.metadata.distributions():
+        name = str(distribution.metadata["Name"] or "").lower().replace("_", "-")
+        if any(name == variant or name.startswith(f"{variant}-") for variant in VARIANTS):
+            found[name] = distribution.version
+    return dict(sorted(found.items()))
 
 
 def stage_key(stage: str, parts: Mapping[str, Any], modules: Sequence[str]) -> str:
@@ -116,11 +128,14 @@ def fsync_path(path: Path) -> None:
 def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
     """A cache to work with; afterwards the entries used longest ago go until the rest fits `limit_bytes`.
 
-    Entries go only while no other process has the cache open. Raises CacheError.
+    Entries go only while no other process has the cache open. Raises CacheError, also for a directory of another use.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
+        _claim(directory)
         descriptor = os.open(directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+    except CacheError:
+        raise
     except OSError as error:
         raise CacheError(
             f"cache {directory}: cannot be written ({error.strerror}); name another with --cache DIR or use --no-cache"
@@ -135,6 +150,20 @@ def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) ->
                 cache.prune(limit_bytes)
     finally:
         os.close(descriptor)
+
+
+def _claim(directory: Path) -> None:
+    """Mark a directory as a cache of ours; raises CacheError for one that holds anything else."""
+    marker = directory / _MARKER_NAME
+    if marker.exists():
+        return
+    known = (_LOCK_NAME, _TIMINGS_NAME)
+    others = sorted(p.name for p in directory.iterdir() if p.name not in known and not _OURS.fullmatch(p.name))
+    if others:
+        raise CacheError(
+            f"cache {directory}: holds {others[0]}, which no cache of ours does; name an empty or a new directory"
+        )
+    marker.touch()
 
 
 def _try_lock(descriptor: int) -> bool:
@@ -211,9 +240,10 @@ class StageCache:
 
     def prune(self, limit_bytes: int) -> None:
         """Drop leftovers of killed processes and the entries used longest ago, until the rest fits."""
-        for leftover in [*self.directory.glob("*.partial"), *self.directory.glob("*.building")]:
+        ours = [path for path in self.directory.iterdir() if _OURS.fullmatch(path.name) and not path.is_symlink()]
+        for leftover in [path for path in ours if path.suffix]:
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        entries = [path for path in self.directory.iterdir() if path.is_dir()]
+        entries = [path for path in ours if not path.suffix and path.is_dir()]
         total = sum(map(_size_bytes, entries))
         for entry in sorted(entries, key=_last_used_ns):
             if total <= limit_bytes:

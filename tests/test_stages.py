@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -45,6 +46,11 @@ def writes(text: str, calls: list[str] | None = None) -> Callable[[Path], None]:
         (directory / "graph.onnx").write_text(text)
 
     return build
+
+
+def key(name: str) -> str:
+    """A key as stages have it."""
+    return hashlib.sha256(name.encode()).hexdigest()
 
 
 def entries(directory: Path) -> list[str]:
@@ -208,23 +214,23 @@ def test_two_builders_of_one_stage_build_it_once(cache: StageCache) -> None:
 
 def test_the_entries_used_longest_ago_go_first(tmp_path: Path, notes: Notes) -> None:
     with open_cache(tmp_path, GIB, notes) as cache:
-        for age, key in enumerate(("new", "middle", "old")):
-            entry, _ = cache.fetch_or_build(key, writes("x" * 1000))
+        for age, name in enumerate(("new", "middle", "old")):
+            entry, _ = cache.fetch_or_build(key(name), writes("x" * 1000))
             os.utime(entry / "entry.json", ns=(10**18 - age, 10**18 - age))
     with open_cache(tmp_path, 2500, notes):
         pass
-    assert entries(tmp_path) == ["middle", "new"]
+    assert entries(tmp_path) == sorted([key("middle"), key("new")])
 
 
 def test_using_an_entry_makes_it_young(tmp_path: Path, notes: Notes) -> None:
     with open_cache(tmp_path, GIB, notes) as cache:
-        for age, key in enumerate(("new", "old")):
-            entry, _ = cache.fetch_or_build(key, writes("x" * 1000))
+        for age, name in enumerate(("new", "old")):
+            entry, _ = cache.fetch_or_build(key(name), writes("x" * 1000))
             os.utime(entry / "entry.json", ns=(10**18 - age, 10**18 - age))
-        cache.fetch_or_build("old", writes("never called"))
+        cache.fetch_or_build(key("old"), writes("never called"))
     with open_cache(tmp_path, 1500, notes):
         pass
-    assert entries(tmp_path) == ["old"]
+    assert entries(tmp_path) == [key("old")]
 
 
 def test_nothing_is_pruned_under_another_process_hands(tmp_path: Path, notes: Notes) -> None:
@@ -233,19 +239,51 @@ def test_nothing_is_pruned_under_another_process_hands(tmp_path: Path, notes: No
         "with open_cache(Path(sys.argv[1]), 0, print): pass"
     )
     with open_cache(tmp_path, GIB, notes) as cache:
-        cache.fetch_or_build("k", writes("x"))
+        cache.fetch_or_build(key("k"), writes("x"))
         subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)
-        assert entries(tmp_path) == ["k"]
+        assert entries(tmp_path) == [key("k")]
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)
     assert entries(tmp_path) == []
 
 
 def test_leftovers_of_killed_processes_go(tmp_path: Path, notes: Notes) -> None:
-    (tmp_path / "k.partial").mkdir()
-    (tmp_path / "k.building").touch()
+    (tmp_path / f"{key('k')}.partial").mkdir()
+    (tmp_path / f"{key('k')}.building").touch()
     with open_cache(tmp_path, GIB, notes):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".tic-vla-edge-cache", "lock"]
+
+
+@pytest.mark.parametrize("name", ["photos/a.jpg", "movie.partial", "thesis.building", "notes.txt"])
+def test_a_directory_with_files_of_the_users_is_refused_and_not_touched(
+    tmp_path: Path, notes: Notes, name: str
+) -> None:
+    theirs = tmp_path / name
+    theirs.parent.mkdir(exist_ok=True)
+    theirs.write_text("mine")
+    with pytest.raises(CacheError, match="which no cache of ours does"), open_cache(tmp_path, 0, notes):
+        pass
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [theirs]
+
+
+@pytest.mark.parametrize("name", ["photos/a.jpg", "movie.partial", "thesis.building", f"{'a' * 63}/x", "AB/x"])
+def test_what_a_user_puts_into_a_cache_stays_whatever_it_is_cut_to(tmp_path: Path, notes: Notes, name: str) -> None:
+    with open_cache(tmp_path, GIB, notes) as cache:
+        cache.fetch_or_build(key("k"), writes("x"))
+    theirs = tmp_path / name
+    theirs.parent.mkdir(exist_ok=True)
+    theirs.write_text("mine")
+    with open_cache(tmp_path, 0, notes):
+        pass
+    assert theirs.read_text() == "mine"
+    assert not (tmp_path / key("k")).exists()
+
+
+def test_the_package_that_the_interpreter_has_of_several_variants_counts() -> None:
+    versions = stages.package_versions()
+    assert {"numpy", "onnx", "tokenizers", "torch"} <= set(versions)
+    assert any(name.startswith("onnxruntime") for name in versions)
+    assert any(name.startswith("opencv-python") for name in versions)
 
 
 def test_a_directory_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path, notes: Notes) -> None:
