@@ -107,7 +107,21 @@ def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
     model = {k.removeprefix(MODEL_PREFIX): s.partition("=")[2] for s, k in settings if k.startswith(MODEL_PREFIX)}
     config = with_overrides(config_for(args.model), model)
     target = load_target(args.target, config.name)
-    return with_settings(target, [s for s, key in settings if not key.startswith(MODEL_PREFIX)]), config
+    return with_settings(target, target_settings(args.settings)), config
+
+
+def target_settings(settings: Sequence[str]) -> list[str]:
+    """Those of `--set` that change the target; a graph's precision also ends the search for a better one."""
+    found: list[str] = []
+    for setting in settings:
+        key = setting.partition("=")[0].strip()
+        if key.startswith(MODEL_PREFIX):
+            continue
+        found.append(setting)
+        section, _, field = key.rpartition(".")
+        if section.startswith("graphs.") and field == "precision":
+            found.append(f"{section}.candidates=")
+    return found
 
 
 def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> dict[str, Any] | None:

@@ -75,10 +75,16 @@ COMPUTING = ("vision_encoder", "language_model.prefill")
 
 
 def with_exceptions(chosen: Precision, asked: Precision) -> Precision:
-    """What the search chose, and the exceptions that the target asks for where they are more exact than that."""
+    """What the search chose, and the exceptions that the target asks for where they are more exact than its default.
+
+    Of two for one layer the more exact wins, whoever it comes from.
+    """
     order = PRECISIONS.index
-    exact = tuple((layer, kind) for layer, kind in asked.overrides if order(kind) < order(chosen.default))
-    return Precision(chosen.default, (*chosen.overrides, *exact))
+    exact = [(layer, kind) for layer, kind in asked.overrides if order(kind) < order(chosen.default)]
+    found: dict[str, str] = {}
+    for layer, kind in sorted([*exact, *chosen.overrides], key=lambda pair: order(pair[1])):
+        found.setdefault(layer, kind)
+    return Precision(chosen.default, tuple(found.items()))
 
 
 def machine_name() -> str:
@@ -250,7 +256,6 @@ class Pipeline:
                 policy.candidates,
                 limits,
                 measured=points,
-                activations=policy.form == "fused",
                 speed_first=graph in COMPUTING,
             )
             (directory / DECISION_FILE).write_text(json.dumps(decision.to_dict(), allow_nan=False), encoding="utf-8")
@@ -272,7 +277,7 @@ class Pipeline:
             return asked, f"target {self.job.target.name} leaves no other choice"
         chosen = Precision.from_dict(decision["precision"])
         precision = with_exceptions(chosen, asked)
-        added = [f"{layer} in {kind}" for layer, kind in precision.overrides[len(chosen.overrides) :]]
+        added = [f"{layer} in {kind}" for layer, kind in precision.overrides if (layer, kind) not in chosen.overrides]
         also = f"; {', '.join(added)} as target {self.job.target.name} asks" if added else ""
         return precision, f"{decision['reason']}{also}"
 

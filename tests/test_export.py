@@ -28,7 +28,8 @@ from export.metrics import Arrays, ParityResult, Sample, compare
 from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.parity import references, sample_inputs
-from export.pipeline import Pipeline, build_stages
+from export.pipeline import Pipeline, build_stages, with_exceptions
+from export.precision import Precision
 from export.progress import Progress
 from export.stages import StageCache, open_cache
 from export.target import list_targets, load_target
@@ -36,6 +37,9 @@ from export.target import list_targets, load_target
 NANO = PRESETS["nano"]
 TARGET = load_target("cpu", "nano")
 GRAPHS = graph_names(pair=False)
+LOOSE = [
+    f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
+]  # for an encoder that is rounded
 
 
 @pytest.fixture(scope="module")
@@ -385,6 +389,30 @@ def test_the_result_has_the_keys_that_other_tools_read(
         assert {"params", "bytes", "precision", "parity"} <= set(graph)
         assert {"cosine", "max_abs", "verdict"} <= set(graph["parity"])
     assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(result["plan"])
+
+
+def test_a_precision_that_is_asked_for_ships_although_the_target_leaves_a_choice(tmp_path: Path) -> None:
+    out = tmp_path / "nano"
+    choice = ["--set", "graphs.vision_encoder.candidates=fp32,int8"]
+    assert main(["--out", str(out), *choice, "--set", "graphs.vision_encoder.precision=int8-b32", *LOOSE]) == 0
+    assert manifest(out)["graphs"]["vision_encoder"]["precision"] == {"default": "int8-b32", "overrides": {}}
+
+
+@pytest.mark.parametrize(
+    ("chosen", "asked", "shipped"),
+    [
+        ((("blocks.*", "int8"),), (("blocks.0.qkv", "fp32"),), {"blocks.0.qkv": "fp32", "blocks.*": "int8"}),
+        ((("blocks.0.qkv", "int8"),), (("blocks.0.qkv", "fp32"),), {"blocks.0.qkv": "fp32"}),
+        ((("blocks.0.qkv", "fp32"),), (("blocks.*", "int8"),), {"blocks.0.qkv": "fp32", "blocks.*": "int8"}),
+        ((), (("blocks.*", "int4-b128"),), {}),
+    ],
+)
+def test_the_exact_exceptions_of_a_target_win_over_what_the_search_chose(
+    chosen: tuple[tuple[str, str], ...], asked: tuple[tuple[str, str], ...], shipped: dict[str, str]
+) -> None:
+    found = with_exceptions(Precision("int4-b128", chosen), Precision("int4-b32", asked))
+    assert found == Precision("int4-b128", tuple(shipped.items()))
+    assert found == Precision.from_dict(found.to_dict())
 
 
 def test_a_setting_of_the_network_makes_that_network_and_a_small_cache_stays_small(tmp_path: Path) -> None:
