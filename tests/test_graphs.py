@@ -40,6 +40,11 @@ def nano() -> TicVla:
     return build(NANO, 0)
 
 
+@pytest.fixture(scope="module")
+def small() -> TicVla:
+    return build(SMALL, 1)
+
+
 def run(directory: Path, name: str) -> ort.InferenceSession:
     return ort.InferenceSession(str(directory / f"{name}.onnx"), providers=["CPUExecutionProvider"])
 
@@ -107,6 +112,53 @@ def test_every_variant_of_the_action_expert_exports(tmp_path: Path, change: dict
 @pytest.mark.parametrize("name", ALL)
 def test_half_precision_is_close(nano: TicVla, tmp_path: Path, name: str) -> None:
     assert check(nano, tmp_path, name, Precision("fp16"), "fused", half=True) < 0.05
+
+
+BOUNDS = {"fp32": 0.05, "fp16": 0.05, "int8-b32": 0.3, "int8": 0.5, "int4-b32": 2.0}
+STORED = {
+    "fp32": onnx.TensorProto.FLOAT,
+    "fp16": onnx.TensorProto.FLOAT16,
+    "int8-b32": onnx.TensorProto.UINT8,
+    "int8": onnx.TensorProto.INT8,
+    "int4-b32": onnx.TensorProto.UINT8,
+}
+
+
+@pytest.mark.parametrize("half", [False, True], ids=["float", "half"])
+@pytest.mark.parametrize("precision", BOUNDS)
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [(name, form) for form in ("fused", "plain") for name in graph_names(False) if form == "fused" or "_m" not in name],
+)
+def test_every_combination_runs_as_the_network_and_stores_what_it_says_or_is_refused(
+    small: TicVla, tmp_path: Path, name: str, form: str, precision: str, half: bool
+) -> None:
+    asked = Precision(precision, (("embed", "fp16"),) if "language" in name else ())
+    if form == "plain" and "-b" in precision:
+        with pytest.raises(ValueError, match="blocks are an operator of the fused form only"):
+            write_graph(small, name, asked, form, tmp_path, half=half)
+        assert not list(tmp_path.iterdir())
+        return
+    assert check(small, tmp_path, name, asked, form, half=half) < BOUNDS[precision]
+    stored = {t.name: t.data_type for t in onnx.load(str(tmp_path / f"{name}.onnx")).graph.initializer}
+    layers = {n for n in stored if n.endswith(".weight") and "norm" not in n and not n.startswith("embed")}
+    assert layers
+    assert {stored[n] for n in layers if n.split(".")[0] in ("blocks", "layers", "key_values")} == {STORED[precision]}
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+def test_a_convolutional_stem_is_as_exact_as_the_graphs_default(nano: TicVla, tmp_path: Path, precision: str) -> None:
+    assert check(nano, tmp_path, "vision_encoder", Precision(precision), "plain", half=True) < 0.05
+    stored = {t.name: t.data_type for t in onnx.load(str(tmp_path / "vision_encoder.onnx")).graph.initializer}
+    assert stored["embed.0.weight"] == STORED[precision]
+
+
+def test_a_layer_raised_to_32_bits_in_a_half_graph_is_computed_in_them(nano: TicVla, tmp_path: Path) -> None:
+    write_graph(nano, "action_expert", Precision("fp16", (("out", "fp32"),)), "plain", tmp_path, half=True)
+    nodes = onnx.load(str(tmp_path / "action_expert.onnx")).graph.node
+    product = next(node for node in nodes if "out.weight" in node.input)
+    widened = {out for node in nodes if node.op_type == "Cast" for out in node.output}
+    assert product.input[0] in widened
 
 
 @pytest.mark.parametrize(("precision", "bound"), [("int8", 0.4), ("int8-b128", 0.2), ("int4-b32", 2.0)])

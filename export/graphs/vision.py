@@ -68,7 +68,12 @@ def _patches(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
 def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
     """Stride-2 convolutions; only the deviation folds into them, because their padding is at the mean colour."""
     c = vision.config
-    x = g.op("Sub", [g.cast(frame, g.float_type), g.floats(array(vision.mean), "mean")])
+    # As exact as the graph's default says, like the products: no override names a convolution.
+    exact = g.precision.default == "fp32"
+    kind = np.dtype(np.float32) if exact else g.float
+    bits = "fp16" if g.precision.default == "fp16" or (g.half and not exact) else "fp32"
+    pixels = g.cast(frame, TensorProto.FLOAT if exact else g.float_type)
+    x = g.op("Sub", [pixels, g.constant(array(vision.mean).astype(kind), "mean")])
     x = g.op("Transpose", [x], perm=[0, 3, 1, 2])
     scale = array(vision.inv_std)[None, :, None, None]
     assert isinstance(vision.embed, nn.Sequential)
@@ -76,14 +81,16 @@ def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
         if isinstance(module, nn.Conv2d):
             assert module.bias is not None
             weight = array(module.weight) * (scale if i == 0 else np.float32(1))
-            inputs = [x, g.floats(weight, f"embed.{i}.weight"), g.floats(array(module.bias), f"embed.{i}.bias")]
+            inputs = [x, g.stored(weight, f"embed.{i}.weight", bits)]
+            inputs += [g.constant(array(module.bias).astype(kind), f"embed.{i}.bias")]
             pad = module.kernel_size[0] // 2
             x = g.op("Conv", inputs, kernel_shape=list(module.kernel_size), strides=list(module.stride), pads=[pad] * 4)
             g.parameters += weight.size + module.bias.numel()
         else:
             x = g.op("Gelu", [x])
     x = g.op("Reshape", [x, g.constant([1, c.hidden, c.grid**2])])
-    return g.op("Transpose", [x], perm=[0, 2, 1])
+    x = g.op("Transpose", [x], perm=[0, 2, 1])
+    return g.from_float32(x) if exact else x
 
 
 def layer_norm(g: GraphWriter, x: str, module: nn.LayerNorm, name: str) -> str:

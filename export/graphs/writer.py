@@ -183,14 +183,39 @@ class GraphWriter:
         """
         precision = precision or self.precision.of(of or layer)
         self.parameters += weight.size + (0 if bias is None else bias.size)
-        if precision == "int8" and self.fused:
-            return self._dynamic_int8(x, layer, weight, bias)
         if block_size(precision) is not None:
+            if not self.fused:
+                raise ValueError(f"{self.name}: {layer} in {precision}: blocks are an operator of the fused form only")
             return self._blocks(x, layer, weight, bias, precision)
-        if precision == "int8":
+        if precision == "int8" and not self.fused:
             return self._static_int8(x, layer, weight, bias, self._ranges.get(of or layer))
-        y = self.op("MatMul", [x, self.weight(weight.T.astype(self.float), f"{layer}.weight")])
+        if precision == "int8":
+            return self.from_float32(self._dynamic_int8(self.in_float32(x), layer, weight, bias))
+        if precision == "fp32":
+            y = self.op("MatMul", [self.in_float32(x), self.stored(weight.T, f"{layer}.weight", precision)])
+            if bias is not None:
+                y = self.op("Add", [y, self.constant(np.asarray(bias, np.float32), f"{layer}.bias")])
+            return self.from_float32(y)
+        y = self.op("MatMul", [x, self.stored(weight.T, f"{layer}.weight", precision)])
         return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
+
+    def in_float32(self, x: str) -> str:
+        """x, which is in the graph's float type, in fp32."""
+        return self.cast(x, TensorProto.FLOAT) if self.half else x
+
+    def from_float32(self, x: str) -> str:
+        """x, which is in fp32, in the graph's float type."""
+        return self.cast(x, self.float_type) if self.half else x
+
+    def stored(self, value: Array, name: str, precision: str) -> str:
+        """A weight stored in 16 or 32 bits, as its product reads it.
+
+        16 bits are widened where activations have 32: by a runtime once when it opens the graph, to the same numbers.
+        """
+        if precision == "fp32":
+            return self.weight(value.astype(np.float32), name)
+        half = self.weight(value.astype(np.float16), name)
+        return half if self.half else self.cast(half, TensorProto.FLOAT)
 
     def _dynamic_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
         q = quantise_channels(weight)
