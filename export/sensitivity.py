@@ -164,19 +164,19 @@ class Search:
         limits: Limits,
         *,
         measured: Sequence[MeasuredPoint] = (),
-        activations: bool = True,
         speed_first: bool = False,
     ) -> Decision:
         """Decide for one graph; `candidates` run from the most exact to the smallest. See `drop_dominated`.
 
-        `activations` is whether `int8` kernels of the graph's form round their inputs too (form "fused" does).
+        `int8` layers are tried with their inputs rounded too, in every form: the fused kernels do that, and so does the
+        plain form of the encoder. Where a plain graph rounds weights alone, the decision errs on the exact side.
         """
         if not candidates:
             raise ValueError(f"{graph}: no candidates to choose a precision from")
         sizes = {c: self.bytes_of(graph, Precision(c)) for c in candidates}
         kept, dropped = drop_dominated(graph, candidates, sizes, measured, speed_first=speed_first)
         # The rounded weights of one graph at a time: kept for all, they would take as much memory as the model.
-        found = probe(self._reference, graph, Rounder(), activations=activations)
+        found = probe(self._reference, graph, Rounder(), activations=True)
         trial = _Trial(found, limits, self._trained, self._progress)
         precision, within = _smallest_within(trial, kept)
         reason = _reason(trial, self, graph, precision, kept, within)

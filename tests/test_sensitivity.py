@@ -232,6 +232,13 @@ def test_a_single_candidate_is_measured_and_kept(search: Search) -> None:
     assert search.choose("action_expert", ["fp32"], LIMITS).reason == "fp32: the only candidate"
 
 
+def test_eight_bits_are_tried_with_rounded_inputs(search: Search, reference: Reference) -> None:
+    decision = search.choose("action_expert", ["int8"], LIMITS)
+    rounded = probe(reference, "action_expert", Rounder(), activations=True).whole(Precision("int8"))
+    weights = probe(reference, "action_expert", Rounder(), activations=False).whole(Precision("int8"))
+    assert decision.table[0].output_error == rounded.output_error != weights.output_error
+
+
 def test_no_candidates_is_an_error(search: Search) -> None:
     with pytest.raises(ValueError, match="no candidates"):
         search.choose("action_expert", [], LIMITS)
