@@ -9,7 +9,7 @@ from typing import Any
 
 from export.metrics import ParityResult
 from export.target_types import GraphGate, TaskGate
-from export.task_error import TaskError
+from export.task_error import TaskError, short
 
 PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
 
@@ -32,6 +32,10 @@ class TaskResult:
     """(Δt in s, worst moment's waypoint deviation in cm) in order of Δt."""
     token_agreement: float | None = None
     """Mean share of the first greedy tokens before the first that differs; None for a graph that writes no text."""
+    kv_cosine: float = 1.0
+    """Of the semantic state to the exact one, lowest over the samples."""
+    semantic: float | None = None
+    """How far another semantic state moves the exact plans, as a share of how much they vary; None: they do not."""
 
     @classmethod
     def of(cls, error: TaskError) -> TaskResult:
@@ -44,6 +48,8 @@ class TaskResult:
             relative=error.relative if math.isfinite(error.relative) else None,
             by_delay_cm=tuple((delay_s, errors.waypoint_mean_cm.max) for delay_s, errors in error.by_delay),
             token_agreement=error.token_agreement,
+            kv_cosine=error.kv_cosine,
+            semantic=short(error.semantic_cm / error.spread_cm) if error.spread_cm > 0 else None,
         )
 
     @classmethod
@@ -92,7 +98,8 @@ def judge(
 ) -> Verdict:
     """Hold one graph's numbers against its thresholds; a comparison that is not a number fails.
 
-    The logits of untrained weights are nearly ties, which any rounding decides otherwise: there another token warns.
+    The logits of untrained weights are nearly ties, which any rounding decides otherwise: there another token warns,
+    and text is not compared.
     """
     failed: list[str] = []
     warned: list[str] = []
@@ -118,6 +125,20 @@ def judge(
             at_most(f"{name} error in {unit}", found, getattr(task_gate, f"warn_{name}_{unit}"), warned)
         at_most("speed command error in m/s", task.speed_mps, task_gate.speed_mps, failed)
         at_most("turn command error in rad/s", task.turn_radps, task_gate.turn_radps, failed)
+        relative = math.inf if task.relative is None else task.relative
+        at_most("deviation as a share of the plans' spread", relative, task_gate.relative, failed)
+        at_most("deviation as a share of the plans' spread", relative, task_gate.warn_relative, warned)
+        at_least("cosine of the semantic state", task.kv_cosine, task_gate.kv_cosine, failed)
+        at_least("cosine of the semantic state", task.kv_cosine, task_gate.warn_kv_cosine, warned)
+        if trained and task.token_agreement is not None:
+            at_least("share of the same text", task.token_agreement, task_gate.token_agreement, failed)
+            at_least("share of the same text", task.token_agreement, task_gate.warn_token_agreement, warned)
+        if task.semantic is None or not task.semantic >= task_gate.min_semantic:
+            moved = 0.0 if task.semantic is None else task.semantic
+            warned.append(
+                f"the exact model's plans hardly follow the semantic state: another one moves them by {moved:.2g} of "
+                f"their spread (≥ {task_gate.min_semantic:g}), so the task says little about the language model"
+            )
     if failed:
         return Verdict(FAIL, tuple(failed))
     return Verdict(WARN, tuple(warned)) if warned else Verdict(PASS)

@@ -145,10 +145,12 @@ def _gate_table(report: Report) -> str:
     limits = _gate(report, "task")
     return table(("graph", "", *numbers, "ran on"), rows, numeric=frozenset(range(2, 9))) + (
         '<p class="quiet">Under a value: the threshold it is held to. Same text: mean share of the first greedy tokens '
-        "after every calibration prompt before the first that differs; not held to anything. What rounding may do to "
-        "the robot, worst case "
+        "after every calibration prompt before the first that differs; only trained weights are held to it. What "
+        "rounding may do to the robot, worst case "
         f"over the delays of the semantic state: waypoints {limits['waypoint_cm']:g} cm, heading "
-        f"{limits['heading_deg']:g}°, speed {limits['speed_mps']:g} m/s, turn rate {limits['turn_radps']:g} rad/s."
+        f"{limits['heading_deg']:g}°, speed {limits['speed_mps']:g} m/s, turn rate {limits['turn_radps']:g} rad/s; on "
+        f"average no more than {limits['relative']:g} of how much the model's own plans vary; "
+        f"semantic state of cosine ≥ {limits['kv_cosine']:g}."
         "</p>"
     )
 

@@ -15,6 +15,9 @@ KV_DTYPES = {"fp32": 4, "fp16": 2}
 METERS = ("ina3221", "nvml", "rapl", "none")
 STAGES = ("vision_encoder", "prefill", "decode", "semantic_context", "action_expert")
 SHARING = ("one-device", "own-cores")
+RUNTIME_MOST = {"tick_period_ms": 60_000, "max_new_tokens": 8192, "prefill_chunk_tokens": 8192}
+"""Largest values of [runtime] that still make sense; a larger one is a slip of the keyboard."""
+MAX_FRAMES = 16
 
 
 class TargetError(ValueError):
@@ -266,6 +269,19 @@ class TaskGate:
     turn_radps: float
     warn_waypoint_cm: float | None = None
     warn_heading_deg: float | None = None
+    relative: float = 1.0
+    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres say
+    little about a model whose plans are short, as those of untrained weights are."""
+    warn_relative: float = 0.5
+    kv_cosine: float = 0.9
+    """Least cosine of the semantic state to the exact one."""
+    warn_kv_cosine: float = 0.97
+    token_agreement: float = 0.1
+    """Least share of the text before the first other token, for trained weights."""
+    warn_token_agreement: float = 0.5
+    min_semantic: float = 0.01
+    """Least share of the plans' own spread that another semantic state has to move them by: below it, nothing here can
+    tell a language model that works from one that does not."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -288,9 +304,11 @@ class RuntimePolicy:
     """Whether a plan that does not fit stops the export."""
 
     def __post_init__(self) -> None:
-        for name in ("tick_period_ms", "max_new_tokens", "prefill_chunk_tokens"):
-            _require(getattr(self, name) >= 1, f"{name} {getattr(self, name)} must be at least 1")
-        _require(bool(self.frame_offsets_s), "frame_offsets_s must name a frame")
+        for name, most in RUNTIME_MOST.items():
+            value = getattr(self, name)
+            _require(1 <= value <= most, f"{name} {value} must be 1 to {most}")
+        count = len(self.frame_offsets_s)
+        _require(1 <= count <= MAX_FRAMES, f"frame_offsets_s names {count} frames, expected 1 to {MAX_FRAMES}")
         _require(all(0 <= offset <= 60 for offset in self.frame_offsets_s), "frame_offsets_s must be 0 to 60 s")
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
         _require(0 < self.max_delay_s <= 600, f"max_delay_s {self.max_delay_s} must be 0 to 600 s")

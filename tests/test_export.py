@@ -20,7 +20,7 @@ from edge.manifest import Artifacts, load_artifacts
 from export.artifacts import build_artifacts
 from export.calibration import load_calibration
 from export.cli import DEFAULT_CALIBRATION, main
-from export.gate_run import OpenGraph
+from export.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
 from export.gates import GateError, judge
 from export.graphs.build import graph_names, write_graph
 from export.job import Job, WeightSource
@@ -33,6 +33,7 @@ from export.precision import Precision
 from export.progress import Progress
 from export.stages import StageCache, open_cache
 from export.target import list_targets, load_target
+from export.task_error import TaskError, prompt_parts
 
 NANO = PRESETS["nano"]
 TARGET = load_target("cpu", "nano")
@@ -183,6 +184,30 @@ def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
     graph = OpenGraph(artifacts, "action_expert", threads=1)
     found = compare("action_expert", samples["action_expert"], lambda f: graph({**f, dead: np.zeros_like(f[dead])}))
     assert verdict("action_expert", found) == "FAIL"
+
+
+class Blind(TaskCheck):
+    """A runner that never feeds its language model a frame."""
+
+    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
+        unseen = [np.zeros_like(tokens) for tokens in self._reference.visual]
+        kv, texts = [], []
+        for sample in self._samples.samples:
+            state, ids = self._torch.language(prompt_parts(sample, unseen), NEW_TOKENS)
+            kv.append(state)
+            texts.append(ids)
+        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv], texts=texts)
+
+
+def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("export.pipeline.TaskCheck", Blind)
+    assert main(["--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "language_model: not the same model: deviation as a share of the plans' spread" in said
+    assert "cosine of the semantic state" in said
+    assert not (tmp_path / "blind").exists()
 
 
 def test_a_failed_gate_leaves_no_directory(cache: StageCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

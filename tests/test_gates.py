@@ -17,7 +17,7 @@ TASK_GATE = TaskGate(
     waypoint_cm=5, heading_deg=2, speed_mps=0.05, turn_radps=0.1, warn_waypoint_cm=2, warn_heading_deg=1
 )
 GOOD = ParityResult(inputs=2, cosine=0.9999, max_abs=0.01, min_difference=0.5, top1=1.0)
-STEADY = TaskResult(1, 0.5, 0.01, 0.01, relative=0.02, by_delay_cm=((0.0, 0.5), (10.0, 1.0)))
+STEADY = TaskResult(1, 0.5, 0.01, 0.01, relative=0.02, by_delay_cm=((0.0, 0.5), (10.0, 1.0)), semantic=0.4)
 
 
 def samples(count: int = 3) -> list[Sample]:
@@ -136,6 +136,10 @@ def test_every_tensor_threshold_fails_alone(change: dict[str, float], said: str)
         ({"speed_mps": 0.06}, "speed command error in m/s 0.06 (≤ 0.05)"),
         ({"turn_radps": 0.2}, "turn command error in rad/s 0.2 (≤ 0.1)"),
         ({"waypoint_cm": float("nan")}, "waypoint error in cm nan (≤ 5)"),
+        ({"relative": 1.5}, "deviation as a share of the plans' spread 1.5 (≤ 1)"),
+        ({"relative": None}, "deviation as a share of the plans' spread inf (≤ 1)"),
+        ({"kv_cosine": 0.5}, "cosine of the semantic state 0.5 (≥ 0.9)"),
+        ({"token_agreement": 0.0}, "share of the same text 0 (≥ 0.1)"),
     ],
 )
 def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -> None:
@@ -149,6 +153,9 @@ def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -
         (replace(GOOD, cosine=0.995), STEADY, "cosine 0.995 (≥ 0.999)"),
         (GOOD, replace(STEADY, waypoint_cm=3), "waypoint error in cm 3 (≤ 2)"),
         (GOOD, replace(STEADY, heading_deg=1.5), "heading error in deg 1.5 (≤ 1)"),
+        (GOOD, replace(STEADY, relative=0.7), "deviation as a share of the plans' spread 0.7 (≤ 0.5)"),
+        (GOOD, replace(STEADY, kv_cosine=0.95), "cosine of the semantic state 0.95 (≥ 0.97)"),
+        (GOOD, replace(STEADY, token_agreement=0.3), "share of the same text 0.3 (≥ 0.5)"),
     ],
 )
 def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, said: str) -> None:
@@ -164,6 +171,19 @@ def test_another_token_from_untrained_weights_only_warns() -> None:
     assert judge(unsure, STEADY, GATE, TASK_GATE, trained=False).level == "WARN"
     assert judge(unsure, STEADY, GATE, TASK_GATE, trained=True).level == "FAIL"
     assert judge(replace(unsure, cosine=0.5), STEADY, GATE, TASK_GATE, trained=False).level == "FAIL"
+
+
+def test_other_text_from_untrained_weights_says_nothing_but_their_plans_and_state_do() -> None:
+    assert judge(GOOD, replace(STEADY, token_agreement=0.0), GATE, TASK_GATE, trained=False) == Verdict("PASS")
+    for change in ({"relative": 1.5}, {"kv_cosine": 0.5}):
+        assert judge(GOOD, replace(STEADY, **change), GATE, TASK_GATE, trained=False).level == "FAIL"
+
+
+@pytest.mark.parametrize("semantic", [0.0, 0.005, None, float("nan")])
+def test_plans_that_do_not_follow_the_semantic_state_warn_that_the_task_cannot_tell(semantic: float | None) -> None:
+    verdict = judge(GOOD, replace(STEADY, semantic=semantic), GATE, TASK_GATE)
+    assert verdict.level == "WARN"
+    assert "hardly follow the semantic state" in verdict.reasons[0]
 
 
 def test_a_graph_without_tokens_or_task_is_held_to_the_rest() -> None:
