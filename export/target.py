@@ -16,7 +16,7 @@ else:
     import tomli as tomllib
 
 from edge.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
-from export.precision import Precision
+from export.precision import Precision, block_size
 from export.target_types import (
     Device,
     Figure,
@@ -48,6 +48,8 @@ SCHEMA = 2
 TARGETS_DIR = Path(__file__).with_name("targets")
 TASK_GATE = "task"
 OTHER_GRAPHS = ("vision_encoder", "semantic_context", "action_expert")
+CHOOSING = (*LANGUAGE_WHOLE, LANGUAGE_PAIR[1])
+"""Graphs that choose a token."""
 MODEL_SECTIONS = ("graphs", "gates", "runtime")
 FIXED_KEYS = ("schema", "name", "measured", "models")
 
@@ -88,6 +90,9 @@ class Target:
         wrong = sorted(set(self.gates) - expected - set(LANGUAGE_WHOLE))
         if wrong:
             raise TargetError(f"gates.{wrong[0]}: no such graph; {near(wrong[0], expected)}")
+        for name, gate in self.gates.items():
+            if gate.top1 is not None and name not in CHOOSING:
+                raise TargetError(f"gates.{name}.top1: {name} chooses no token; expected it of {' or '.join(CHOOSING)}")
         for point in self.measured:
             if point.mode is not None and point.mode not in self.power.modes:
                 raise TargetError(f"measured: mode {point.mode!r}: {near(point.mode, self.power.modes)}")
@@ -96,9 +101,15 @@ class Target:
     def _check_provider(name: str, graph: GraphPolicy, provider: Provider) -> None:
         if graph.form not in provider.forms:
             raise TargetError(f"graphs.{name}.form {graph.form!r}: {provider.name} takes {', '.join(provider.forms)}")
+        if graph.form == "plain" and name in (*LANGUAGE_WHOLE, *LANGUAGE_PAIR):
+            raise TargetError(
+                f"graphs.{name}.form 'plain': its attention extends KV buffers in place, expected 'fused'"
+            )
         for precision in (graph.precision, *graph.overrides.values(), *graph.candidates):
             if provider.compute.roof(precision) is None:
                 raise TargetError(f"graphs.{name}: {provider.name} has no kernel for precision {precision!r}")
+            if graph.form == "plain" and block_size(precision) is not None:
+                raise TargetError(f"graphs.{name}: the plain form has no {precision!r}, blocks need the form 'fused'")
 
     @property
     def graph_names(self) -> tuple[str, ...]:
@@ -124,6 +135,8 @@ class Target:
         found = self.gates.get(graph)
         if found is None and graph in LANGUAGE_PAIR:
             found = self.gates.get(LANGUAGE_WHOLE[0])
+            if found is not None and graph not in CHOOSING:
+                found = dataclasses.replace(found, top1=None)
         if found is None:
             raise TargetError(f"gates.{graph} is missing: expected the thresholds of that graph")
         return found
@@ -265,7 +278,8 @@ def _places(content: Mapping[str, Any], path: str) -> list[tuple[list[str], Any]
     parts = path.split(".")
     whole = len(parts) > 2 and parts[0] in ("graphs", "gates") and parts[1] == LANGUAGE_WHOLE[0]
     if whole and LANGUAGE_WHOLE[0] not in content[parts[0]] and parts[2] not in ("prefill", "decode"):
-        return [_place(content, [parts[0], name, *parts[2:]], path) for name in LANGUAGE_PAIR]
+        halves = [name for name in LANGUAGE_PAIR if parts[2] != "top1" or name in CHOOSING]
+        return [_place(content, [parts[0], name, *parts[2:]], path) for name in halves]
     return [_place(content, parts, path)]
 
 

@@ -120,6 +120,18 @@ def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
         (lambda t: t["runtime"].update(tick_period_ms="fast"), "expected a whole number, found 'fast'"),
         (lambda t: t["runtime"].update(tick_period_ms=True), "expected a whole number, found True"),
         (lambda t: t["runtime"].update(kv_dtype="int2"), "kv_dtype 'int2' is not known"),
+        (lambda t: t["runtime"].update(prefill_chunk_tokens=99999999), "tokens 99999999 must be 1 to 8192"),
+        (lambda t: t["runtime"].update(max_new_tokens=8193), "max_new_tokens 8193 must be 1 to 8192"),
+        (lambda t: t["runtime"].update(tick_period_ms=0), "tick_period_ms 0 must be 1 to 60000"),
+        (lambda t: t["runtime"].update(frame_offsets_s=[]), "names 0 frames, expected 1 to 16"),
+        (lambda t: t["runtime"].update(frame_offsets_s=[0.0] * 17), "names 17 frames, expected 1 to 16"),
+        (lambda t: t["gates"][PAIR[0]].update(top1=0.8), "language_model.prefill chooses no token; expected it of"),
+        (lambda t: t["gates"]["vision_encoder"].update(top1=0.8), "vision_encoder chooses no token"),
+        (lambda t: t["graphs"][PAIR[0]].update(form="plain"), "prefill.form 'plain': .* expected 'fused'"),
+        (
+            lambda t: t["graphs"]["action_expert"].update(form="plain", precision="int8-b32"),
+            "the plain form has no 'int8-b32', blocks need the form 'fused'",
+        ),
         (lambda t: t["graphs"]["vision_encoder"].update(precision="int5"), "precision 'int5' is not known"),
         (lambda t: t["graphs"]["vision_encoder"].update(provider="gpu"), r"provider 'gpu' is not in \[providers\]"),
         (lambda t: t["graphs"]["vision_encoder"].update(candidates=["int8", "fp32"]), "from most to least exact"),
@@ -192,6 +204,15 @@ def test_settings_are_typed_by_their_field() -> None:
 def test_a_setting_of_the_language_model_reaches_both_halves_of_a_pair() -> None:
     target = with_settings(load_target("cpu"), ["graphs.language_model.precision=fp32"])
     assert [target.graphs[name].precision for name in PAIR] == ["fp32", "fp32"]
+
+
+def test_a_pair_is_held_to_the_tokens_of_the_half_that_chooses_them() -> None:
+    target = with_settings(load_target("cpu"), ["gates.language_model.top1=0.9"])
+    assert [target.gate(name).top1 for name in PAIR] == [None, 0.9]
+    shared = {**target.to_dict(), "models": {}}
+    shared["gates"] = {k: v for k, v in shared["gates"].items() if k != PAIR[0]}
+    shared["gates"]["language_model"] = shared["gates"].pop(PAIR[1])
+    assert [parse_target(shared, "x.toml").gate(name).top1 for name in PAIR] == [None, 0.9]
 
 
 def test_a_setting_of_one_half_leaves_the_other() -> None:
