@@ -12,7 +12,7 @@ from edge.artifact_files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, re
 from edge.manifest import load_artifacts
 from export.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
-from export.job import Job
+from export.job import Asked, Job
 from export.model.config import TicVlaConfig
 from export.pipeline import Pipeline
 from export.plan import Plan, plan
@@ -20,6 +20,7 @@ from export.progress import Progress
 from export.report import report_html
 from export.stages import StageCache, file_sha256, fsync_path, package_versions
 from export.target import Target
+from export.verify import first_difference
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 
@@ -96,7 +97,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
     pipeline.task_reference()
     for name in job.target.graph_names:
         pipeline.reference(name)
-    made = plan(job.target, job.config, {name: pipeline.precision(name)[0] for name in job.target.graph_names})
+    made = _plan(pipeline)
     if job.target.runtime.enforce_plan:
         made.require()
     graphs: dict[str, Any] = {}
@@ -109,7 +110,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
     manifest: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "target": job.target.name,
-        "model": {"name": job.config.name, "trained": weights.trained, "config": job.config.to_dict()},
+        "model": _model_section(pipeline),
         "runtime": manifest_runtime(job.target, job.config, made),
         "graphs": graphs,
         "plan": made.to_dict(),
@@ -118,6 +119,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
             "weights_origin": weights.origin,
             "calibration": job.calibration.to_dict(),
             "packages": package_versions(),
+            "asked": asked_dict(job.asked),
             "target": job.target.to_dict(),
         },
     }
@@ -183,8 +185,50 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Pro
     weights = pipeline.weights()
     if weights.sha256 != manifest["provenance"].get("weights_sha256"):
         raise ArtifactError(f"{directory}: was made from other weights than {weights.origin}; pass --checkpoint")
+    _check_manifest(pipeline, directory, manifest)
     pipeline.task_reference()
     for name in job.target.graph_names:
         pipeline.reference(name)
     results = check_directory(pipeline, directory, progress)
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
+
+
+def asked_dict(asked: Asked) -> dict[str, Any]:
+    """Plain JSON form."""
+    return {**vars(asked), "settings": list(asked.settings)}
+
+
+def _plan(pipeline: Pipeline) -> Plan:
+    target = pipeline.job.target
+    return plan(target, pipeline.job.config, {name: pipeline.precision(name)[0] for name in target.graph_names})
+
+
+def _model_section(pipeline: Pipeline) -> dict[str, Any]:
+    config = pipeline.job.config
+    return {"name": config.name, "trained": pipeline.weights().trained, "config": config.to_dict()}
+
+
+def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, Any]) -> None:
+    """Everything that a runner goes by is what this export would write; raises ArtifactError naming the first key."""
+    job, graphs = pipeline.job, manifest["graphs"]
+    expected: dict[str, Any] = {
+        "target": job.target.name,
+        "model": _model_section(pipeline),
+        "runtime": manifest_runtime(job.target, job.config, _plan(pipeline)),
+        "gates": job.target.to_dict()["gates"],
+    }
+    found = {key: manifest[key] for key in ("target", "model", "runtime")}
+    found["gates"] = manifest["provenance"]["target"]["gates"]
+    for name in job.target.graph_names:
+        expected[f"graphs.{name}"] = {
+            "precision": pipeline.precision(name)[0].to_dict(),
+            "form": job.target.graphs[name].form,
+            "session": job.target.session(name, graphs[name]["inputs"]),
+        }
+        found[f"graphs.{name}"] = {key: graphs[name].get(key) for key in ("precision", "form", "session")}
+    for key, value in expected.items():
+        said = first_difference(found[key], json.loads(json.dumps(value)), key)
+        if said is not None:
+            raise ArtifactError(f"{directory / MANIFEST_NAME}: {said}; export again")
+    if (directory / TOKENIZER_NAME).read_bytes() != pipeline.tokenizer():
+        raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer that goes with the weights; export again")

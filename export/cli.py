@@ -21,20 +21,20 @@ from edge.manifest import load_artifacts
 from export.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.calibration import CalibrationError, load_calibration
 from export.gates import GateError
-from export.job import Job, WeightSource
-from export.model.config import ModelConfigError, TicVlaConfig
+from export.job import Asked, Job, WeightSource
+from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_for, with_overrides
 from export.model.weights import WeightsError, save_weights
 from export.pipeline import build_stages
 from export.plan import PlanError, plan
 from export.plan_table import plan_lines, plan_table
 from export.progress import Progress, peak_rss_bytes
+from export.settings import model_settings, target_settings
 from export.stages import StageCache, default_cache_dir, open_cache
 from export.target import Target, TargetError, list_targets, load_target, with_settings
 from export.verify import job_of
 
 COMMAND = "edge-export"
-MODEL_PREFIX = "model."
 DEFAULT_CALIBRATION = "corridor-go2"
 EXAMPLES = """examples:
   edge-export --target cpu --model nano --out out/nano
@@ -103,25 +103,13 @@ def _say(line: str) -> None:
 
 
 def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
-    settings = [(s, s.partition("=")[0].strip()) for s in args.settings]
-    model = {k.removeprefix(MODEL_PREFIX): s.partition("=")[2] for s, k in settings if k.startswith(MODEL_PREFIX)}
-    config = with_overrides(config_for(args.model), model)
-    target = load_target(args.target, config.name)
-    return with_settings(target, target_settings(args.settings)), config
+    config = with_overrides(config_for(args.model), model_settings(args.settings))
+    return with_settings(load_target(args.target, config.name), target_settings(args.settings)), config
 
 
-def target_settings(settings: Sequence[str]) -> list[str]:
-    """Those of `--set` that change the target; a graph's precision also ends the search for a better one."""
-    found: list[str] = []
-    for setting in settings:
-        key = setting.partition("=")[0].strip()
-        if key.startswith(MODEL_PREFIX):
-            continue
-        found.append(setting)
-        section, _, field = key.rpartition(".")
-        if section.startswith("graphs.") and field == "precision":
-            found.append(f"{section}.candidates=")
-    return found
+def _asked(args: argparse.Namespace) -> Asked:
+    target = args.target if args.target in list_targets() else None
+    return Asked(target, args.model if args.model in PRESETS else None, tuple(args.settings))
 
 
 def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> dict[str, Any] | None:
@@ -154,7 +142,7 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
         raise UsageError(f"--out {out}: expected a directory that can be made")
     check_replaceable(out)
     weights = WeightSource(config, args.checkpoint, args.random_weights)
-    job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION))
+    job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _asked(args))
     with _cache(args, out.parent) as cache:
         run = f"{target.name} {config.name}"
         progress = Progress(COMMAND, build_stages(job, cache.timings(run)))

@@ -66,12 +66,25 @@ class WeightSource:
 
 
 @dataclass(frozen=True)
+class Asked:
+    """What the command line named, by which `verify` finds target and network again without trusting their copies."""
+
+    target: str | None = None
+    """A target that is shipped; None for a file of the user's."""
+    model: str | None = None
+    """A preset; None for a file of the user's."""
+    settings: tuple[str, ...] = ()
+    """Every `--set`, in order."""
+
+
+@dataclass(frozen=True)
 class Job:
     """Everything that an artifact directory follows from."""
 
     target: Target
     weights: WeightSource
     calibration: CalibrationSet
+    asked: Asked = Asked()
 
     @property
     def config(self) -> TicVlaConfig:

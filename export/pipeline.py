@@ -102,9 +102,9 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
     column = int(is_large(job.config))
     names = ["weights", "task reference"]
     names += [f"reference {graph}" for graph in job.target.graph_names]
+    searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
+    names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
     if graphs:
-        searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
-        names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
         vision = job.target.graphs["vision_encoder"]
         if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
             names += ["activation ranges"]
