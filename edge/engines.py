@@ -32,6 +32,8 @@ MAX_BYTES = 4_000_000
 BUSY_LINE_S = 15.0
 TIMING_SUFFIX = ".timing"
 PROFILES = ("min", "opt", "max")
+CONTEXT_AXIS = "T"
+"""Free axis along which a semantic state grows, up to the model's context."""
 _CACHE_OPTIONS = {
     TENSORRT: ("trt_engine_cache_path", "trt_timing_cache_path"),
     OPENVINO: ("cache_dir",),
@@ -114,6 +116,7 @@ def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None)
     names = needed(artifacts)
     if not names:
         return
+    _check_profiles(artifacts, names)
     entries = _read(directory)
     for name in names:
         wrong = _wrong(artifacts, name, directory, entries.get(name), machine)
@@ -194,6 +197,7 @@ def build(artifacts: Artifacts, directory: Path, say: Progress, machine: Machine
             f"this ONNX Runtime has no {', '.join(sorted(lacking))}, only {', '.join(machine.providers())}: "
             f"run this on the device itself, with the package that brings it"
         )
+    _check_profiles(artifacts, names)
     directory.mkdir(parents=True, exist_ok=True)
     entries = {name: entry for name, entry in _read(directory).items() if name in names}
     results: dict[str, Any] = {}
@@ -271,7 +275,7 @@ def profile_shapes(
     inputs: Sequence[TensorContract], options: Mapping[str, str], name: str
 ) -> list[dict[str, tuple[int, ...]]]:
     """Shapes of all inputs at each profile in a session's options; one set without free axes. Raises EngineError."""
-    free = [tensor.name for tensor in inputs if any(isinstance(axis, str) for axis in tensor.shape)]
+    free = {t.name: len(t.shape) for t in inputs if any(isinstance(axis, str) for axis in t.shape)}
     fixed = {t.name: tuple(axis for axis in t.shape if isinstance(axis, int)) for t in inputs if t.name not in free}
     if not free:
         return [fixed]
@@ -283,11 +287,26 @@ def profile_shapes(
             shapes = {tensor: tuple(int(axis) for axis in shape.split("x")) for tensor, _, shape in pairs}
         except ValueError:
             raise EngineError(f"{name}: profile {text!r} is not of the form input:1x2,… ; export again") from None
-        missing = [tensor for tensor in free if tensor not in shapes]
+        missing = [tensor for tensor, axes in free.items() if len(shapes.get(tensor, ())) != axes]
         if missing:
             raise EngineError(f"{name}: no {kind} profile for input {missing[0]}, whose shape is free; export again")
         sets.append({**fixed, **{tensor: shapes[tensor] for tensor in free}})
     return sets
+
+
+def _check_profiles(artifacts: Artifacts, names: Sequence[str]) -> None:
+    """Raise EngineError if a generation could give an engine more than it is built for."""
+    context = artifacts.runtime.max_context
+    for name in names:
+        graph = artifacts.graphs[name]
+        largest = profile_shapes(graph.inputs, graph.session.options, name)[-1]
+        for tensor in graph.inputs:
+            for axis, length in zip(tensor.shape, largest[tensor.name], strict=True):
+                if axis == CONTEXT_AXIS and length < context:
+                    raise EngineError(
+                        f"{name}: its profile takes {tensor.name} of at most {length} tokens, the model reads "
+                        f"{context}; export again with graphs.{name}.profile.{axis}=1,{context},{context}"
+                    )
 
 
 @contextmanager

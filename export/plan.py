@@ -159,6 +159,7 @@ def plan(
     if unknown:
         raise PlanError(f"plan: no graph {unknown[0]!r}; expected some of {', '.join(target.graph_names)}")
     chosen = {name: wanted.get(name, target.precision(name)) for name in target.graph_names}
+    _check_profiles(target, config)
     if text_tokens is None:
         text_tokens = TEXT_TOKENS[config.language.vocab >= LARGE_VOCABULARY]
     prompt = len(target.runtime.frame_offsets_s) * config.frame_tokens + text_tokens
@@ -183,6 +184,23 @@ def plan(
             (middle, high) if delay_s is not None and delay_s <= target.runtime.max_delay_s else (low, middle - 1)
         )
     return _sized(target, config, chosen, prompt, low, advise=True)
+
+
+def _check_profiles(target: Target, config: TicVlaConfig) -> None:
+    """Refuse engines that the model's context would outgrow: a call beyond a profile fails while the robot walks."""
+    context = config.language.max_context
+    needed = {"T": (config.frame_tokens, context), "S": (1, min(target.runtime.prefill_chunk_tokens, context))}
+    needed["C"] = (context, context)
+    for name in target.graph_names:
+        profile = target.graphs[name].profile if target.provider(name).engine else {}
+        for axis, (low, high) in needed.items():
+            least, _, most = profile.get(axis, (low, low, high))
+            if not least <= low <= high <= most:
+                raise PlanError(
+                    f"graphs.{name}.profile.{axis} covers {least} to {most}, {config.name} needs {low} to {high} "
+                    f"(model.language.max_context={context}): set graphs.{name}.profile.{axis}={low},{high},{high} or "
+                    f"wider"
+                )
 
 
 @dataclass(frozen=True)

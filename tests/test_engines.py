@@ -154,6 +154,16 @@ def test_every_shape_of_the_profiles_is_run_at_build_time(orin: Artifacts, engin
     assert fixed == {(1, 128, 128, 3)}
 
 
+def test_a_profile_shorter_than_the_models_context_is_refused(directory: Path, engines: Path) -> None:
+    edit(directory, lambda m: m["runtime"].update(max_context=513))
+    for refused in (check, lambda *given: build(given[0], given[1], silent, given[2])):
+        with pytest.raises(
+            EngineError, match=r"semantic_context: .* of at most 512 tokens, the model reads 513; export"
+        ):
+            refused(load_artifacts(directory), engines, FakeTensorRt().machine())
+    assert not engines.exists()
+
+
 def test_a_second_build_builds_nothing(orin: Artifacts, engines: Path) -> None:
     fake = FakeTensorRt()
     first = build(orin, engines, silent, fake.machine())

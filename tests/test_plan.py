@@ -11,7 +11,7 @@ from rich.console import Console
 
 from export.cost import DECODE, PREFILL, action_call, context_call, language_call, vision_call
 from export.graphs.build import linear_layers
-from export.model.config import PRESETS
+from export.model.config import PRESETS, TicVlaConfig
 from export.plan import Plan, PlanError, plan
 from export.plan_table import plan_table
 from export.precision import Precision
@@ -336,3 +336,26 @@ def test_a_person_sees_every_stage_and_the_verdict(name: str) -> None:
     assert all(s.stage in text for s in made.stages)
     assert ("verdict     fits" in text) == made.fits
     assert text.count(MODELLED) >= 1
+
+
+@pytest.mark.parametrize("name", ["orin", "rtx4060"])
+@pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
+def test_the_engines_of_a_board_cover_the_context_of_both_models(name: str, config: TicVlaConfig) -> None:
+    assert plan(target(name, model=config.name), config).tokens >= 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "context", "line"),
+    [
+        ((), 4096, r"semantic_context\.profile\.T covers 1 to 1536, 1b needs 256 to 4096"),
+        (("graphs.action_expert.profile.T=1,64,512",), 1536, r"action_expert\.profile\.T covers 1 to 512, 1b needs"),
+        (("graphs.action_expert.profile.T=900,900,1536",), 1536, r"action_expert\.profile\.T covers 900 to 1536"),
+    ],
+)
+def test_an_engine_that_the_context_would_outgrow_is_refused_before_anything_is_built(
+    settings: tuple[str, ...], context: int, line: str
+) -> None:
+    config = dataclasses.replace(BIG, language=dataclasses.replace(BIG.language, max_context=context))
+    with pytest.raises(PlanError, match=line) as refusal:
+        plan(target("orin", *settings), config)
+    assert "\n" not in str(refusal.value)
