@@ -82,9 +82,10 @@ class Clip:
 
 @dataclass(frozen=True)
 class CalibrationSet:
-    """Clips under the name they were asked for by, with the SHA-256 of every file they came from."""
+    """Clips with the SHA-256 of every file they came from."""
 
     name: str
+    """Of a set that ships, or kind and base name of a user's own (`folder:corridor`): no path of a machine."""
     sha256: str
     clips: tuple[Clip, ...]
 
@@ -113,10 +114,8 @@ def list_calibration_sets() -> list[str]:
 def load_calibration(name: str) -> CalibrationSet:
     """The set of that name, `folder:PATH` or `video:PATH`; raises CalibrationError with one clear line."""
     kind, colon, path = name.partition(":")
-    if colon and kind == "folder" and path:
-        return _load_folder(name, Path(path))
-    if colon and kind == "video" and path:
-        return _load_video(name, Path(path))
+    if colon and kind in USER_KINDS and path:
+        return USER_KINDS[kind](f"{kind}:{Path(path).resolve().name}", Path(path))
     if name not in list_calibration_sets():
         known = ", ".join(list_calibration_sets())
         raise CalibrationError(
@@ -272,3 +271,6 @@ def _video_frames(path: Path, where: str) -> list[Picture]:
     finally:
         capture.release()
     return images
+
+
+USER_KINDS = {"folder": _load_folder, "video": _load_video}

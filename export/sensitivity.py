@@ -130,11 +130,16 @@ class MeasuredPoint(Protocol):
 
 
 def search_samples(calibration: CalibrationSet, config: TicVlaConfig, runtime: Runtime, tokenizer: bytes) -> SampleSet:
-    """The samples of the search: one anchor a clip, three delays; a large model: two clips, one frame a prompt."""
+    """The samples of the search: one anchor a clip, or two in a single one, and three delays.
+
+    A large model gets two clips and one frame a prompt.
+    """
+    per_clip = 1 if len(calibration.clips) > 1 else 2
     if not is_large(config):
-        return samples_from(calibration, config, runtime, tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=1)
+        return samples_from(
+            calibration, config, runtime, tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=per_clip
+        )
     clips = CalibrationSet(calibration.name, calibration.sha256, calibration.clips[:2])
-    per_clip = 1 if len(clips.clips) > 1 else 2
     return samples_from(clips, config, _NewestFrame(), tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=per_clip)
 
 

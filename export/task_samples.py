@@ -18,7 +18,7 @@ from edge.geometry import SE2, interpolate
 from edge.policy import fit_frame
 from edge.prompt import PromptBuilder, PromptIds
 from edge.ring import EncodedFrame
-from export.calibration import CalibrationError, CalibrationSet, Clip
+from export.calibration import CLIP_S, CalibrationError, CalibrationSet, Clip
 from export.model.config import TicVlaConfig
 
 Picture = npt.NDArray[np.uint8]
@@ -102,16 +102,17 @@ def samples_from(
     delays_s: Sequence[float] = DELAYS_S,
     anchors_per_clip: int | None = None,
 ) -> SampleSet:
-    """Samples of every clip: one anchor a clip for a large model, else two; raises CalibrationError.
+    """Samples of every clip: one anchor a clip for a large model, else, or of a single clip, two.
 
     A large model so needs ten encoder frames and one prefill a clip, all delays of an anchor share its prefill.
+    Raises CalibrationError.
     """
     language = config.language
     ids = PromptIds(
         language.im_start_id, language.im_end_id, language.img_start_id, language.img_end_id, language.img_context_id
     )
     builder = PromptBuilder(Tokenizer.from_buffer(tokenizer), ids, config.frame_tokens)
-    count = anchors_per_clip or (1 if is_large(config) else 2)
+    count = anchors_per_clip or (1 if is_large(config) and len(calibration.clips) > 1 else 2)
     frames: dict[tuple[int, int], int] = {}
     pictures: list[Picture] = []
 
@@ -139,7 +140,9 @@ def samples_from(
             moments = tuple(_moment(clip, anchor_s, delay_s, number, index_of) for delay_s in delays_s)
             samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, moments))
     if len(samples) < 2:
-        raise CalibrationError(f"calibration set {calibration.name}: has one clip, two samples are needed to compare")
+        raise CalibrationError(
+            f"calibration set {calibration.name}: gives one sample, two samples are needed to compare"
+        )
     longest = max(sum(len(part.ids) for part in sample.prompt) for sample in samples)
     if longest > language.max_context:
         raise CalibrationError(
@@ -156,7 +159,20 @@ def _anchors(clip: Clip, history_s: float, future_s: float, count: int) -> list[
             f"clip {clip.name}: too short for frames {history_s:g} s back and a delay of {future_s:g} s"
         )
     last_s = max(first_s, last_s)
+    if last_s - first_s < FRAME_TOLERANCE_S:
+        count = 1  # all would be the same frames
     return [first_s + i * (last_s - first_s) / max(1, count - 1) for i in range(count)]
+
+
+def check_clips(calibration: CalibrationSet, runtime: Runtime) -> None:
+    """Raise CalibrationError if the clips are too short for a target's frames and every delay: before any work."""
+    history_s, future_s = max(runtime.frame_offsets_s), max(DELAYS_S)
+    anchors = [anchor_s for clip in calibration.clips for anchor_s in _anchors(clip, history_s, future_s, 2)]
+    if len(anchors) < 2:
+        raise CalibrationError(
+            f"calibration set {calibration.name}: has one clip of {CLIP_S:g} s, which gives one sample and two are "
+            f"needed to compare: give pictures of {2 * CLIP_S + 2:g} s, or fewer runtime.frame_offsets_s"
+        )
 
 
 def _nearest(clip: Clip, time_s: float) -> int:

@@ -33,7 +33,7 @@ def _picture(seed: int, width: int = 64, height: int = 48) -> np.ndarray:
 
 
 def _folder(path: Path, count: int = 21) -> Path:
-    path.mkdir()
+    path.mkdir(parents=True)
     for i in range(count):
         cv2.imwrite(str(path / f"{i:03d}.png"), _picture(i))
     return path
@@ -152,6 +152,14 @@ def test_a_folder_of_images_is_a_walk_that_is_assumed_and_says_so(tmp_path: Path
     assert "0.5 m/s" in clip.assumed and "0.5 m/s" in str(loaded.to_dict()["assumed"])
     assert [frame.T_odom_base.x_m for frame in clip.frames[:3]] == [0.0, 0.5, 1.0]
     assert np.array_equal(clip.frames[2].image, _picture(2)[:, :, ::-1])
+
+
+def test_the_same_pictures_are_the_same_set_wherever_they_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = _folder(tmp_path / "a" / "mine"), _folder(tmp_path / "b" / "mine")
+    monkeypatch.chdir(second)
+    found = [load_calibration(f"folder:{path}").to_dict() for path in (first, second, ".", "../mine/")]
+    assert found == [found[0]] * 4
+    assert found[0]["name"] == "folder:mine"
 
 
 def test_a_long_folder_gives_at_most_three_walks_from_all_over_it(tmp_path: Path) -> None:

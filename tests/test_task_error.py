@@ -19,6 +19,7 @@ from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.model.tokenizer import NANO_TOKENIZER
 from export.precision import Precision
+from export.sensitivity import search_samples
 from export.task_error import (
     StageOutputs,
     TaskErrorError,
@@ -29,7 +30,7 @@ from export.task_error import (
     spread,
     task_error,
 )
-from export.task_samples import DELAYS_S, SampleSet, samples_from
+from export.task_samples import DELAYS_S, SampleSet, check_clips, samples_from
 from export.torch_stages import TorchStages, empty_past, prompt_tensors
 
 NANO = PRESETS["nano"]
@@ -132,6 +133,22 @@ def test_the_large_model_gets_one_sample_a_clip(calibration: CalibrationSet) -> 
     large = samples_from(calibration, PRESETS["1b"], Runtime(), NANO_TOKENIZER.read_bytes())
     assert len(large.samples) == 3 and len(large.frames) == 30
     assert len(samples_from(calibration, NANO, Runtime(), NANO_TOKENIZER.read_bytes()).samples) == 6
+
+
+@pytest.mark.parametrize("model", ["1b", "nano"])
+def test_one_clip_is_enough_for_either_model(calibration: CalibrationSet, model: str) -> None:
+    one, tokenizer = dataclasses.replace(calibration, clips=calibration.clips[:1]), NANO_TOKENIZER.read_bytes()
+    check_clips(one, Runtime())
+    assert len(samples_from(one, PRESETS[model], Runtime(), tokenizer).samples) == 2
+    assert len(search_samples(one, PRESETS[model], Runtime(), tokenizer).samples) == 2
+
+
+def test_clips_too_short_for_a_targets_frames_are_refused_before_any_work(calibration: CalibrationSet) -> None:
+    with pytest.raises(CalibrationError, match="too short for frames 12 s back and a delay of 10 s"):
+        check_clips(calibration, Runtime((0.0, 12.0)))
+    one = dataclasses.replace(calibration, clips=calibration.clips[:1])
+    with pytest.raises(CalibrationError, match=r"has one clip of 20 s, .* give pictures of 42 s, or fewer runtime"):
+        check_clips(one, Runtime((0.0, 10.0)))
 
 
 def test_a_set_too_short_for_the_delays_is_refused(calibration: CalibrationSet) -> None:
