@@ -17,6 +17,7 @@ from export.model.network import PARTS, build
 from export.model.weights import WeightsInfo
 from export.stages import file_sha256
 from export.target import Target
+from export.task_samples import check_clips
 
 DEFAULT_SEED = 0
 DIRECTORY_FILES = ("config.json", "tokenizer.json")
@@ -85,6 +86,9 @@ class Job:
     weights: WeightSource
     calibration: CalibrationSet
     asked: Asked = Asked()
+
+    def __post_init__(self) -> None:
+        check_clips(self.calibration, self.target.runtime)
 
     @property
     def config(self) -> TicVlaConfig:
