@@ -294,6 +294,15 @@ def test_the_graphs_of_a_large_pair_share_one_token_table(
         assert result.max_abs < 5e-5
 
 
+def test_a_pair_in_two_precisions_still_shares_its_token_table(
+    nano: TicVla, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("export.graphs.build.SINGLE_FILE_BYTES", 0)
+    precisions = zip(LANGUAGE_PAIR, ("int8", "int4-b128"), strict=True)
+    files = [write_graph(nano, name, Precision(precision), "fused", tmp_path) for name, precision in precisions]
+    assert set(files[0]) & set(files[1]) == {"language_model.embed.int8.onnx.data"}
+
+
 def test_the_plain_int8_encoder_rounds_the_inputs_of_products_and_nothing_else(tmp_path: Path) -> None:
     model = build(SMALL, 1)
     frames = [references(model, "vision_encoder", 4)[i].feeds["frame"] for i in range(4)]
