@@ -117,7 +117,7 @@ def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
         rows_ = slice(start, start + 8192)
         codes[rows_] = np.rint(table[rows_] / scales[rows_])
     rows = g.cast(
-        g.op("Gather", [g.shared_weight(codes, "embed.weight", EMBEDDING_FILE.format(precision)), ids]), g.float_type
+        g.op("Gather", [g.shared_weight(codes, "embed.weight", EMBEDDING_FILE.format("int8")), ids]), g.float_type
     )
     scale = g.op("Gather", [g.weight(scales.astype(g.float), "embed.scale"), ids])
     return g.op("Mul", [rows, scale])
