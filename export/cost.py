@@ -30,8 +30,10 @@ class Linear:
         return 0 if self.table else FLOPS_PER_PRODUCT * self.rows * self.columns * self.tokens
 
     def bytes_in(self, precision: Precision, scale_bytes: int) -> int:
-        """Bytes that it is stored in."""
+        """Bytes that it takes in memory, where its scales and activations take `scale_bytes` each."""
         name = precision.of(self.name)
+        if name == "fp16" and not self.table and scale_bytes == 4:
+            name = "fp32"  # widened when the graph is opened: a kernel multiplies equal types
         if self.table and name not in ("fp32", "fp16"):
             name = "int8"  # tables are stored in 8 bits at least, one scale a row
         return weight_bytes(name, self.rows, self.columns, scale_bytes=scale_bytes)

@@ -359,3 +359,14 @@ def test_an_engine_that_the_context_would_outgrow_is_refused_before_anything_is_
     with pytest.raises(PlanError, match=line) as refusal:
         plan(target("orin", *settings), config)
     assert "\n" not in str(refusal.value)
+
+
+def test_16_bit_weights_take_32_in_memory_where_activations_do() -> None:
+    sizes = {
+        (name, kind): planned(
+            name, "runtime.tick_period_ms=60000", f"graphs.vision_encoder.precision={kind}"
+        ).weight_bytes["vision_encoder"]
+        for name in ("cpu", "orin")
+        for kind in ("fp32", "fp16")
+    }
+    assert sizes["cpu", "fp16"] == sizes["cpu", "fp32"] == 2 * sizes["orin", "fp16"]
