@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,9 @@ from export.target import Target
 from export.verify import first_difference
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
+NEW, OLD = "new", "old"
+OLDER_SCHEMAS = (1,)
+"""Schemas whose directories an export replaces."""
 
 
 def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, Any]:
@@ -50,44 +56,88 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
 def build_artifacts(job: Job, out: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
     """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
     nothing behind but finished stages in the cache."""
-    partial = out.with_name(out.name + ".partial")
     check_replaceable(out)
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        report = _write_directory(Pipeline(job, cache, progress), partial, progress)
-        for path in [*partial.iterdir(), partial]:
+    with workplace(out) as work:
+        made = work / NEW
+        made.mkdir()
+        report = _write_directory(Pipeline(job, cache, progress), made, progress)
+        for path in [*made.iterdir(), made]:
             fsync_path(path)
         check_replaceable(out)  # once more: building took its time
-        _swap(partial, out)
+        _swap(made, out, work / OLD)
         return report
+
+
+@contextmanager
+def workplace(out: Path) -> Iterator[Path]:
+    """A hidden directory beside `out`, on the same disk, for one export at a time; raises ArtifactError for a second.
+
+    What a killed export left in it goes; the directory that it was just replacing comes back.
+    """
+    work = out.with_name(f".{out.name}.edge-export")
+    work.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = work.exists() and work.stat().st_ino == os.fstat(descriptor).st_ino
+        except BlockingIOError:
+            mine = False
+        if not mine:
+            raise ArtifactError(f"another export is writing {out}; wait for it or name another directory")
+        others = sorted(path.name for path in work.iterdir() if path.name not in (NEW, OLD))
+        if others:
+            raise ArtifactError(f"{work / others[0]}: not ours, so nothing is built there; move it away")
+        if (work / OLD).exists() and not out.exists():
+            (work / OLD).rename(out)
+        try:
+            for left in (NEW, OLD):
+                shutil.rmtree(work / left, ignore_errors=True)
+            yield work
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        os.close(descriptor)
 
 
 def check_replaceable(out: Path) -> None:
-    """An existing directory is replaced only if it is an artifact directory with nothing of the user's beside it."""
-    if not out.exists():
+    """An existing directory is replaced only if it is empty, or of ours with nothing of the user's beside it."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
-    listed = {MANIFEST_NAME, *read_manifest(out)["files"]}
+    listed = {MANIFEST_NAME, *_files_of(out)}
     others = sorted(path.name for path in out.iterdir() if path.name not in listed)
     if others:
         raise ArtifactError(f"{out / others[0]}: not ours, so {out} is not replaced; name another directory")
 
 
-def _swap(partial: Path, out: Path) -> None:
-    retired = out.with_name(out.name + ".old.partial")
-    shutil.rmtree(retired, ignore_errors=True)
+def _files_of(out: Path) -> dict[str, Any]:
+    """The files that a manifest lists, also one of an older schema if they are all there as it says."""
+    try:
+        return dict(read_manifest(out)["files"])
+    except ArtifactError:
+        try:
+            older = json.loads((out / MANIFEST_NAME).read_bytes())
+            files = dict(older["files"])
+            ours = older["schema_version"] in OLDER_SCHEMAS and all(
+                file_sha256(out / name) == entry["sha256"] for name, entry in files.items()
+            )
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            ours = False
+        if not ours:
+            raise
+        return files
+
+
+def _swap(made: Path, out: Path, retired: Path) -> None:
     if out.exists():
         out.rename(retired)
     try:
-        partial.rename(out)
+        made.rename(out)
     except BaseException:
         if retired.exists():
             retired.rename(out)
         raise
     fsync_path(out.parent)
-    shutil.rmtree(retired, ignore_errors=True)
 
 
 def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, Any]:

@@ -137,7 +137,7 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     target, config = _target_and_config(args)
     if _check_plan(target, config, args) is not None:
         return None
-    out = args.out.absolute()
+    out = Path(os.path.realpath(args.out))
     if not out.name:
         raise UsageError(f"--out {out}: expected a directory that can be made")
     check_replaceable(out)
