@@ -171,7 +171,7 @@ def check_clips(calibration: CalibrationSet, runtime: Runtime) -> None:
     if len(anchors) < 2:
         raise CalibrationError(
             f"calibration set {calibration.name}: has one clip of {CLIP_S:g} s, which gives one sample and two are "
-            f"needed to compare: give pictures of {2 * CLIP_S + 2:g} s, or fewer runtime.frame_offsets_s"
+            f"needed to compare: give pictures of {2 * CLIP_S + 2:g} s, or smaller runtime.frame_offsets_s"
         )
 
 

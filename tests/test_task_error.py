@@ -147,7 +147,7 @@ def test_clips_too_short_for_a_targets_frames_are_refused_before_any_work(calibr
     with pytest.raises(CalibrationError, match="too short for frames 12 s back and a delay of 10 s"):
         check_clips(calibration, Runtime((0.0, 12.0)))
     one = dataclasses.replace(calibration, clips=calibration.clips[:1])
-    with pytest.raises(CalibrationError, match=r"has one clip of 20 s, .* give pictures of 42 s, or fewer runtime"):
+    with pytest.raises(CalibrationError, match=r"has one clip of 20 s, .* give pictures of 42 s, or smaller runtime"):
         check_clips(one, Runtime((0.0, 10.0)))
 
 
