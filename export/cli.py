@@ -35,6 +35,7 @@ from export.target import Target, TargetError, list_targets, load_target, with_s
 from export.verify import job_of
 
 COMMAND = "edge-export"
+DEFAULT_TARGET, DEFAULT_MODEL = "cpu", "nano"
 DEFAULT_CALIBRATION = "corridor-go2"
 EXAMPLES = """examples:
   edge-export --target cpu --model nano --out out/nano
@@ -47,6 +48,15 @@ EXAMPLES = """examples:
 exit codes: 0 done, 1 a graph is not the same model, a plan does not fit or an artifact is damaged,
             2 bad arguments or input, 130 interrupted (what was finished is kept in the cache)
 """
+EXPORT_ONLY = {
+    "target": "--target",
+    "model": "--model",
+    "settings": "--set",
+    "out": "--out",
+    "dry_run": "--dry-run",
+    "save_weights": "--save-weights",
+}
+"""What `verify` has no use for: it takes all of it from the directory."""
 BAD_INPUT = (ArtifactError, CalibrationError, ModelConfigError, WeightsError, TargetError, OSError)
 
 
@@ -61,9 +71,9 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: hashes, contract and gates once more")
     p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
-    p.add_argument("--target", default="cpu", metavar="NAME|FILE.toml", help="device to export for (default: cpu)")
+    p.add_argument("--target", metavar="NAME|FILE.toml", help="device to export for (default: cpu)")
     p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
-    p.add_argument("--model", default="nano", metavar="nano|1b|FILE.json", help="network (default: nano)")
+    p.add_argument("--model", metavar="nano|1b|FILE.json", help="network (default: nano)")
     p.add_argument(
         "--checkpoint",
         type=Path,
@@ -103,13 +113,16 @@ def _say(line: str) -> None:
 
 
 def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
-    config = with_overrides(config_for(args.model), model_settings(args.settings))
-    return with_settings(load_target(args.target, config.name), target_settings(args.settings)), config
+    config = with_overrides(config_for(args.model or DEFAULT_MODEL), model_settings(args.settings))
+    return with_settings(
+        load_target(args.target or DEFAULT_TARGET, config.name), target_settings(args.settings)
+    ), config
 
 
 def _asked(args: argparse.Namespace) -> Asked:
-    target = args.target if args.target in list_targets() else None
-    return Asked(target, args.model if args.model in PRESETS else None, tuple(args.settings))
+    target, model = args.target or DEFAULT_TARGET, args.model or DEFAULT_MODEL
+    shipped = target if target in list_targets() else None
+    return Asked(shipped, model if model in PRESETS else None, tuple(args.settings))
 
 
 def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> dict[str, Any] | None:
@@ -140,6 +153,9 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     out = Path(os.path.realpath(args.out))
     if not out.name:
         raise UsageError(f"--out {out}: expected a directory that can be made")
+    for option, path in (("--save-weights", args.save_weights), ("--json", args.json)):
+        if path is not None and str(path) != "-":
+            _check_file_target(option, Path(path), out)
     check_replaceable(out)
     weights = WeightSource(config, args.checkpoint, args.random_weights)
     job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _asked(args))
@@ -159,9 +175,26 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     return {**_result(report), "out": str(args.out), "stage_s": progress.built_s}
 
 
+def _check_file_target(option: str, path: Path, out: Path) -> None:
+    """Refuse, before a long build, a file that cannot be written or that the new directory would swallow."""
+    real = Path(os.path.realpath(path))
+    if real.is_dir() or not path.name:
+        raise UsageError(f"{option} {path}: expected a file to write")
+    if real == out or out in real.parents:
+        raise UsageError(f"{option} {path}: lies inside --out, which is replaced as a whole; name a place outside it")
+    parent = next(folder for folder in real.parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise UsageError(f"{option} {path}: {parent} is not a directory that can be written to")
+
+
 def _verify(args: argparse.Namespace) -> dict[str, Any]:
     if args.directory is None:
         raise UsageError("verify: which directory? expected: edge-export verify DIR")
+    ignored = [option for name, option in EXPORT_ONLY.items() if getattr(args, name)]
+    if ignored:
+        raise UsageError(f"verify: {ignored[0]} has no effect on what is there; leave it out")
+    if not args.directory.is_dir():
+        raise UsageError(f"verify {args.directory}: not a directory; make one with edge-export --out")
     check_result_target(args.json)
     load_artifacts(args.directory)
     job, notes = job_of(args.directory, args.checkpoint, args.random_weights, args.calibration)
@@ -230,14 +263,14 @@ def _main(args: argparse.Namespace, started_ns: int) -> int:
             result["wall_s"] = (time.monotonic_ns() - started_ns) / 1e9
             write_result(args.json, result)
     except (GateError, PlanError) as error:
-        _say(str(error))
+        _say(str(error) if args.command == "verify" or args.dry_run else f"{error}; nothing was written")
         return EXIT_CHECK_FAILED
     except (UsageError, *BAD_INPUT) as error:
         _say(str(error))
         # An artifact that does not verify is a failed check; anything else here is bad input.
         return EXIT_CHECK_FAILED if args.command == "verify" and isinstance(error, ArtifactError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted; finished stages are in the cache")
+        _say(f"interrupted; {'nothing was kept' if args.no_cache else 'finished stages are in the cache'}")
         return EXIT_INTERRUPTED
     if result is not None and args.json != "-":
         for name, graph in result["graphs"].items():

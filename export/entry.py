@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from edge.cli import run_with_extra
+import sys
+
+from edge.cli import EXIT_INTERRUPTED, run_with_extra
 
 
 def main() -> int:
     """Entry point; returns the exit code."""
-    return run_with_extra("edge-export", "export.cli", "export")
+    try:
+        return run_with_extra("edge-export", "export.cli", "export")
+    except KeyboardInterrupt:  # while modules load; afterwards export.cli answers itself
+        sys.stderr.write("edge-export: interrupted\n")
+        return EXIT_INTERRUPTED

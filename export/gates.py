@@ -152,4 +152,4 @@ def worst(verdicts: Mapping[str, Verdict]) -> str:
 def require(graph: str, verdict: Verdict) -> None:
     """Raise GateError when a graph failed."""
     if verdict.level == FAIL:
-        raise GateError(f"{graph}: not the same model: {'; '.join(verdict.reasons)}; nothing was written")
+        raise GateError(f"{graph}: not the same model: {'; '.join(verdict.reasons)}")

@@ -333,7 +333,7 @@ class Pipeline:
                 if parity_cached and task_cached:
                     watch.from_cache()
         except (ParityError, GraphError, TaskErrorError) as error:
-            raise GateError(f"{error}; nothing was written") from error
+            raise GateError(str(error)) from error
         parity, task = ParityResult(**measured), TaskResult.from_dict(moved)
         verdict = judge(parity, task, gate, self.job.target.task_gate, trained=self.weights().trained)
         return GateResult(parity, task, verdict, provider, contract.session.provider)

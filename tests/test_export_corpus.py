@@ -154,6 +154,15 @@ WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
     ([], "--out is missing"),
     (["verify"], "which directory"),
     (["verify", "no-such-directory"], "not a directory"),
+    (["verify", ".", "--target", "orin"], "--target has no effect"),
+    (["verify", ".", "--model", "1b"], "--model has no effect"),
+    (["verify", ".", "--set", "power.mode=25W"], "--set has no effect"),
+    (["verify", ".", "--out", "x"], "--out has no effect"),
+    (["verify", ".", "--dry-run"], "--dry-run has no effect"),
+    (["--out", "x", "--save-weights", "x/w.safetensors"], "--save-weights x/w.safetensors: lies inside --out"),
+    (["--out", "x", "--json", "x/r.json"], "--json x/r.json: lies inside --out"),
+    (["--out", "x", "--save-weights", "."], "--save-weights .: expected a file"),
+    (["--out", "x", "--save-weights", "/dev/null/w"], "--save-weights /dev/null/w"),
     (["--out", "/"], "expected a directory"),
     (["--out", "x", "--target", "toaster"], "expected one of: cpu"),
     (["--out", "x", "--target", "no-such.toml"], "no-such.toml: cannot be read"),
@@ -185,7 +194,7 @@ def test_wrong_arguments_get_one_line_and_their_exit_code(
     arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == (1 if arguments[:1] == ["verify"] and len(arguments) > 1 else 2)
+    assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert said in captured.err
