@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -48,7 +49,7 @@ RANGES_FILE = "ranges.json"
 RANGE_FRAMES = 8
 """Frames of the calibration set over which ranges of activations are taken, evenly spread."""
 
-WEIGHTS_CODE = ("export.checkpoint.load", "export.checkpoint.tokenizer", "export.model.weights")
+WEIGHTS_CODE = ("export.job", "export.checkpoint.load", "export.checkpoint.tokenizer", "export.model.weights")
 REFERENCE_CODE = ("export.parity", "export.sample_files")
 TASK_CODE = ("export.task_samples", "export.torch_stages", "export.sample_files")
 PRECISION_CODE = ("export.sensitivity",)
@@ -151,6 +152,12 @@ class Pipeline:
                     watch.from_cache()
         return self._entries[key]
 
+    def _key(self, stage: str, parts: Mapping[str, Any], modules: tuple[str, ...], recipe: Callable[..., Any]) -> str:
+        """Key of a stage, also of the method here that makes it (the whole module would undo all on every edit) and of
+        the threads that sum for it."""
+        parts = {**parts, "recipe": inspect.getsource(recipe), "threads": self._threads}
+        return stage_key(stage, parts, modules)
+
     def weights(self) -> WeightsRecord:
         """Hash and origin of the weights; raises CheckpointError."""
         return WeightsRecord(**json.loads((self._weights_entry / WEIGHTS_FILE).read_text(encoding="utf-8")))
@@ -172,7 +179,8 @@ class Pipeline:
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
             (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded))
 
-        return self._stage("weights", stage_key("weights", self.job.weights.fingerprint(), WEIGHTS_CODE), build)
+        key = self._key("weights", self.job.weights.fingerprint(), WEIGHTS_CODE, build)
+        return self._stage("weights", key, build)
 
     def _parts(self, **more: Any) -> dict[str, Any]:
         """Parts of every key that depends on the network: its weights, wherever they came from, and the rest."""
@@ -182,7 +190,7 @@ class Pipeline:
 
     def _reference_key(self, graph: str) -> str:
         parts = self._parts(graph=graph, inputs=self.job.target.gate(graph).inputs)
-        return stage_key("reference", parts, REFERENCE_CODE)
+        return self._key("reference", parts, REFERENCE_CODE, Pipeline.reference)
 
     def reference(self, graph: str) -> Path:
         """Test inputs of a graph and PyTorch's outputs."""
@@ -204,7 +212,7 @@ class Pipeline:
         parts = self._parts(
             calibration=calibration, tokenizer=tokenizer, frame_offsets_s=offsets, new_tokens=NEW_TOKENS
         )
-        return stage_key("task", parts, TASK_CODE)
+        return self._key("task", parts, TASK_CODE, Pipeline.task_reference)
 
     def task_reference(self) -> Path:
         """PyTorch's plans in those situations."""
@@ -234,12 +242,15 @@ class Pipeline:
             heading_deg=task.warn_heading_deg or task.heading_deg,
             speed_mps=task.speed_mps,
             turn_radps=task.turn_radps,
+            relative=task.warn_relative,
             top1=top1,
         )
         points = [point for point in self.job.target.measured if point.model == self.job.config.name]
-        key = stage_key(
+        key = self._key(
             "precision",
             {
+                "trained": self.weights().trained,
+                "speed_first": graph in COMPUTING,
                 "task": self._task_key(),
                 "graph": graph,
                 "candidates": list(policy.candidates),
@@ -248,16 +259,12 @@ class Pipeline:
                 "measured": [asdict(point) for point in points],
             },
             PRECISION_CODE,
+            Pipeline.decision,
         )
 
         def build(directory: Path) -> None:
-            decision = self._search.choose(
-                graph,
-                policy.candidates,
-                limits,
-                measured=points,
-                speed_first=graph in COMPUTING,
-            )
+            speed_first = graph in COMPUTING
+            decision = self._search.choose(graph, policy.candidates, limits, measured=points, speed_first=speed_first)
             (directory / DECISION_FILE).write_text(json.dumps(decision.to_dict(), allow_nan=False), encoding="utf-8")
 
         entry = self._stage(f"precision {graph}", key, build)
@@ -287,7 +294,7 @@ class Pipeline:
         precision, _ = self.precision(graph)
         ranges = self._ranges(graph, precision)
         parts = self._parts(graph=graph, precision=precision.to_dict(), form=policy.form, half=half, ranges=ranges)
-        key = stage_key("graph", parts, GRAPH_CODE)
+        key = self._key("graph", parts, GRAPH_CODE, Pipeline.graph)
 
         def build(directory: Path) -> None:
             model = self.job.weights.get().model
@@ -309,7 +316,7 @@ class Pipeline:
 
         entry = self._stage(
             "activation ranges",
-            stage_key("ranges", {"task": self._task_key(), "frames": RANGE_FRAMES}, RANGES_CODE),
+            self._key("ranges", {"task": self._task_key(), "frames": RANGE_FRAMES}, RANGES_CODE, build),
             build,
         )
         content: dict[str, float] = json.loads((entry / RANGES_FILE).read_text(encoding="utf-8"))

@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from edge.artifact_files import seal
 from edge.manifest import Artifacts, load_artifacts
@@ -29,11 +31,11 @@ from export.metrics import Arrays, ParityResult, Sample, compare
 from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.parity import references, sample_inputs
-from export.pipeline import Pipeline, build_stages, with_exceptions
+from export.pipeline import Pipeline, WeightsRecord, build_stages, with_exceptions
 from export.precision import Precision
 from export.progress import Progress
 from export.stages import StageCache, file_sha256, open_cache
-from export.target import TARGETS_DIR, list_targets, load_target
+from export.target import TARGETS_DIR, list_targets, load_target, with_settings
 from export.task_error import TaskError, prompt_parts
 
 NANO = PRESETS["nano"]
@@ -390,6 +392,31 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     assert "graph action_expert: from the cache" in done.stderr
     assert done.stdout == ""
     subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=60)
+
+
+def test_weights_that_are_trained_or_other_threads_choose_a_precision_anew(
+    cache: StageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = with_settings(TARGET, ["graphs.vision_encoder.candidates=fp32,int8"])
+    keys: list[str] = []
+
+    def key_of(pipeline: Pipeline) -> str:
+        keys.clear()
+        monkeypatch.setattr(Pipeline, "_stage", lambda _, title, key, build: keys.append(key) or Path("none"))
+        with pytest.raises(FileNotFoundError):
+            pipeline.decision("vision_encoder")
+        return keys[-1]
+
+    def pipeline(trained: bool, threads: int) -> Pipeline:
+        record = WeightsRecord("0" * 64, trained, "a test", {})
+        monkeypatch.setattr(Pipeline, "weights", lambda _: record)
+        monkeypatch.setattr(Pipeline, "tokenizer", lambda _: b"")
+        monkeypatch.setattr("export.pipeline.threads_for", lambda _: threads)
+        return Pipeline(replace(job(), target=target), cache, progress())
+
+    found = {key_of(pipeline(trained, threads)) for trained in (False, True) for threads in (1, 2)}
+    torch.set_num_threads(1)
+    assert len(found) == 4
 
 
 # ---- what is there stays
