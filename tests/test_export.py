@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,10 +16,8 @@ import onnx
 import pytest
 import torch
 
-from edge.artifact_files import seal
 from edge.manifest import Artifacts, load_artifacts
-from export import entry
-from export.artifacts import build_artifacts, workplace
+from export.artifacts import build_artifacts
 from export.calibration import load_calibration
 from export.cli import DEFAULT_CALIBRATION, main
 from export.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
@@ -31,19 +28,15 @@ from export.metrics import Arrays, ParityResult, Sample, compare
 from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.parity import references, sample_inputs
-from export.pipeline import Pipeline, WeightsRecord, build_stages, with_exceptions
-from export.precision import Precision
+from export.pipeline import Pipeline, WeightsRecord, build_stages
 from export.progress import Progress
-from export.stages import StageCache, file_sha256, open_cache
-from export.target import TARGETS_DIR, list_targets, load_target, with_settings
+from export.stages import StageCache, open_cache
+from export.target import load_target, with_settings
 from export.task_error import TaskError, prompt_parts
 
 NANO = PRESETS["nano"]
 TARGET = load_target("cpu", "nano")
 GRAPHS = graph_names(pair=False)
-LOOSE = [
-    f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
-]  # for an encoder that is rounded
 
 
 @pytest.fixture(scope="module")
@@ -252,96 +245,6 @@ def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys
     assert "with a warning" in (out / "report.html").read_text()
 
 
-# ---- verify
-
-
-def test_verify_repeats_the_gate(artifacts_dir: Path) -> None:
-    assert main(["verify", str(artifacts_dir)]) == 0
-
-
-def resealed(directory: Path, keys: str, value: object) -> Path:
-    """One value of the manifest changed by somebody who also renewed its hash."""
-    content = manifest(directory)
-    *above, last = keys.split("/")
-    table = content
-    for key in above:
-        table = table[key]
-    assert table[last] != value
-    table[last] = value
-    (directory / "manifest.json").write_text(json.dumps(seal(content)))
-    return directory
-
-
-@pytest.mark.parametrize(
-    ("keys", "value", "said"),
-    [
-        ("runtime/tick_period_ms", 900, "runtime.tick_period_ms is 900, this export writes 100"),
-        ("runtime/img_context_id", 7, "runtime.img_context_id is 7"),
-        ("runtime/frame_offsets_s", [0.0, 3.0, 6.0, 1.0], "runtime.frame_offsets_s is"),
-        ("runtime/max_new_tokens", 47, "runtime.max_new_tokens is 47"),
-        ("graphs/action_expert/session/threads", 2, "graphs.action_expert.session.threads is 2"),
-        ("graphs/vision_encoder/precision/default", "int8", 'graphs.vision_encoder.precision.default is "int8"'),
-        ("model/name", "1b", 'model.name is "1b"'),
-        ("model/trained", True, "model.trained is true, this export writes false"),
-        ("model/config/action/step_s", 0.2, "model.config.action.step_s is 0.2"),
-        ("provenance/target/gates/action_expert/max_abs", 9.0, "gates.action_expert.max_abs is 9.0"),
-    ],
-)
-def test_a_manifest_that_was_changed_and_sealed_again_does_not_verify(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: str, value: object, said: str
-) -> None:
-    copy = resealed(Path(shutil.copytree(artifacts_dir, tmp_path / "nano")), keys, value)
-    assert main(["verify", str(copy)]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert said in error
-
-
-def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
-    tokenizer = json.loads((copy / "tokenizer.json").read_text())
-    (copy / "tokenizer.json").write_text(json.dumps(tokenizer, indent=3))
-    listed = {"sha256": file_sha256(copy / "tokenizer.json"), "bytes": (copy / "tokenizer.json").stat().st_size}
-    resealed(copy, "files/tokenizer.json", listed)
-    assert main(["verify", str(copy)]) == 1
-    assert "tokenizer.json: not the tokenizer" in capsys.readouterr().err
-
-
-def test_thresholds_that_were_set_are_kept_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    setting = "gates.action_expert.max_abs=0.5"
-    assert main(["--out", str(tmp_path / "nano"), "--set", setting]) == 0
-    assert main(["verify", str(tmp_path / "nano")]) == 0
-    assert f"note: thresholds were set when it was built: {setting}" in capsys.readouterr().err
-
-
-def test_a_directory_for_a_target_of_the_users_own_says_whose_thresholds_it_is_held_to(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own = tmp_path / "own.toml"
-    own.write_text((TARGETS_DIR / "cpu.toml").read_text())
-    assert main(["--target", str(own), "--out", str(tmp_path / "nano")]) == 0
-    assert main(["verify", str(tmp_path / "nano")]) == 0
-    assert "checked against the thresholds that the manifest gives" in capsys.readouterr().err
-
-
-def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["verify", str(artifacts_dir), "--random-weights", "5"]) == 1
-    assert "other weights" in capsys.readouterr().err
-
-
-def test_verify_of_a_checkpoint_takes_the_checkpoint(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    saved, out = tmp_path / "nano.safetensors", tmp_path / "nano"
-    assert main(["--out", str(tmp_path / "first"), "--random-weights", "0", "--save-weights", str(saved)]) == 0
-    assert main(["--out", str(out), "--checkpoint", str(saved)]) == 0
-    capsys.readouterr()
-    assert main(["verify", str(out)]) == 2
-    assert "nano.safetensors" in capsys.readouterr().err
-    assert main(["verify", str(out), "--checkpoint", str(saved)]) == 0
-
-
 # ---- the same again
 
 
@@ -417,204 +320,3 @@ def test_weights_that_are_trained_or_other_threads_choose_a_precision_anew(
     found = {key_of(pipeline(trained, threads)) for trained in (False, True) for threads in (1, 2)}
     torch.set_num_threads(1)
     assert len(found) == 4
-
-
-# ---- what is there stays
-
-
-def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
-    (out / "flight.mcap").write_bytes(b"evidence")
-    assert main(["--out", str(out)]) == 2
-    assert "flight.mcap" in capsys.readouterr().err
-    assert (out / "flight.mcap").read_bytes() == b"evidence"
-
-
-def test_a_failed_swap_puts_the_old_directory_back(
-    cache: StageCache, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
-    rename = Path.rename
-
-    def failing(self: Path, target: Path) -> Path:
-        if self.name == "new":
-            raise OSError("disk full")
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(OSError, match="disk full"):
-        build_artifacts(job(), out, cache, progress())
-    assert [p.name for p in tmp_path.iterdir()] == ["nano"]
-    load_artifacts(out)
-
-
-def test_an_existing_directory_that_is_not_ours_is_not_touched(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
-    assert main(["--out", str(tmp_path / "thesis")]) == 2
-    assert "manifest.json" in capsys.readouterr().err
-    assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
-
-
-@pytest.mark.parametrize("name", ["nano.partial", "nano.old.partial"])
-def test_a_directory_of_the_users_beside_the_output_stays(artifacts_dir: Path, tmp_path: Path, name: str) -> None:
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "notes.txt").write_text("mine")
-    (tmp_path / "nano").mkdir()  # empty: may be used
-    assert main(["--out", str(tmp_path / "nano")]) == 0
-    assert (tmp_path / name / "notes.txt").read_text() == "mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["nano", name])
-
-
-def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path) -> None:
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "nano").symlink_to("disk")
-    assert main(["--out", str(tmp_path / "nano")]) == 0
-    assert (tmp_path / "nano").is_symlink()
-    load_artifacts(tmp_path / "disk")
-
-
-def test_an_older_directory_of_ours_is_replaced_if_its_files_are_as_it_says(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
-    content = {"schema_version": 1, "files": manifest(out)["files"]}
-    (out / "manifest.json").write_text(json.dumps(content))
-    tokenizer = (out / "tokenizer.json").read_bytes()
-    (out / "tokenizer.json").write_bytes(tokenizer + b"\n")
-    assert main(["--out", str(out)]) == 2
-    assert "schema version 1" in capsys.readouterr().err
-    (out / "tokenizer.json").write_bytes(tokenizer)
-    assert main(["--out", str(out)]) == 0
-    load_artifacts(out)
-
-
-def test_a_second_export_into_one_directory_is_refused(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with workplace(tmp_path / "nano") as work:
-        (work / "new").mkdir()
-        assert main(["--out", str(tmp_path / "nano")]) == 2
-        assert "another export is writing" in capsys.readouterr().err.splitlines()[-1]
-        assert (work / "new").exists()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_killed_export_was_replacing_comes_back(artifacts_dir: Path, tmp_path: Path) -> None:
-    work = tmp_path / ".nano.edge-export"
-    shutil.copytree(artifacts_dir, work / "old")
-    (work / "new").mkdir()
-    with workplace(tmp_path / "nano"):
-        load_artifacts(tmp_path / "nano")
-    assert [path.name for path in tmp_path.iterdir()] == ["nano"]
-
-
-# ---- the command line
-
-
-def test_an_interrupt_while_modules_load_is_no_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: str) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(entry, "run_with_extra", interrupted)
-    assert entry.main() == 130
-    assert capsys.readouterr().err == "edge-export: interrupted\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "kept"), [([], "finished stages are in the cache"), (["--no-cache"], "nothing was kept")]
-)
-def test_an_interrupt_says_what_is_left(
-    arguments: list[str],
-    kept: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("export.cli.build_artifacts", interrupted)
-    assert main(["--out", str(tmp_path / "nano"), *arguments]) == 130
-    assert capsys.readouterr().err == f"edge-export: interrupted; {kept}\n"
-
-
-def test_targets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--list-targets"]) == 0
-    assert [line.split("\t")[0] for line in capsys.readouterr().out.splitlines()] == list_targets()
-
-
-def test_a_dry_run_prints_the_plan_and_builds_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["--target", "cpu", "--model", "1b", "--dry-run", "--json", "-"]) == 0
-    captured = capsys.readouterr()
-    plan = json.loads(captured.out)["plan"]
-    assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(plan)
-    assert "verdict" in captured.err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("arguments", [["--dry-run"], ["--out", "x"]])
-def test_a_plan_that_does_not_fit_is_refused_before_anything_is_built(
-    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["--target", "orin", "--model", "1b", "--set", "power.mode=10W", *arguments]) == 1
-    assert "1b does not fit orin (10W): tick" in capsys.readouterr().err.splitlines()[-1]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_result_has_the_keys_that_other_tools_read(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--out", str(tmp_path / "nano"), "--json", "-"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert {"target", "model", "graphs", "plan", "peak_rss_bytes", "wall_s"} <= set(result)
-    for graph in result["graphs"].values():
-        assert {"params", "bytes", "precision", "parity"} <= set(graph)
-        assert {"cosine", "max_abs", "verdict"} <= set(graph["parity"])
-    assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(result["plan"])
-
-
-def test_a_precision_that_is_asked_for_ships_although_the_target_leaves_a_choice(tmp_path: Path) -> None:
-    out = tmp_path / "nano"
-    choice = ["--set", "graphs.vision_encoder.candidates=fp32,int8"]
-    assert main(["--out", str(out), *choice, "--set", "graphs.vision_encoder.precision=int8-b32", *LOOSE]) == 0
-    assert manifest(out)["graphs"]["vision_encoder"]["precision"] == {"default": "int8-b32", "overrides": {}}
-
-
-@pytest.mark.parametrize(
-    ("chosen", "asked", "shipped"),
-    [
-        ((("blocks.*", "int8"),), (("blocks.0.qkv", "fp32"),), {"blocks.0.qkv": "fp32", "blocks.*": "int8"}),
-        ((("blocks.0.qkv", "int8"),), (("blocks.0.qkv", "fp32"),), {"blocks.0.qkv": "fp32"}),
-        ((("blocks.0.qkv", "fp32"),), (("blocks.*", "int8"),), {"blocks.0.qkv": "fp32", "blocks.*": "int8"}),
-        ((), (("blocks.*", "int4-b128"),), {}),
-    ],
-)
-def test_the_exact_exceptions_of_a_target_win_over_what_the_search_chose(
-    chosen: tuple[tuple[str, str], ...], asked: tuple[tuple[str, str], ...], shipped: dict[str, str]
-) -> None:
-    found = with_exceptions(Precision("int4-b128", chosen), Precision("int4-b32", asked))
-    assert found == Precision("int4-b128", tuple(shipped.items()))
-    assert found == Precision.from_dict(found.to_dict())
-
-
-def test_a_setting_of_the_network_makes_that_network_and_a_small_cache_stays_small(tmp_path: Path) -> None:
-    out, cache = tmp_path / "three", tmp_path / "cache"
-    settings = ["--set", "model.action.layers=3", "--set", "graphs.action_expert.threads=2"]
-    assert main(["--out", str(out), *settings, "--cache", str(cache), "--cache-gb", "0.03"]) == 0
-    content = manifest(out)
-    assert content["model"]["config"]["action"]["layers"] == 3
-    assert content["graphs"]["action_expert"]["session"]["threads"] == 2
-    names = [tensor["name"] for tensor in content["graphs"]["semantic_context"]["outputs"]]
-    assert [name for name in names if name.endswith(".key")] == [f"context.{i}.key" for i in range(3)]
-    assert 0 < sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) < 35e6
