@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import math
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -46,6 +47,8 @@ SAMPLES_FILE = "samples.safetensors"
 OUTPUTS_FILE = "outputs.safetensors"
 DECISION_FILE = "decision.json"
 RANGES_FILE = "ranges.json"
+GATE_MARGIN = 0.7
+"""Share of the gate's error that the search may use: it sees prompts, the gate the worst of its inputs."""
 RANGE_FRAMES = 8
 """Frames of the calibration set over which ranges of activations are taken, evenly spread."""
 
@@ -244,6 +247,8 @@ class Pipeline:
             turn_radps=task.turn_radps,
             relative=task.warn_relative,
             top1=top1,
+            # A relative error of e leaves a cosine of about 1 − e²/2.
+            output_error=GATE_MARGIN * math.sqrt(2 * max(1 - self.job.target.gate(graph).min_cosine, 1e-9)),
         )
         points = [point for point in self.job.target.measured if point.model == self.job.config.name]
         key = self._key(

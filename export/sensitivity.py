@@ -39,6 +39,8 @@ class Limits:
     relative: float = RELATIVE_LIMIT
     top1: float | None = None
     """Smallest share of equal next tokens; only held against trained weights: untrained logits are nearly ties."""
+    output_error: float | None = None
+    """Largest change of the graph's own output, as a share of it: what the gate holds its tensors to."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -56,6 +58,8 @@ class Limits:
         ]
         if trained and self.top1 is not None and reading.top1 is not None:
             shares.append((1 - reading.top1) / max(1 - self.top1, 1e-9))
+        if self.output_error is not None:
+            shares.append(reading.output_error / self.output_error)
         return max(shares)
 
 
@@ -362,6 +366,10 @@ def _reason(trial: _Trial, search: Search, graph: str, precision: Precision, kep
             f"average {share} of their own spread (limits {limits.waypoint_cm:g} cm, {limits.heading_deg:g} deg, "
             f"{100 * limits.relative:g} %)"
         )
+        if limits.output_error is not None:
+            parts.append(
+                f"its outputs move by {100 * row.output_error:.2g} % (limit {100 * limits.output_error:.2g} %)"
+            )
     else:
         parts.append(f"{precision.default}: the exact model")
     if not within:

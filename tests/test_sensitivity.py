@@ -311,3 +311,9 @@ def test_the_large_model_is_searched_with_two_short_prompts() -> None:
     samples = search_samples(load_calibration("corridor-go2"), config, runtime, NANO_TOKENIZER.read_bytes())
     assert len(samples.samples) == 2 and len(samples.frames) == 6
     assert all(sum(part.frame is not None for part in sample.prompt) == 1 for sample in samples.samples)
+
+
+def test_a_graph_whose_own_output_moves_too_far_is_outside_although_its_plans_are_not() -> None:
+    calm = Reading(0.1, 0.1, 0.001, 0.001, 0.01, output_error=0.3, top1=None)
+    assert Limits(5, 3, 0.05, 0.05).load(calm, trained=False) < 1
+    assert Limits(5, 3, 0.05, 0.05, output_error=0.2).load(calm, trained=False) == pytest.approx(1.5)
