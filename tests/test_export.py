@@ -274,7 +274,12 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", "--out", str(out), "--cache", str(cache)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
+    # A background job of a shell ignores SIGINT and so would its children; what is handled here is default there.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
+    finally:
+        signal.signal(signal.SIGINT, before)
     try:
         assert process.stderr is not None
         for line in process.stderr:
