@@ -10,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 from edge.manifest import Artifacts, load_artifacts
+from export.stages import StageCache, open_cache
 
 # How long an example takes says nothing about it on a shared machine.
 settings.register_profile("tests", deadline=None)
@@ -32,6 +33,13 @@ def export_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         del os.environ["XDG_CACHE_HOME"]
     else:
         os.environ["XDG_CACHE_HOME"] = before
+
+
+@pytest.fixture
+def cache(export_cache: Path) -> Iterator[StageCache]:
+    """That cache, opened."""
+    with open_cache(export_cache, 10**10, print) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="session")

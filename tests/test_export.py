@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -18,24 +15,19 @@ import torch
 
 from edge.manifest import Artifacts, load_artifacts
 from export.artifacts import build_artifacts
-from export.calibration import load_calibration
 from export.cli import DEFAULT_CALIBRATION, main
 from export.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
 from export.gates import GateError, judge
 from export.graphs.build import graph_names, write_graph
-from export.job import Job, WeightSource
 from export.metrics import Arrays, ParityResult, Sample, compare
-from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.parity import references, sample_inputs
-from export.pipeline import Pipeline, WeightsRecord, build_stages
-from export.progress import Progress
-from export.stages import StageCache, open_cache
-from export.target import load_target, with_settings
+from export.pipeline import Pipeline, WeightsRecord
+from export.stages import StageCache
+from export.target import with_settings
 from export.task_error import TaskError, prompt_parts
+from tests.export_job import NANO, TARGET, job, manifest, progress
 
-NANO = PRESETS["nano"]
-TARGET = load_target("cpu", "nano")
 GRAPHS = graph_names(pair=False)
 
 
@@ -47,25 +39,6 @@ def model() -> TicVla:
 @pytest.fixture(scope="module")
 def samples(model: TicVla) -> dict[str, list[Sample]]:
     return {name: references(model, name, TARGET.gate(name).inputs) for name in GRAPHS}
-
-
-@pytest.fixture
-def cache(export_cache: Path) -> Iterator[StageCache]:
-    with open_cache(export_cache, 10**10, print) as opened:
-        yield opened
-
-
-def job(seed: int = 0) -> Job:
-    return Job(TARGET, WeightSource(NANO, [], seed), load_calibration(DEFAULT_CALIBRATION))
-
-
-def progress() -> Progress:
-    return Progress("test", build_stages(job(), {}))
-
-
-def manifest(directory: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((directory / "manifest.json").read_text())
-    return content
 
 
 def verdict(name: str, found: ParityResult) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,15 +12,11 @@ from export.cli import main
 from export.pipeline import with_exceptions
 from export.precision import Precision
 from export.target import list_targets
+from tests.export_job import manifest
 
 LOOSE = [
     f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
 ]  # for an encoder that is rounded
-
-
-def manifest(directory: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((directory / "manifest.json").read_text())
-    return content
 
 
 def test_an_interrupt_while_modules_load_is_no_traceback(

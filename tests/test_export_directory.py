@@ -4,44 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from edge.manifest import load_artifacts
 from export.artifacts import build_artifacts, workplace
-from export.calibration import load_calibration
-from export.cli import DEFAULT_CALIBRATION, main
-from export.job import Job, WeightSource
-from export.model.config import PRESETS
-from export.pipeline import build_stages
-from export.progress import Progress
-from export.stages import StageCache, open_cache
-from export.target import load_target
-
-NANO = PRESETS["nano"]
-TARGET = load_target("cpu", "nano")
-
-
-@pytest.fixture
-def cache(export_cache: Path) -> Iterator[StageCache]:
-    with open_cache(export_cache, 10**10, print) as opened:
-        yield opened
-
-
-def job(seed: int = 0) -> Job:
-    return Job(TARGET, WeightSource(NANO, [], seed), load_calibration(DEFAULT_CALIBRATION))
-
-
-def progress() -> Progress:
-    return Progress("test", build_stages(job(), {}))
-
-
-def manifest(directory: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((directory / "manifest.json").read_text())
-    return content
+from export.cli import main
+from export.stages import StageCache
+from tests.export_job import job, manifest, progress
 
 
 def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced(

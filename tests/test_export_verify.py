@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,11 +12,7 @@ from edge.artifact_files import seal
 from export.cli import main
 from export.stages import file_sha256
 from export.target import TARGETS_DIR
-
-
-def manifest(directory: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((directory / "manifest.json").read_text())
-    return content
+from tests.export_job import manifest
 
 
 def test_verify_repeats_the_gate(artifacts_dir: Path) -> None:
