@@ -6,6 +6,7 @@ every layer of the language model, so that rounding layer N costs only the layer
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -87,7 +88,7 @@ class Reference:
         )
 
 
-class Probe:
+class Probe(ABC):
     """One graph of the model under rounding."""
 
     def __init__(self, reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> None:
@@ -102,9 +103,9 @@ class Probe:
         """Patterns over the graph's layers that are rounded together: a block, a decoder layer, a projection."""
         return tuple(dict.fromkeys(group_of(layer) for layer in self.layers))
 
+    @abstractmethod
     def whole(self, precision: Precision) -> Reading:
         """The graph in that precision."""
-        raise NotImplementedError
 
     def group(self, group: str, precision: str) -> Reading:
         """The graph with one group of layers in that precision."""
