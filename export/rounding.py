@@ -49,16 +49,20 @@ class Rounder:
         return torch.from_numpy(packed.dequantised()).reshape(rows.shape)
 
     def choices(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
-        """Most likely token [n] of hidden states [n, d] by a vocabulary matrix, which is rounded slab by slab."""
-        best = torch.full((hidden.shape[0],), -torch.inf)
-        choice = torch.zeros(hidden.shape[0], dtype=torch.long)
+        """Most likely token [n] of hidden states [n, d] by a vocabulary matrix; see `logits`."""
+        return self.logits(parameter, hidden, precision).argmax(dim=-1)
+
+    def logits(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
+        """Scores [n, vocab] of hidden states [n, d] by a vocabulary matrix, which is rounded slab by slab."""
         x = round_u8(hidden) if precision == "int8" else hidden
-        for start in range(0, parameter.shape[0], SLAB_ROWS):
-            rows = self._rows(parameter, precision, start, min(start + SLAB_ROWS, parameter.shape[0]))
-            value, index = (x @ rows.T).max(dim=-1)
-            better = value > best
-            best, choice = torch.where(better, value, best), torch.where(better, index + start, choice)
-        return choice
+        starts = range(0, parameter.shape[0], SLAB_ROWS)
+        return torch.cat(
+            [
+                x @ self._rows(parameter, precision, start, min(start + SLAB_ROWS, parameter.shape[0])).T
+                for start in starts
+            ],
+            dim=-1,
+        )
 
     def _keep(self, key: tuple[int, str, int], packed: Blocks | Channels) -> None:
         size = _bytes(packed)

@@ -21,6 +21,7 @@ from edge.prompt import Segment
 from export.graphs.build import linear_layers
 from export.model.network import TicVla
 from export.model.vision import fold_tokens
+from export.parity import sample_inputs
 from export.precision import Precision
 from export.rounding import Rounder
 from export.task_error import compare_plans, plan, prompt_parts, relative_error, short, spread
@@ -31,6 +32,9 @@ Floats = npt.NDArray[np.float32]
 
 TOKENS_COMPARED = 16
 """Positions at the prompt's end whose most likely next token is compared: they are text, as an answer's are."""
+
+DECODE_INPUTS = 8
+"""Calls like the gate's that a decoding graph is held to: its tensors are judged there, after no exact prompt."""
 
 
 @dataclass(frozen=True)
@@ -182,12 +186,14 @@ class VisionProbe(Probe):
 class LanguageProbe(Probe):
     """The language model; as `language_model.decode` only the text at the prompt's end goes through the rounding.
 
-    That text stands for an answer's tokens, which decoding would feed one by one onto an exact cache.
+    That text stands for an answer's tokens, which decoding would feed one by one onto an exact cache. Its output error
+    is also that of the gate's calls, in which nothing is exact.
     """
 
     def __init__(self, reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> None:
         super().__init__(reference, graph, rounder, activations=activations)
         self._tokens = "lm_head" in self.layers
+        self._calls = self._gate_calls() if graph == "language_model.decode" else []
         self._runs = [self._prepare(index) for index in range(len(reference.samples.samples))]
 
     def _prepare(self, index: int) -> dict[str, Any]:
@@ -226,14 +232,15 @@ class LanguageProbe(Probe):
             with torch.no_grad(), self._rounded(language, precision):
                 hidden, _, kv = language.hidden_states(run["ids"], run["visual"], run["past"])
             found.append((kv, hidden))
-        return self._reading(found, precision.of("lm_head"))
+        return self._reading(found, precision.of("lm_head"), self._calls_error(precision))
 
     def group(self, group: str, precision: str) -> Reading:
         """See `Probe`."""
-        if group == "lm_head":
-            return self._reading([(None, run["hidden"]) for run in self._runs], precision)
-        if not group.startswith("layers."):
+        if group != "lm_head" and not group.startswith("layers."):
             return super().group(group, precision)
+        calls_error = self._calls_error(Precision("fp32", ((group, precision),)))
+        if group == "lm_head":
+            return self._reading([(None, run["hidden"]) for run in self._runs], precision, calls_error)
         language, start = self.reference.model.language, int(group.split(".")[1])
         found = []
         # One prompt ranks the layers of a large model; what is chosen in the end is read on all of them.
@@ -245,9 +252,39 @@ class LanguageProbe(Probe):
                 new = run["ids"].shape[1]
                 parts = [t[:, :, -new:].transpose(1, 2).reshape(1, new, -1) for t in (keys, values)]
                 found.append((torch.cat(parts, dim=-1), language.norm(x)))
-        return self._reading(found, "fp32")
+        return self._reading(found, "fp32", calls_error)
 
-    def _reading(self, found: list[tuple[Tensor | None, Tensor]], head_precision: str) -> Reading:
+    def _gate_calls(self) -> list[tuple[Tensor, list[Tensor], Floats, Floats]]:
+        """Ids, caches and what the exact model makes of them: logits and K‖V."""
+        calls = []
+        for index in range(DECODE_INPUTS):
+            feeds = sample_inputs(self.reference.model.config, self.graph, index)
+            ids = torch.from_numpy(feeds["input_ids"])
+            past = int(feeds["total_sequence_length"]) - ids.shape[1]
+            caches = [torch.from_numpy(feeds[name][:, :, :past]) for name in feeds if name.startswith("past_")]
+            calls.append((ids, caches, *self._call(ids, caches, Precision("fp32"))))
+        return calls
+
+    def _call(self, ids: Tensor, caches: list[Tensor], precision: Precision) -> tuple[Floats, Floats]:
+        language, vision = self.reference.model.language, self.reference.model.config.vision
+        weight = language.lm_head.weight
+        assert isinstance(weight, nn.Parameter)
+        with torch.no_grad(), self._rounded(language, precision):
+            hidden, _, kv = language.hidden_states(ids, torch.zeros(1, vision.tokens, vision.token_dim), caches)
+            logits = self._rounder.logits(weight, hidden[0, -1:], precision.of("lm_head"))
+        return logits.numpy(), kv.numpy()
+
+    def _calls_error(self, precision: Precision) -> float:
+        """Largest relative error of those calls' logits and K‖V."""
+        errors = [0.0]
+        for ids, caches, *exact in self._calls:
+            found = self._call(ids, caches, precision)
+            errors += [relative_error(a, b) for a, b in zip(exact, found, strict=True)]
+        return max(errors)
+
+    def _reading(
+        self, found: list[tuple[Tensor | None, Tensor]], head_precision: str, calls_error: float = 0.0
+    ) -> Reading:
         r = self.reference
         plans, errors, same = [], [], []
         for index, (run, (kv, hidden)) in enumerate(zip(self._runs, found, strict=False)):
@@ -258,7 +295,7 @@ class LanguageProbe(Probe):
             plans.append(plan(r.stages, r.samples.samples[index], r.visual, r.stages.context(whole)))
             if self._tokens:
                 same.append(float((self._choices(hidden, head_precision) == run["tokens"]).float().mean()))
-        return r.reading(plans, max(errors), sum(same) / len(same) if same else None)
+        return r.reading(plans, max(calls_error, *errors), sum(same) / len(same) if same else None)
 
 
 class ActionProbe(Probe):

@@ -16,10 +16,12 @@ from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
 from export.model.tokenizer import NANO_TOKENIZER
 from export.model.weights import weights_sha256
+from export.parity import reference_outputs, sample_inputs
 from export.precision import Precision
 from export.rounding import Rounder, round_u8
 from export.sensitivity import Decision, Limits, Search, drop_dominated, search_samples
 from export.sensitivity_probe import Reading, Reference, group_of, probe
+from export.task_error import relative_error
 from export.task_samples import SampleSet
 
 NANO = PRESETS["nano"]
@@ -152,10 +154,26 @@ def test_rounding_one_block_of_the_encoder_from_its_kept_input_is_rounding_it_in
     assert torch.equal(whole, kept)
 
 
-def test_decoding_rounds_only_the_text_after_the_frames(reference: Reference) -> None:
+def test_decoding_moves_the_plan_less_than_rounding_the_frames_too(reference: Reference) -> None:
     decode = probe(reference, "language_model.decode", Rounder(), activations=True).whole(Precision("int4-b32"))
     both = probe(reference, "language_model", Rounder(), activations=True).whole(Precision("int4-b32"))
-    assert 0 < decode.output_error < both.output_error
+    assert 0 < decode.relative < both.relative
+
+
+def test_decoding_is_held_to_the_tensors_of_the_gate(reference: Reference) -> None:
+    """The gate has refused a decoding graph in which the text after exact frames looked well."""
+    precision = Precision("int4-b32")
+    found = probe(reference, "language_model.decode", Rounder(), activations=True).whole(precision)
+    errors = []
+    for index in range(8):
+        feeds = sample_inputs(reference.model.config, "language_model.decode", index)
+        layers = linear_layers(reference.model.config, "language_model.decode")
+        with torch.no_grad():
+            exact = reference_outputs(reference.model, "language_model.decode", feeds)
+        with torch.no_grad(), Rounder().applied(reference.model.language, precision, layers):
+            rounded = reference_outputs(reference.model, "language_model.decode", feeds)
+        errors += [relative_error(exact[name], rounded[name]) for name in ("logits", "last_layer_kv")]
+    assert found.output_error == pytest.approx(max(errors), rel=1e-3)
 
 
 def test_prefill_chooses_no_token_and_decoding_does(reference: Reference) -> None:
