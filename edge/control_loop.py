@@ -15,8 +15,8 @@ from edge.camera import Frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
 from edge.geometry import SE2
 from edge.graph import GraphError
-from edge.odometry import PoseHistory, StampedPose
 from edge.policy import Policy
+from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_loop import SemanticSlot
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing

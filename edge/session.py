@@ -23,8 +23,8 @@ from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.language import ContextOverflowError, LanguageModel
 from edge.manifest import Artifacts
-from edge.odometry import PoseHistory, StampedPose
 from edge.policy import Policy
+from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_loop import ReasoningLoop, SemanticSlot
 from edge.recorder import Recorder
 from edge.release import ReleaseDelay

@@ -12,7 +12,7 @@ from edge.control_loop import ControlLoop
 from edge.controller import Controller, ControllerConfig
 from edge.geometry import SE2
 from edge.graph import GraphError
-from edge.odometry import PoseHistory, StampedPose
+from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_loop import SemanticSlot
 from edge.ring import TokenRing
 from edge.semantic import SemanticState

@@ -1,4 +1,4 @@
-"""Pose history of the robot's odometry, read by two threads and written by a third without a lock."""
+"""Pose history of the robot, as the drift estimator gives it: read by two threads, written by a third, no lock."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edge.geometry import SE2, interpolate
 
 @dataclass(frozen=True)
 class StampedPose:
-    """Odometry as received: monotonic stamp, `T_odom_base`, body velocity."""
+    """One fused pose: monotonic stamp, `T_odom_base`, body velocity."""
 
     stamp_ns: int
     T_odom_base: SE2

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.geometry import SE2
-from edge.odometry import PoseHistory, StampedPose
+from edge.pose_history import PoseHistory, StampedPose
 
 
 def pose(stamp_ns: int, x_m: float) -> StampedPose:
