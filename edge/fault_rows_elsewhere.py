@@ -1,0 +1,161 @@
+"""Faults that the bridge or the robot answers, because the runner is what has failed, and those that refuse a start."""
+
+from __future__ import annotations
+
+from edge.fault_row import Action, Fault
+
+BRIDGE: tuple[Fault, ...] = (
+    Fault(
+        "graph-hung", 23, Action.STOP, 300, "bridge",
+        "A graph's run does not come back (driver or GPU hang): no commands come.",
+        "The watchdog restarts the runner; look at the kernel log before arming again.",
+        "tests/test_bridge_process.py::test_a_dead_or_frozen_runner_leaves_zero_on_the_wire",
+    ),
+    Fault(
+        "out-of-memory", 26, Action.STOP, 300, "bridge",
+        "The machine ran out of memory and the runner was killed.",
+        "Look for what used the memory (edge-doctor), then arm again.",
+        "tests/test_edge_run.py::test_killed_while_driving_the_robot_gets_zero_within_300_ms",
+    ),
+    Fault(
+        "runner-killed", 27, Action.STOP, 300, "bridge",
+        "The runner was killed.",
+        "Look at its journal, then start and arm again.",
+        "tests/test_edge_run.py::test_killed_while_driving_the_robot_gets_zero_within_300_ms",
+    ),
+    Fault(
+        "control-thread-dead", 28, Action.STOP, 300, "bridge",
+        "The runner lives but its control thread does not: no commands come.",
+        "The watchdog restarts the runner; report it with the journal.",
+        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+    ),
+    Fault(
+        "runner-frozen", 29, Action.STOP, 300, "bridge",
+        "The runner was frozen; commands that it left behind are refused by age and sequence.",
+        "Find what stopped it, then arm again.",
+        "tests/test_edge_run.py::test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead",
+    ),
+    Fault(
+        "bridge-killed", 30, Action.STOP, 1200, "robot",
+        "The bridge was killed: the robot itself drops a command after 1 s (simulated Go2; measure a real one).",
+        "systemd starts the bridge again, disarmed; look at its journal.",
+        "tests/test_sim_go2.py::test_a_move_is_held_one_second_and_then_the_robot_stands_still",
+    ),
+    Fault(
+        "bridge-hung", 31, Action.STOP, 1200, "robot",
+        "The bridge hangs: the runner ends its run, the robot itself drops a command after 1 s.",
+        "systemd's watchdog restarts the bridge, disarmed; look at its journal.",
+        "tests/test_control_loop.py::test_a_bridge_that_has_gone_silent_ends_the_loop",
+    ),
+    Fault(
+        "link-lost", 35, Action.STOP, 1300, "bridge",
+        "Nothing comes from the robot any more.",
+        "Check the cable to the robot and that the robot is on, then arm again.",
+        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+    ),
+    Fault(
+        "message-reordered", 36, Action.NOTHING, 0, "bridge",
+        "A command came twice or in the wrong order and was dropped.",
+        "Nothing to do.",
+        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+    ),
+    Fault(
+        "message-flood", 37, Action.NOTHING, 0, "bridge",
+        "Old messages arrived in a burst and were dropped by their age.",
+        "Nothing to do.",
+        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+    ),
+    Fault(
+        "late-motion", 38, Action.STOP, 40, "bridge",
+        "A motion command overtook the stop; the stop was sent again.",
+        "Nothing to do: zero goes on being sent.",
+        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+    ),
+    Fault(
+        "stop-call-blocked", 39, Action.NOTHING, 0, "bridge",
+        "The robot does not answer StopMove; zero velocity was sent before it.",
+        "If it stays, restart the robot.",
+        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+    ),
+    Fault(
+        "second-commander", 40, Action.STOP, 500, "bridge",
+        "Somebody else commands the robot.",
+        "Close the other program or app; only one may command the robot.",
+        "tests/test_bridge_process.py::test_a_second_client_is_turned_away_and_the_first_drives_on",
+    ),
+    Fault(
+        "robot-link-down", 46, Action.STOP, 100, "bridge",
+        "Commands cannot be sent: the network to the robot is down or its queue is full.",
+        "Check the network interface in the robot file.",
+        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+    ),
+    Fault(
+        "emergency-stop", 47, Action.STOP, 60, "bridge",
+        "The emergency stop was pressed, or the remote took over.",
+        "Find out why, release it, then arm again.",
+        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+    ),
+)  # fmt: skip
+
+START: tuple[Fault, ...] = (
+    Fault(
+        "provider-missing", 24, Action.STOP, 0, "start",
+        "An execution provider that the artifacts need is not on this machine.",
+        "Install it or export for this machine; the CPU is never used instead without being asked for.",
+        "tests/test_manifest.py::test_a_provider_that_this_machine_lacks_is_refused_by_name",
+    ),
+    Fault(
+        "provider-partial", 25, Action.STOP, 0, "start",
+        "The execution provider takes no part of a graph.",
+        "Build the engines again with edge-install engines and read what it says.",
+        "tests/test_engines.py::test_a_graph_that_the_provider_takes_no_part_of_is_refused",
+    ),
+    Fault(
+        "artifact-corrupt", 53, Action.STOP, 0, "start",
+        "A file of the artifacts is not what its manifest says.",
+        "Copy or export the artifacts again.",
+        "tests/test_manifest.py::test_one_flipped_bit_anywhere_is_refused_by_name",
+    ),
+    Fault(
+        "external-data", 54, Action.STOP, 0, "start",
+        "A graph points to data outside the manifest's list.",
+        "Do not use these artifacts: somebody has changed them.",
+        "tests/test_manifest.py::test_a_data_file_that_the_manifest_does_not_list_is_refused",
+    ),
+    Fault(
+        "manifest-changed", 55, Action.STOP, 0, "start",
+        "The manifest is not what was exported, or its signature does not match.",
+        "Use the artifacts as they were exported, with the key that they were signed with.",
+        "tests/test_manifest.py::test_a_change_anywhere_in_the_manifest_is_refused",
+    ),
+    Fault(
+        "code-in-artifacts", 56, Action.STOP, 0, "start",
+        "There is a file among the artifacts that the manifest does not list (a pickle could run code).",
+        "Delete it, or export the artifacts again.",
+        "tests/test_manifest.py::test_a_file_that_is_not_listed_is_refused",
+    ),
+    Fault(
+        "bad-configuration", 57, Action.STOP, 0, "start",
+        "The robot file has an unknown key, or a value beyond what the robot allows.",
+        "Correct the key that the message names.",
+        "tests/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
+    ),
+    Fault(
+        "wrong-robot", 58, Action.STOP, 0, "start",
+        "The robot file is for another robot or protocol.",
+        "Name the file of the robot that is connected.",
+        "tests/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
+    ),
+    Fault(
+        "restart-storm", 59, Action.STOP, 0, "start",
+        "The runner failed five times within 60 s and is not started again.",
+        "Look at its journal: journalctl -u edge-runner.",
+        "tests/test_edge_run.py::test_artifacts_that_do_not_verify_are_refused_by_name",
+    ),
+    Fault(
+        "upgrade-interrupted", 60, Action.STOP, 0, "start",
+        "Writing the artifacts was interrupted: the old ones are still there.",
+        "Export again.",
+        "tests/test_export_directory.py::test_what_a_killed_export_was_replacing_comes_back",
+    ),
+)  # fmt: skip
