@@ -37,11 +37,15 @@ class Heard:
 
 
 class FakeGo2:
-    """Serves in a thread of its own until `close`. `reporting = False` makes it fall silent."""
+    """Serves in a thread of its own until `close`.
+
+    `reporting = False` makes it fall silent; `truth` changes what it reports (fields of RobotTruth).
+    """
 
     def __init__(self, domain: int) -> None:
         self.mode = ids.MODE_LIE_DOWN
         self.reporting = True
+        self.truth: dict[str, object] = {}
         self.heard: list[Heard] = []
         self.bus = Bus(DdsConfig(domain, "lo", ("127.0.0.1",)))
         self._server = ServiceServer(self.bus, ids.SPORT_SERVICE)
@@ -81,7 +85,8 @@ class FakeGo2:
             now_ns = time.monotonic_ns()
             if self.reporting and now_ns - report_ns >= 20_000_000:
                 report_ns = now_ns
-                self._state.write(sport_mode_state(standing(self.mode), OdometryFrame((0.0, 0.0, 0.0))))
+                truth = standing(self.mode, time_s=now_ns / 1e9, **self.truth)
+                self._state.write(sport_mode_state(truth, OdometryFrame((0.0, 0.0, 0.0))))
 
 
 def standing(mode: int = ids.MODE_BALANCE_STAND, **changes: object) -> RobotTruth:

@@ -2,55 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 from firmware_bridge.config import RobotConfig
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.idl import SportModeState_
-from firmware_bridge.unitree.ids import GET_IMAGE_SAMPLE, SPORT_STATE_TOPIC, VIDEO_SERVICE
+from firmware_bridge.unitree.idl_low import LowState_
+from firmware_bridge.unitree.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
 from firmware_bridge.unitree.rpc import RpcClient, RpcError
+from firmware_bridge.unitree.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
+
+__all__ = ["BatteryState", "CameraError", "Go2Reader", "RobotState", "robot_state"]
 
 _WAIT_NS: Final = 100_000_000  # how soon close() is noticed
+_BATTERY_PERIOD_NS: Final = 500_000_000  # decoding a low state costs as much as ten odometry reports
 _JPEG_START: Final = b"\xff\xd8"
 
 
 class CameraError(RuntimeError):
     """No usable camera frame; one line that says why."""
-
-
-@dataclass(frozen=True)
-class RobotState:
-    """One odometry report: `T_odom_base` = (x_m, y_m, theta_rad), velocity in the body frame."""
-
-    received_ns: int
-    T_odom_base: tuple[float, float, float]
-    vx_mps: float
-    vy_mps: float
-    wz_radps: float
-    mode: int
-    error_code: int
-
-
-def robot_state(sample: SportModeState_, received_ns: int, velocity_frame: str) -> RobotState | None:
-    """Convert a `rt/sportmodestate` sample; None when a number in it is not finite.
-
-    `velocity_frame` is the frame of `sample.velocity`: the maker's simulator reports it in the odometry frame.
-    """
-    x_m, y_m = sample.position[0], sample.position[1]
-    theta_rad = sample.imu_state.rpy[2]
-    vx_mps, vy_mps, wz_radps = sample.velocity[0], sample.velocity[1], sample.yaw_speed
-    if not all(map(math.isfinite, (x_m, y_m, theta_rad, vx_mps, vy_mps, wz_radps))):
-        return None
-    if velocity_frame == "odom":
-        cos, sin = math.cos(theta_rad), math.sin(theta_rad)
-        vx_mps, vy_mps = cos * vx_mps + sin * vy_mps, cos * vy_mps - sin * vx_mps
-    pose = (x_m, y_m, theta_rad)
-    return RobotState(received_ns, pose, vx_mps, vy_mps, wz_radps, sample.mode, sample.error_code)
 
 
 class Go2Reader:
@@ -61,11 +34,15 @@ class Go2Reader:
         self.malformed = 0
         self._velocity_frame = config.odometry.velocity_frame
         self._state: RobotState | None = None
+        self._battery: BatteryState | None = None
+        self._battery_due_ns = 0
+        self._order = StampOrder()
         self._listener: Callable[[RobotState], None] | None = None
         self._closing = threading.Event()
         self._bus = bus or Bus(config.dds)
         self._owns_bus = bus is None
         self._reader = self._bus.reader(SPORT_STATE_TOPIC, SportModeState_)
+        self._low_reader = self._bus.reader(LF_LOW_STATE_TOPIC, LowState_)
         self._waitset = self._bus.waitset(self._reader)
         self._video = RpcClient(self._bus, VIDEO_SERVICE)
         self._thread = threading.Thread(target=self._read_states, name="go2-state", daemon=True)
@@ -74,6 +51,18 @@ class Go2Reader:
     def state(self) -> RobotState | None:
         """The newest state, None before the first; any thread, never waits."""
         return self._state
+
+    @property
+    def reordered(self) -> int:
+        """States dropped because they were not newer than one already delivered."""
+        return self._order.dropped
+
+    def battery(self) -> BatteryState | None:
+        """The battery as of at most 0.5 s ago, None before the first report; any thread, never waits.
+
+        The robot does not say when it measured: judge the age by `received_ns`.
+        """
+        return self._battery
 
     def set_state_listener(self, listener: Callable[[RobotState], None] | None) -> None:
         """Call `listener` with every state as it arrives, in the reading thread; it must not block or raise."""
@@ -105,7 +94,21 @@ class Go2Reader:
                 if state is None:
                     self.malformed += 1
                     continue
+                if not self._order.accept(state):
+                    continue
                 self._state = state
                 listener = self._listener
                 if listener is not None:
                     listener(state)
+            self._read_battery(time.monotonic_ns())
+
+    def _read_battery(self, now_ns: int) -> None:
+        if now_ns < self._battery_due_ns:
+            return
+        self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
+        for sample in take_each(self._low_reader):
+            battery = None if sample is None else battery_state(sample, now_ns)
+            if battery is None:
+                self.malformed += 1
+            else:
+                self._battery = battery

@@ -12,6 +12,7 @@ SPORT_SERVICE: Final = "sport"
 VIDEO_SERVICE: Final = "videohub"
 SPORT_STATE_TOPIC: Final = "rt/sportmodestate"
 LOW_STATE_TOPIC: Final = "rt/lowstate"
+LF_LOW_STATE_TOPIC: Final = "rt/lf/lowstate"  # the same at a low frequency
 
 API_VERSION: Final = 1  # every service answers it with its version as bare text
 SERVICE_VERSION: Final = "1.0.0.1"
@@ -49,6 +50,7 @@ MODE_LIE_DOWN: Final = 5
 MODE_JOINT_LOCK: Final = 6
 MODE_DAMPING: Final = 7
 MODE_RECOVERY_STAND: Final = 8
+LAST_MODE: Final = 13  # front pounce
 
 
 def request_topic(service: str) -> str:
