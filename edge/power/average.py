@@ -1,0 +1,61 @@
+"""The moving average that the budget is on: each sample weighs as long as it was in force."""
+
+from __future__ import annotations
+
+from collections import deque
+
+
+class PowerHistory:
+    """Energy of the last seconds, at any rate of samples, with bounded memory.
+
+    A sample holds until the next one, but not longer than `hold_s`: a gap beyond that belongs to no sample and is left
+    out of averages. Before the first sample everything is taken to have been as the first sample says.
+    """
+
+    def __init__(self, keep_s: float, hold_s: float = 1.0, capacity: int = 4096) -> None:
+        self._keep_ns = round(keep_s * 1e9)
+        self._hold_ns = round(hold_s * 1e9)
+        # (begin, end, W): ordered, not overlapping.
+        self._pieces: deque[tuple[int, int, float]] = deque(maxlen=capacity)
+        self._newest: tuple[int, float] | None = None
+        self._first_w: float | None = None
+
+    def add(self, stamp_ns: int, power_w: float) -> None:
+        """Append a sample; one that is not newer than the last is dropped."""
+        if self._newest is not None:
+            last_ns, last_w = self._newest
+            if stamp_ns <= last_ns:
+                return
+            self._pieces.append((last_ns, min(stamp_ns, last_ns + self._hold_ns), last_w))
+        else:
+            self._first_w = power_w
+        self._newest = (stamp_ns, power_w)
+        oldest_ns = stamp_ns - self._keep_ns
+        while self._pieces and self._pieces[0][1] <= oldest_ns:
+            self._pieces.popleft()
+            self._first_w = None
+
+    def energy_j(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
+        """(energy in J, seconds covered by samples) of an interval."""
+        if self._newest is None or end_ns <= begin_ns:
+            return 0.0, 0.0
+        newest_ns, newest_w = self._newest
+        energy, covered = 0.0, 0
+        for piece_begin, piece_end, power_w in (*self._pieces, (newest_ns, newest_ns + self._hold_ns, newest_w)):
+            length = min(piece_end, end_ns) - max(piece_begin, begin_ns)
+            if length > 0:
+                energy += power_w * length
+                covered += length
+        first_ns = self._pieces[0][0] if self._pieces else newest_ns
+        before = min(first_ns, end_ns) - begin_ns
+        if self._first_w is not None and before > 0:
+            energy += self._first_w * before
+            covered += before
+        return energy / 1e9, covered / 1e9
+
+    def average_w(self, now_ns: int, window_s: float) -> float | None:
+        """Mean power of the last `window_s`; None without a sample in it."""
+        energy, covered = self.energy_j(now_ns - round(window_s * 1e9), now_ns)
+        if covered <= 0:
+            return None if self._newest is None else self._newest[1]
+        return energy / covered

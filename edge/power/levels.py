@@ -1,0 +1,109 @@
+"""Learns, from power and from how much reasoning ran, what the device draws with and without it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+LEARN_S = 2.0
+"""Time constant: a few times the period of the samples, shorter than a generation."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Power without reasoning, and what a running generation adds."""
+
+    base_w: float
+    rise_w: float
+
+    def at(self, share: float) -> float:
+        """Power with reasoning running that share of the time."""
+        return self.base_w + self.rise_w * share
+
+
+class LevelEstimator:
+    """Two levels by normalised least mean squares: each sample moves the level that it says something of."""
+
+    def __init__(self, start: Levels | None) -> None:
+        self._start = start
+        self._base_w: float | None = None if start is None else start.base_w
+        self._rise_w: float | None = None if start is None else start.rise_w
+
+    @property
+    def levels(self) -> Levels | None:
+        """What is known; None before the first sample without a model to start from."""
+        return None if self._base_w is None else Levels(self._base_w, self._rise_w or 0.0)
+
+    def add(self, power_w: float, share: float, dt_s: float) -> None:
+        """A sample during which reasoning ran `share` (0 to 1) of the time."""
+        if self._base_w is None:
+            self._base_w = power_w
+        if self._rise_w is None:
+            if share < 0.5:
+                self._base_w += (power_w - self._base_w) * (1 - math.exp(-dt_s / LEARN_S))
+                return
+            self._rise_w = max(0.0, (power_w - self._base_w) / share)
+        busy_w = self._base_w + self._rise_w
+        error = power_w - (self._base_w * (1 - share) + busy_w * share)
+        step = error * (1 - math.exp(-dt_s / LEARN_S)) / ((1 - share) ** 2 + share**2)
+        busy_w += step * share
+        if share == 0.0:
+            busy_w += step  # what changes without reasoning changes under it too
+        self._base_w += step * (1 - share)
+        self._rise_w = max(0.0, busy_w - self._base_w)
+
+
+class GenerationTimes:
+    """How long generations take, from the counts of busy time and of finished generations."""
+
+    KEEP = 4
+
+    def __init__(self) -> None:
+        self._recent: deque[float] = deque(maxlen=self.KEEP)
+        self._done = 0
+        self._busy_s = 0.0
+
+    def update(self, generations: int, busy_s: float) -> None:
+        """Counts so far; both only grow."""
+        if generations > self._done:
+            self._recent.append((busy_s - self._busy_s) / (generations - self._done))
+            self._done, self._busy_s = generations, busy_s
+
+    def forget(self, busy_s: float) -> None:
+        """Lengths that were taken under another token cap say nothing any more."""
+        self._recent.clear()
+        self._busy_s = busy_s
+
+    @property
+    def mean_s(self) -> float | None:
+        """Mean of the last few; None before the first."""
+        return sum(self._recent) / len(self._recent) if self._recent else None
+
+    @property
+    def longest_s(self) -> float | None:
+        """Longest of the last few."""
+        return max(self._recent, default=None)
+
+
+def worst_share(generation_s: float, pause_s: float, window_s: float) -> float:
+    """Largest share of any window that generations take which repeat after a pause."""
+    cycle_s = generation_s + pause_s
+    if cycle_s <= 0:
+        return 1.0
+    whole = math.floor(window_s / cycle_s)
+    return min(1.0, (whole * generation_s + min(window_s - whole * cycle_s, generation_s)) / window_s)
+
+
+def pause_for(share: float, generation_s: float, window_s: float, tolerance_s: float = 0.01) -> float:
+    """Shortest pause that keeps every window's share at or below `share`; infinite where none does."""
+    if share >= 1.0:
+        return 0.0
+    if share <= 0.0 or generation_s >= share * window_s:
+        # One generation in a window must fit whatever the pause.
+        return math.inf if generation_s > share * window_s or share <= 0.0 else window_s
+    low, high = 0.0, window_s
+    while high - low > tolerance_s:
+        middle = (low + high) / 2
+        low, high = (middle, high) if worst_share(generation_s, middle, window_s) > share else (low, middle)
+    return high

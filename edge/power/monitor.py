@@ -1,0 +1,279 @@
+"""The power thread: reads meter, heat and battery about ten times a second, steps the governor, publishes its budget.
+
+Each source is read by a thread of its own, so that one that blocks costs its own value and nothing else: the stepping
+thread takes the newest value of each, and one that is too old counts as missing. Nobody waits for any of these threads.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+from edge.findings import Finding
+from edge.power.battery import BatteryReading, ReadBattery
+from edge.power.governor import OFF, Governor, GovernorInputs, GovernorOutputs
+from edge.power.governor import LEVELS as GOVERNOR_LEVELS
+from edge.power.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
+from edge.power.overcurrent import OverCurrentEvents
+from edge.power.statistics import PowerStatistics
+from edge.power.thermal import ThermalReader, ThermalState
+from edge.reasoning_budget import ReasoningBudget
+
+PERIOD_S: Final = 0.1
+STALE_NS: Final = 500_000_000
+THERMAL_STALE_NS: Final = 2_000_000_000
+JOIN_S: Final = 0.5
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Activity:
+    """What the program has done so far; counts only grow."""
+
+    ticks: int = 0
+    reasoning: bool = False
+    """A generation is under way."""
+    generations: int | None = None
+    """Finished ones; None: counted from `reasoning`, which misses those shorter than a period."""
+    reasoning_s: float | None = None
+    """Time that generations have taken; None: counted from `reasoning`."""
+
+
+@dataclass(frozen=True)
+class PowerSnapshot:
+    """Everything that is known of power at one step."""
+
+    stamp_ns: int
+    sample: PowerSample | None
+    """The meter's newest sample; None without a fresh one."""
+    outputs: GovernorOutputs
+    thermal: ThermalState | None
+    battery: BatteryReading | None
+    meter_error: str | None
+    over_current: dict[str, int]
+
+    def record(self) -> dict[str, Any]:
+        """The `/power` record of the flight log."""
+        outputs, sample = self.outputs, self.sample
+        return {
+            "stamp_ns": self.stamp_ns,
+            "total_w": None if sample is None else sample.total_w,
+            "rails": {} if sample is None else dict(sample.rails),
+            "average_w": outputs.average_w,
+            "budget_w": outputs.budget_w,
+            "level": outputs.level,
+            "pause_s": outputs.budget.pause_s,
+            "token_cap": outputs.budget.max_new_tokens,
+            "tagged": MODELLED if sample is None else sample.tagged,
+            "source": "none" if sample is None else sample.source,
+            "temperature_c": None if self.thermal is None else self.thermal.hottest_c,
+        }
+
+
+class _Source(Generic[T]):
+    """Calls a function at a rate in a thread of its own and keeps its newest value and when it came."""
+
+    def __init__(self, name: str, read: Callable[[int], T], period_s: float, clock: Callable[[], int]) -> None:
+        self._read = read
+        self._period_s = period_s
+        self._clock = clock
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._newest: tuple[int, T] | None = None
+        self.error: str | None = None
+
+    def start(self) -> None:
+        """Begin reading."""
+        self._thread.start()
+
+    def fresh(self, now_ns: int, oldest_ns: int) -> T | None:
+        """The newest value if it is not too old."""
+        newest = self._newest
+        return None if newest is None or now_ns - newest[0] > oldest_ns else newest[1]
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stop.set()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for it; False if it hangs in a reading: it is left behind and ends with the process."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            began_ns = self._clock()
+            try:
+                self._newest = (began_ns, self._read(began_ns))
+                self.error = None
+            except MeterError as error:
+                self.error = str(error)
+            except Exception as error:  # noqa: BLE001 - a driver's surprise may cost its value, not the thread
+                self.error = f"{type(error).__name__}: {error}"
+            self._stop.wait(self._period_s)
+
+
+class PowerMonitor:
+    """Shell of the governor; `budget` and `snapshot` are single reads of a reference, from any thread."""
+
+    def __init__(
+        self,
+        meter: PowerMeter | None,
+        governor: Governor,
+        *,
+        activity: Callable[[], Activity],
+        thermal: ThermalReader | None = None,
+        battery: ReadBattery | None = None,
+        over_current: OverCurrentEvents | None = None,
+        on_sample: Callable[[int, dict[str, Any]], object] | None = None,
+        on_findings: Callable[[tuple[Finding, ...]], object] | None = None,
+        say: Callable[[str], object] | None = None,
+        period_s: float = PERIOD_S,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`activity` and `battery` must not block. `on_sample` gets (stamp_ns, `/power` record) every step,
+        `on_findings` what was found in every step in which there is something, `say` a line when something changes."""
+        self._meter = meter
+        self._governor = governor
+        self._activity = activity
+        self._battery = battery
+        self._on_sample, self._on_findings, self._say = on_sample, on_findings, say
+        self._period_s = period_s
+        self._clock = clock
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="power", daemon=True)
+        self._power = None if meter is None else _Source("power-meter", meter.read, period_s, clock)
+        self._heat = None if thermal is None else _Source("thermal", thermal.read, 2 * period_s, clock)
+        self._events = (
+            None if over_current is None else _Source("over-current", lambda _: over_current.read(), 1.0, clock)
+        )
+        self._counted: tuple[int, bool, int, float] | None = None
+        self._statistics = PowerStatistics()
+        self._measured = True
+        self._failed: str | None = None
+        self._snapshot = PowerSnapshot(clock(), None, GovernorOutputs(), None, None, None, {})
+
+    def start(self) -> None:
+        """Begin; until the first step nothing is limited."""
+        for source in self._sources():
+            source.start()
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; a reading that hangs is not waited for longer than half a second in all."""
+        self._stop.set()
+        for source in self._sources():
+            source.stop()
+        deadline_s = time.monotonic() + JOIN_S
+        if self._thread.ident is not None:
+            self._thread.join(JOIN_S)
+        for source in self._sources():
+            source.join(max(0.0, deadline_s - time.monotonic()))
+
+    def budget(self) -> ReasoningBudget:
+        """What reasoning may do now."""
+        return self._snapshot.outputs.budget
+
+    def snapshot(self) -> PowerSnapshot:
+        """The last step's view."""
+        return self._snapshot
+
+    def statistics(self) -> dict[str, Any]:
+        """`power_w` of a result: mean and p99 of the metered samples, in W, and where they come from."""
+        mean_w, p99_w = self._statistics.mean_w, self._statistics.percentile_w(0.99)
+        known = self._meter is not None and mean_w is not None
+        result: dict[str, Any] = {
+            "mean": None if mean_w is None else round(mean_w, 3),
+            "p99": None if p99_w is None else round(p99_w, 2),
+            "source": self._meter.source if known and self._meter is not None else "none",
+            "tagged": MEASURED if known and self._measured else MODELLED,
+        }
+        if self._snapshot.over_current:
+            result["over_current_events"] = dict(self._snapshot.over_current)
+        return result
+
+    def step(self, now_ns: int) -> PowerSnapshot:
+        """One step of the stepping thread, without its clock."""
+        sample = None if self._power is None else self._power.fresh(now_ns, STALE_NS)
+        thermal = None if self._heat is None else self._heat.fresh(now_ns, THERMAL_STALE_NS)
+        events = None if self._events is None else self._events.fresh(now_ns, 10 * THERMAL_STALE_NS)
+        battery = None if self._battery is None else self._battery()
+        reasoning, generations, reasoning_s = self._count(self._activity(), now_ns)
+        outputs = self._governor.step(
+            GovernorInputs(
+                power_w=None if sample is None else sample.total_w,
+                reasoning=reasoning,
+                reasoning_s=reasoning_s,
+                generations=generations,
+                throttled=thermal is not None and thermal.throttled,
+                throttle_margin_c=None if thermal is None else thermal.throttle_margin_c,
+                trip_margin_c=None if thermal is None else thermal.trip_margin_c,
+                battery_percent=None if battery is None else battery.soc_percent,
+            ),
+            now_ns,
+        )
+        if sample is not None:
+            self._statistics.add(sample.stamp_ns, sample.total_w)
+            self._measured = self._measured and sample.tagged == MEASURED
+        error = None if self._power is None else self._power.error
+        self._snapshot = PowerSnapshot(now_ns, sample, outputs, thermal, battery, error, events or {})
+        return self._snapshot
+
+    def _sources(self) -> list[_Source[Any]]:
+        return [source for source in (self._power, self._heat, self._events) if source is not None]
+
+    def _count(self, activity: Activity, now_ns: int) -> tuple[bool, int, float]:
+        """Counts that the program does not keep, from what it was doing at each step."""
+        last_ns, last_reasoning, generations, reasoning_s = self._counted or (now_ns, False, 0, 0.0)
+        if last_reasoning:
+            reasoning_s += (now_ns - last_ns) / 1e9
+            generations += not activity.reasoning
+        self._counted = (now_ns, activity.reasoning, generations, reasoning_s)
+        return (
+            activity.reasoning,
+            generations if activity.generations is None else activity.generations,
+            reasoning_s if activity.reasoning_s is None else activity.reasoning_s,
+        )
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                snapshot = self.step(self._clock())
+                self._publish(snapshot)
+                self._failed = None
+            except Exception as error:  # noqa: BLE001 - whatever fails here must not end the governing
+                self._fail(f"{type(error).__name__}: {error}")
+            self._stop.wait(self._period_s)
+
+    def _publish(self, snapshot: PowerSnapshot) -> None:
+        outputs = snapshot.outputs
+        if self._on_findings is not None and outputs.findings:
+            self._on_findings(tuple(Finding(name, _detail(name, snapshot)) for name in outputs.findings))
+        if self._on_sample is not None:
+            self._on_sample(snapshot.stamp_ns, snapshot.record())
+        if self._say is not None and outputs.says is not None:
+            self._say(f"power: {outputs.says}")
+
+    def _fail(self, why: str) -> None:
+        """Without a governor nothing keeps the budget: reasoning stops, control goes on."""
+        last = self._snapshot
+        outputs = GovernorOutputs(ReasoningBudget(allowed=False), level=GOVERNOR_LEVELS[OFF], says=why)
+        self._snapshot = PowerSnapshot(self._clock(), None, outputs, last.thermal, last.battery, why, last.over_current)
+        if self._failed != why and self._say is not None:
+            self._failed = why
+            self._say(f"power: the governor failed, reasoning is off ({why})")
+
+
+def _detail(name: str, snapshot: PowerSnapshot) -> str:
+    thermal, battery = snapshot.thermal, snapshot.battery
+    if name.startswith("thermal") and thermal is not None and thermal.hottest_c is not None:
+        what = f" ({', '.join(thermal.throttling)})" if thermal.throttling else ""
+        return f"{thermal.hottest_c:.0f} °C{what}"
+    if name.startswith("battery") and battery is not None:
+        return f"{battery.soc_percent} %"
+    return ""
