@@ -146,9 +146,9 @@ def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -
 
 
 def context_call(config: TicVlaConfig, *, tokens: int) -> Call:
-    """The semantic context of `tokens` tokens, once a generation."""
+    """The semantic context of `tokens` tokens: once a generation, of waypoints once a tick."""
     c = config.action
-    width = config.kv_dim if c.semantic_interface == "kv" else config.kv_dim // 2
+    width = config.guidance_width
     linears = [
         Linear("semantic_projection.0", c.hidden, width, tokens),
         Linear("semantic_projection.2", c.hidden, c.hidden, tokens),

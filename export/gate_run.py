@@ -5,7 +5,7 @@ What the network is compared with comes from PyTorch in fp32 (`parity.references
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -18,10 +18,11 @@ import onnxruntime as ort
 from edge.graph import CPU_PROVIDER, DTYPES, Graph
 from edge.language import LanguageModel
 from edge.manifest import Artifacts
+from export.graphs.action import guidance_input
 from export.graphs.writer import IR_VERSION, OPSET
 from export.metrics import Arrays
 from export.model.config import TicVlaConfig
-from export.task_error import StageOutputs, TaskError, plan, prompt_parts
+from export.task_error import Context, StageOutputs, TaskError, moment_contexts, plan, prompt_parts
 from export.task_error import compare as compare_task
 from export.task_samples import SampleSet, is_large
 from export.torch_stages import TorchStages
@@ -97,7 +98,7 @@ class TaskCheck:
         """Of the shipped encoder."""
         visual = [graph({"frame": frame})["visual_tokens"] for frame in self._samples.frames]
         kv = [self._torch.language(prompt_parts(s, visual), 0)[0] for s in self._samples.samples]
-        return self._compare(visual, kv, [self._torch.context(x) for x in kv])
+        return self._compare(visual, kv, self._torch.context)
 
     def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
         """Of the shipped language model: one graph, or the pair as it runs together."""
@@ -108,29 +109,33 @@ class TaskCheck:
             found = model.generate(segments, max_new_tokens=NEW_TOKENS, cancelled=lambda: False)
             kv.append(found.last_layer_kv[:, : found.prompt_tokens])
             texts.append(found.token_ids)
-        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv], texts=texts)
+        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
 
     def context(self, graph: OpenGraph) -> TaskError:
         """Of the shipped semantic context."""
-        contexts = [_unpacked(graph({"last_layer_kv": kv})) for kv in self._reference.kv]
-        return self._compare(self._reference.visual, self._reference.kv, contexts)
+        name = guidance_input(self._torch.model.config)[0]
+        return self._compare(
+            self._reference.visual, self._reference.kv, lambda guidance: _unpacked(graph({name: guidance}))
+        )
 
     def action(self, graph: OpenGraph) -> TaskError:
         """Of the shipped action expert."""
-        contexts = [self._torch.context(kv) for kv in self._reference.kv]
-        return self._compare(self._reference.visual, self._reference.kv, contexts, act=_ShippedAction(graph))
+        return self._compare(self._reference.visual, self._reference.kv, self._torch.context, act=_ShippedAction(graph))
 
     def _compare(
         self,
         visual: Sequence[Floats],
         kv: Sequence[Floats],
-        contexts: Sequence[tuple[Floats, Floats]],
+        context: Callable[[Floats], Context],
         *,
         texts: Sequence[tuple[int, ...]] | None = None,
         act: _ShippedAction | None = None,
     ) -> TaskError:
         stages: Any = self._torch if act is None else act
-        trajectories = tuple(plan(stages, s, visual, c) for s, c in zip(self._samples.samples, contexts, strict=True))
+        trajectories = tuple(
+            plan(stages, s, visual, moment_contexts(context, s, x))
+            for s, x in zip(self._samples.samples, kv, strict=True)
+        )
         # Graphs that write no text are not held to any.
         reference = self._reference if texts is not None else replace(self._reference, token_ids=tuple(() for _ in kv))
         found = StageOutputs(tuple(visual), tuple(kv), tuple(texts or reference.token_ids), trajectories, ())

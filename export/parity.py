@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from export.graphs.action import context_shapes
+from export.graphs.action import context_shapes, guidance_input
 from export.graphs.language import ROLES, cache_names
 from export.metrics import Sample
 from export.model.config import TicVlaConfig
@@ -34,7 +34,8 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
     if name in ROLES:
         return _language_inputs(config, name, index, rng)
     if name == "semantic_context":
-        return {"last_layer_kv": normal(1, 20 + 17 * index, config.kv_dim)}
+        guidance, shape = guidance_input(config)
+        return {guidance: normal(*(axis if isinstance(axis, int) else 20 + 17 * index for axis in shape))}
     if name == "action_expert":
         tokens = 20 + 17 * index
         shapes = {
@@ -95,7 +96,7 @@ def reference_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
         return _language_outputs(model, name, feeds)
     layers = range(model.config.action.layers)
     if name == "semantic_context":
-        keys, values = model.action.context(tensors["last_layer_kv"])
+        keys, values = model.action.context(tensors[guidance_input(model.config)[0]])
         outputs = {f"context.{i}.key": keys[i].transpose(2, 3).contiguous().numpy() for i in layers}
         return outputs | {f"context.{i}.value": values[i].contiguous().numpy() for i in layers}
     keys = torch.stack([tensors[f"context.{i}.key"].transpose(2, 3) for i in layers])

@@ -24,7 +24,7 @@ from export.model.vision import fold_tokens
 from export.parity import sample_inputs
 from export.precision import Precision
 from export.rounding import Rounder
-from export.task_error import compare_plans, plan, prompt_parts, relative_error, short, spread
+from export.task_error import compare_plans, moment_contexts, plan, prompt_parts, relative_error, short, spread
 from export.task_samples import SampleSet, is_large
 from export.torch_stages import TorchStages, empty_past, prompt_tensors
 
@@ -65,7 +65,9 @@ class Reference:
         self.visual = [self.stages.encode(frame) for frame in samples.frames]
         progress(f"sensitivity: fp32 language model, {len(samples.samples)} prompts")
         self.kv = [self.stages.language(self.prompt(i), 0)[0] for i in range(len(samples.samples))]
-        self.contexts = [self.stages.context(kv) for kv in self.kv]
+        self.contexts = [
+            moment_contexts(self.stages.context, s, kv) for s, kv in zip(samples.samples, self.kv, strict=True)
+        ]
         self.plans = [plan(self.stages, s, self.visual, c) for s, c in zip(samples.samples, self.contexts, strict=True)]
         self.spread_cm, self.spread_deg = spread(np.concatenate(self.plans))
 
@@ -139,7 +141,7 @@ class VisionProbe(Probe):
         plans = []
         for sample in r.samples.samples:
             kv = r.stages.language(prompt_parts(sample, visual), 0)[0]
-            plans.append(plan(r.stages, sample, visual, r.stages.context(kv)))
+            plans.append(plan(r.stages, sample, visual, moment_contexts(r.stages.context, sample, kv)))
         return r.reading(plans, max(map(relative_error, r.visual, visual)))
 
     def group(self, group: str, precision: str) -> Reading:
@@ -292,7 +294,8 @@ class LanguageProbe(Probe):
             if kv is not None and run["head"] is not None:
                 whole = np.concatenate([run["head"], whole], axis=1)
             errors.append(relative_error(r.kv[index], whole))
-            plans.append(plan(r.stages, r.samples.samples[index], r.visual, r.stages.context(whole)))
+            sample = r.samples.samples[index]
+            plans.append(plan(r.stages, sample, r.visual, moment_contexts(r.stages.context, sample, whole)))
             if self._tokens:
                 same.append(float((self._choices(hidden, head_precision) == run["tokens"]).float().mean()))
         return r.reading(plans, max(calls_error, *errors), sum(same) / len(same) if same else None)
@@ -309,8 +312,8 @@ class ActionProbe(Probe):
         for sample, kv, exact in zip(r.samples.samples, r.kv, r.contexts, strict=True):
             context = exact
             if self.graph == "semantic_context":
-                context = stages.context(kv)
-                errors.append(max(map(relative_error, exact, context)))
+                context = moment_contexts(stages.context, sample, kv)
+                errors += [max(map(relative_error, e, c)) for e, c in zip(exact, context, strict=True)]
             plans.append(plan(stages, sample, r.visual, context))
         return r.reading(plans, max(errors or map(relative_error, r.plans, plans)))
 

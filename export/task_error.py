@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.controller import TARGET_TIME_S, arc_to
 from edge.geometry import SE2
+from edge.guidance import waypoints_now
 from edge.prompt import Segment
 from export.task_samples import Sample, SampleSet
 
 Floats = npt.NDArray[np.float32]
 Picture = npt.NDArray[np.uint8]
+Context: TypeAlias = tuple[Floats, Floats]
 
 
 class TaskErrorError(ValueError):
@@ -36,8 +38,8 @@ class Stages(Protocol):
     def language(self, prompt: Sequence[Segment], new_tokens: int) -> tuple[Floats, tuple[int, ...]]:
         """K‖V of the last layer for every prompt token [1, T, kv_dim], and the first `new_tokens` greedy tokens."""
 
-    def context(self, last_layer_kv: Floats) -> tuple[Floats, Floats]:
-        """K‖V → keys and values of every cross-attention layer, [layers, 1, heads, T, d] each."""
+    def context(self, guidance: Floats) -> Context:
+        """K‖V or waypoints → keys and values of every cross-attention layer, [layers, 1, heads, T, d] each."""
 
     def act(self, visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
         """Visual tokens, state [1, 3], latency [1, 4] and context → trajectory [1, steps, 3]."""
@@ -66,19 +68,24 @@ def run_stages(
     for number, frame in enumerate(samples.frames):
         progress(f"frame {number + 1} of {len(samples.frames)}")
         visual.append(stages.encode(frame))
-    kv, token_ids, contexts = [], [], []
+    kv, token_ids = [], []
     for sample in samples.samples:
         progress(f"generation {sample.name}")
         last_layer_kv, ids = stages.language(prompt_parts(sample, visual), new_tokens)
         kv.append(last_layer_kv)
         token_ids.append(ids)
-        contexts.append(stages.context(last_layer_kv))
+    contexts = [moment_contexts(stages.context, s, x) for s, x in zip(samples.samples, kv, strict=True)]
+    others = [*samples.samples[1:], samples.samples[0]]
+    swapped = [
+        moment_contexts(stages.context, replace(s, waypoints=other.waypoints), x)
+        for s, other, x in zip(samples.samples, others, kv[1:] + kv[:1], strict=True)
+    ]
     return StageOutputs(
         tuple(visual),
         tuple(kv),
         tuple(token_ids),
         tuple(plan(stages, s, visual, c) for s, c in zip(samples.samples, contexts, strict=True)),
-        tuple(plan(stages, s, visual, c) for s, c in zip(samples.samples, contexts[1:] + contexts[:1], strict=True)),
+        tuple(plan(stages, s, visual, c) for s, c in zip(samples.samples, swapped, strict=True)),
     )
 
 
@@ -87,10 +94,20 @@ def prompt_parts(sample: Sample, visual: Sequence[Floats] | Mapping[int, Floats]
     return [Segment(part.ids, None if part.frame is None else visual[part.frame]) for part in sample.prompt]
 
 
+def moment_contexts(context: Callable[[Floats], Context], sample: Sample, last_layer_kv: Floats) -> list[Context]:
+    """The semantic context at every moment of a sample: K‖V's does not change, waypoints' moves with the robot."""
+    if sample.waypoints is None:
+        return [context(last_layer_kv)] * len(sample.moments)
+    return [context(waypoints_now(sample.waypoints, moment.offset)) for moment in sample.moments]
+
+
 def plan(
-    stages: Stages, sample: Sample, visual: Sequence[Floats] | Mapping[int, Floats], context: tuple[Floats, Floats]
+    stages: Stages,
+    sample: Sample,
+    visual: Sequence[Floats] | Mapping[int, Floats],
+    contexts: Sequence[Context],
 ) -> Floats:
-    """Trajectories [moments, steps, 3] of a sample under one semantic context."""
+    """Trajectories [moments, steps, 3] of a sample under the semantic context of every moment."""
     planned = [
         stages.act(
             visual[moment.frame],
@@ -98,7 +115,7 @@ def plan(
             np.array([moment.latency], dtype=np.float32),
             *context,
         )
-        for moment in sample.moments
+        for moment, context in zip(sample.moments, contexts, strict=True)
     ]
     return np.concatenate(planned)
 

@@ -17,6 +17,7 @@ from tokenizers import Tokenizer
 from edge.geometry import SE2, interpolate
 from edge.policy import fit_frame
 from edge.prompt import PromptBuilder, PromptIds
+from edge.reasoning_text import WAYPOINT_TIMES_S
 from edge.ring import EncodedFrame
 from export.calibration import CLIP_S, CalibrationError, CalibrationSet, Clip
 from export.model.config import TicVlaConfig
@@ -69,6 +70,9 @@ class Sample:
     name: str
     prompt: tuple[PromptPart, ...]
     moments: tuple[Moment, ...]
+    waypoints: tuple[tuple[float, float], ...] | None = None
+    """For a model that is guided by waypoints: where the clip's robot was 3, 6 and 9 s after the anchor, in the robot's
+    frame there. They stand for what the language model would have written; None: guided by K‖V."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,7 @@ def samples_from(
                 EncodedFrame(clip.frames[i].stamp_ns, clip.frames[i].T_odom_base, np.zeros(1, np.float32))
                 for i in shown
             ]
-            # The builder gives one segment a frame, then the text: the frames' places follow from the order.
+            # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
             segments = builder.build(encoded, clip.instruction)
             places = [index_of(number, i) for i in shown]
             prompt = tuple(
@@ -138,7 +142,9 @@ def samples_from(
                 for i, segment in enumerate(segments)
             )
             moments = tuple(_moment(clip, anchor_s, delay_s, number, index_of) for delay_s in delays_s)
-            samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, moments))
+            guided = config.action.semantic_interface == "waypoints"
+            waypoints = tuple(_ahead(clip, anchor_s, time_s) for time_s in WAYPOINT_TIMES_S) if guided else None
+            samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, moments, waypoints))
     if len(samples) < 2:
         raise CalibrationError(
             f"calibration set {calibration.name}: gives one sample, two samples are needed to compare"
@@ -186,6 +192,11 @@ def _pose(clip: Clip, time_s: float) -> SE2:
         return b.T_odom_base
     fraction = (time_s - a.stamp_ns / 1e9) / ((b.stamp_ns - a.stamp_ns) / 1e9)
     return interpolate(a.T_odom_base, b.T_odom_base, min(1.0, max(0.0, fraction)))
+
+
+def _ahead(clip: Clip, anchor_s: float, time_s: float) -> tuple[float, float]:
+    offset = _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + time_s)
+    return offset.x_m, offset.y_m
 
 
 class _IndexOf(Protocol):

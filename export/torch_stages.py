@@ -71,10 +71,10 @@ class TorchStages:
                     next_id, _, _, *past = language(next_id, visual[:1], past)
         return _array(kv), tuple(found)
 
-    def context(self, last_layer_kv: Floats) -> tuple[Floats, Floats]:
+    def context(self, guidance: Floats) -> tuple[Floats, Floats]:
         """See `Stages`."""
         with torch.no_grad(), self._graph("semantic_context", self.model.action):
-            keys, values = self.model.action.context(torch.from_numpy(last_layer_kv))
+            keys, values = self.model.action.context(torch.from_numpy(guidance))
         return _array(keys), _array(values)
 
     def act(self, visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:

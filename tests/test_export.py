@@ -165,7 +165,7 @@ class Blind(TaskCheck):
             state, ids = self._torch.language(prompt_parts(sample, unseen), NEW_TOKENS)
             kv.append(state)
             texts.append(ids)
-        return self._compare(self._reference.visual, kv, [self._torch.context(x) for x in kv], texts=texts)
+        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
 
 
 def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(

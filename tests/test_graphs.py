@@ -94,6 +94,7 @@ def test_a_language_model_without_merging_takes_each_visual_token_as_it_is(tmp_p
     "change",
     [
         {"semantic_interface": "values-only"},
+        {"semantic_interface": "waypoints"},
         {"parameterisation": "offsets"},
         {"latency_aware": False},
         {"motion_offset": False},

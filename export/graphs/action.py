@@ -41,12 +41,20 @@ def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
     return shapes
 
 
+def guidance_input(config: TicVlaConfig) -> tuple[str, tuple[int | str, ...]]:
+    """Name and shape of what the semantic context is made from: `last_layer_kv` or `waypoints`."""
+    if config.action.semantic_interface == "waypoints":
+        return "waypoints", (1, config.guidance_tokens, config.guidance_width)
+    return "last_layer_kv", (1, TOKENS, config.kv_dim)
+
+
 def write_context(action: ActionExpert, directory: Path, *, precision: Precision, form: str, half: bool) -> list[str]:
-    """Write semantic_context.onnx: last_layer_kv [1, T, kv_dim] → the tensors of `context_shapes`."""
+    """Write semantic_context.onnx: `guidance_input` → the tensors of `context_shapes`."""
     c = action.config.action
     with GraphWriter(directory, "semantic_context", precision=precision, form=form, half=half, external=False) as g:
         kv_dim = action.config.kv_dim
-        x = g.input("last_layer_kv", TensorProto.FLOAT, (1, TOKENS, kv_dim))
+        name, shape = guidance_input(action.config)
+        x = g.input(name, TensorProto.FLOAT, shape)
         length = g.op("Shape", [x], start=1, end=2)
         if c.semantic_interface == "values-only":
             x = g.op("Slice", [x, g.constant([kv_dim // 2]), g.constant([kv_dim]), g.constant([2])])

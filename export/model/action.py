@@ -2,7 +2,8 @@
 
 Split in two so that the part which depends on the semantic state alone runs once a generation: `SemanticContext`
 projects the VLM's tokens to every layer's keys and values, `ActionExpert` adds what changes each tick. Keys and
-values are per-token linear maps, so the split is exact.
+values are per-token linear maps, so the split is exact. Waypoints are re-expressed in the robot's current frame first
+(paper appendix C), so their context, of three tokens, is computed every tick.
 """
 
 from __future__ import annotations
@@ -63,9 +64,8 @@ class ActionExpert(nn.Module):
         super().__init__()
         self.config = config
         c = config.action
-        semantic_width = config.kv_dim if c.semantic_interface == "kv" else config.kv_dim // 2
-        self.semantic_projection = projection(semantic_width, c.hidden)
-        self.semantic_position = nn.Parameter(torch.zeros(1, config.language.max_context, c.hidden))
+        self.semantic_projection = projection(config.guidance_width, c.hidden)
+        self.semantic_position = nn.Parameter(torch.zeros(1, config.guidance_tokens, c.hidden))
         self.visual_projection = projection(config.vision.token_dim, c.hidden)
         self.visual_position = nn.Parameter(torch.zeros(1, config.vision.tokens, c.hidden))
         self.state_projection = projection(3, c.hidden)
@@ -78,20 +78,21 @@ class ActionExpert(nn.Module):
         self.head = projection(c.hidden, c.hidden)
         self.out = nn.Linear(c.hidden, 3)
 
-    def semantic_tokens(self, last_layer_kv: Tensor) -> Tensor:
-        """Last-layer K‖V [1, T, kv_dim] → tokens of the shared latent space [1, T, hidden]."""
-        if self.config.action.semantic_interface == "values-only":
-            last_layer_kv = last_layer_kv[..., self.config.kv_dim // 2 :]
-        tokens = self.semantic_projection(last_layer_kv) + self.semantic_position[:, : last_layer_kv.shape[1]]
-        if self.training:
-            # Whole tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
+    def semantic_tokens(self, guidance: Tensor) -> Tensor:
+        """Last-layer K‖V [1, T, kv_dim], or waypoints [1, 3, 2] in m in the current robot frame → [1, T, hidden]."""
+        interface = self.config.action.semantic_interface
+        if interface == "values-only":
+            guidance = guidance[..., self.config.kv_dim // 2 :]
+        tokens = self.semantic_projection(guidance) + self.semantic_position[:, : guidance.shape[1]]
+        if self.training and interface != "waypoints":
+            # Whole K‖V tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
             keep = torch.rand(tokens.shape[:2], device=tokens.device) >= self.config.action.kv_dropout
             tokens = tokens * keep[..., None]
         return tokens
 
-    def context(self, last_layer_kv: Tensor) -> tuple[Tensor, Tensor]:
+    def context(self, guidance: Tensor) -> tuple[Tensor, Tensor]:
         """Semantic context: keys and values [layers, 1, heads, T, hidden/heads] of the semantic tokens."""
-        tokens = self.semantic_tokens(last_layer_kv)
+        tokens = self.semantic_tokens(guidance)
         pairs = [kv(tokens) for kv in self.key_values]
         return torch.stack([k for k, _ in pairs]), torch.stack([v for _, v in pairs])
 

@@ -6,7 +6,10 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-SEMANTIC_INTERFACES = ("kv", "values-only")
+from edge.reasoning_text import WAYPOINT_TIMES_S
+
+SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
+"""What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
 PARAMETERISATIONS = ("increments", "offsets")
 
 
@@ -178,6 +181,18 @@ class TicVlaConfig:
     def kv_dim(self) -> int:
         """Width of one token of the semantic state: last-layer K‖V (256 at paper size)."""
         return 2 * self.language.kv_heads * self.language.head_dim
+
+    @property
+    def guidance_width(self) -> int:
+        """Width of one token of what the semantic context is made from."""
+        widths = {"kv": self.kv_dim, "values-only": self.kv_dim // 2, "waypoints": 2}
+        return widths[self.action.semantic_interface]
+
+    @property
+    def guidance_tokens(self) -> int:
+        """Most tokens that the semantic context is made from."""
+        by_text = self.action.semantic_interface == "waypoints"
+        return len(WAYPOINT_TIMES_S) if by_text else self.language.max_context
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON form."""
