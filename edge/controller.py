@@ -1,6 +1,7 @@
 """From a planned trajectory to a velocity command: the point 1 s ahead, an arc to it, limits, slew (paper appendix B).
 
-Pure: no clock, no thread, no I/O. Whatever is missing, old or not finite gives zero velocity in the same step.
+Pure: no clock, no thread, no I/O. Whatever is missing, old or not finite gives zero velocity in the same step. The
+limits are the robot file's and frozen: the supervisor can lower the speed below them, and nothing can raise it.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ class ControllerInputs:
     """Planned (x m, y m, θ rad) in the current robot frame, [steps, 3]; None before the first semantic state."""
     frame_age_ms: float | None
     odometry_age_ms: float | None
+    speed_scale: float = 1.0
+    """Share of the speed limits that may be used, 0..1 (supervisor); whatever lies outside is taken as 0 or 1."""
+    hold: str | None = None
+    """Why the velocity must be zero whatever the plan says; None: it need not."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,20 @@ def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
     return arc_m / time_s, 2 * bearing / time_s
 
 
+def target_of(trajectory: npt.NDArray[np.float32], step_s: float) -> SE2:
+    """The point of a finite plan [steps, 3] that is driven to: 1 s ahead, or the last one of a shorter plan."""
+    index = min(len(trajectory), max(1, round(TARGET_TIME_S / step_s))) - 1
+    x_m, y_m, theta_rad = (float(value) for value in trajectory[index])
+    return SE2(x_m, y_m, theta_rad)
+
+
+def limit_share(speed_mps: float, yaw_rate_radps: float, limits: LimitsConfig, speed_scale: float) -> float:
+    """Factor 0..1 for both velocities that keeps them within `speed_scale` of the limits: slower on the same arc."""
+    # A comparison with NaN is false: a scale that is no number gives no speed.
+    scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
+    return scale / max(scale, speed_mps / limits.vx_max_mps, abs(yaw_rate_radps) / limits.wz_max_radps, 1e-9)
+
+
 def _grow(value: float, goal: float, step: float) -> float:
     """`goal`, with its magnitude at most `step` above that of `value`: speeding up is limited, slowing down is not."""
     reached = abs(value) if value * goal > 0 else 0.0
@@ -83,27 +102,35 @@ class Controller:
         self._wz_radps = 0.0
         self._last_ns: int | None = None
 
+    @property
+    def config(self) -> ControllerConfig:
+        """What it was made with; nothing can change it."""
+        return self._config
+
     def step(self, inputs: ControllerInputs, now_ns: int) -> VelocityCommand:
         """The command of this tick."""
         elapsed_s = 0.0 if self._last_ns is None else min(max((now_ns - self._last_ns) / 1e9, 0.0), MAX_STEP_S)
         self._last_ns = now_ns
         reason = self._refusal(inputs)
         if reason is not None or inputs.trajectory is None:
-            self._vx_mps = self._wz_radps = 0.0
-            return VelocityCommand(0.0, 0.0, 0.0, None, reason or "no-semantic-state")
-        index = min(len(inputs.trajectory), max(1, round(TARGET_TIME_S / self._config.step_s))) - 1
-        x, y, theta = (float(value) for value in inputs.trajectory[index])
-        target = SE2(x, y, theta)
+            return self.halt(reason or "no-semantic-state")
+        target = target_of(inputs.trajectory, self._config.step_s)
         speed, yaw_rate = arc_to(target, TARGET_TIME_S)
         limits = self._config.limits
-        # Both are scaled by the same factor: limits make the robot slower on its arc, not take another arc.
-        scale = 1 / max(1.0, speed / limits.vx_max_mps, abs(yaw_rate) / limits.wz_max_radps)
-        self._vx_mps = _grow(self._vx_mps, speed * scale, limits.accel_mps2 * elapsed_s)
-        self._wz_radps = _grow(self._wz_radps, yaw_rate * scale, limits.alpha_radps2 * elapsed_s)
+        share = limit_share(speed, yaw_rate, limits, inputs.speed_scale)
+        self._vx_mps = _grow(self._vx_mps, speed * share, limits.accel_mps2 * elapsed_s)
+        self._wz_radps = _grow(self._wz_radps, yaw_rate * share, limits.alpha_radps2 * elapsed_s)
         return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
+
+    def halt(self, reason: str) -> VelocityCommand:
+        """Zero velocity; whatever comes next speeds up from there."""
+        self._vx_mps = self._wz_radps = 0.0
+        return VelocityCommand(0.0, 0.0, 0.0, None, reason)
 
     def _refusal(self, inputs: ControllerInputs) -> str | None:
         config = self._config
+        if inputs.hold is not None:
+            return inputs.hold
         if inputs.frame_age_ms is None or not 0 <= inputs.frame_age_ms <= config.frame_max_age_ms:
             return "stale-frame"
         if inputs.odometry_age_ms is None or not 0 <= inputs.odometry_age_ms <= config.odometry_max_age_ms:

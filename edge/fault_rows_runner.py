@@ -108,7 +108,7 @@ INPUTS: tuple[Fault, ...] = (
         _LOOP + "two_speeds_that_disagree",
     ),
     Fault(
-        "link-lossy", 35, Action.LIMIT, 1000, _HERE,
+        "link-lossy", 35, Action.LIMIT, 2000, _HERE,
         "Many of the robot's state messages are lost.",
         "Use the cable, not the radio; the robot drives at half speed.",
         _LOOP + "half_of_the_state_messages_lost",

@@ -1,0 +1,118 @@
+"""All monitors together, in the order in which a tick needs them, and where they get what the tick does not know."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.controller import ControllerConfig
+from edge.findings import Finding, FindingQueue
+from edge.geometry import SE2
+from edge.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs, Picture
+from edge.monitors.machine import Heat, MachineMonitor
+from edge.monitors.output import OutputConfig, OutputMonitor
+from edge.monitors.robot import Attitude, Charge, RobotMonitor, RobotWatchConfig
+from edge.monitors.semantic import SemanticConfig, SemanticMonitor
+from edge.pose_history import StampedPose
+from edge.semantic import SemanticState
+
+
+def asleep_ns() -> int:
+    """How long this machine has slept since it was started: boot time less monotonic time.
+
+    Boot time is read first: a thread that is held up between the two readings gives less, never more.
+    """
+    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return boot_ns - time.monotonic_ns()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What monitors ask for in every tick; none may wait or raise. The defaults know nothing."""
+
+    findings: FindingQueue = field(default_factory=FindingQueue)
+    """What other threads have found: odometry, power."""
+    attitude: Callable[[], Attitude | None] = lambda: None
+    states: Callable[[], int | None] = lambda: None
+    """State messages of the robot so far."""
+    battery: Callable[[], Charge | None] = lambda: None
+    heat: Callable[[], Heat | None] = lambda: None
+    failed_generations: Callable[[], int] = lambda: 0
+    asleep_ns: Callable[[], int] = asleep_ns
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """What each monitor expects."""
+
+    frame: FrameConfig
+    output: OutputConfig
+    semantic: SemanticConfig
+    robot: RobotWatchConfig
+    period_ns: int
+
+    @staticmethod
+    def standard(
+        controller: ControllerConfig,
+        period_ns: int,
+        *,
+        image_px: int | None = None,
+        camera_hz: float | None = None,
+        semantic: SemanticConfig | None = None,
+    ) -> WatchConfig:
+        """The fault matrix's values for a robot and a tick; `image_px` None: whatever size the camera gives."""
+        tick_hz = 1e9 / period_ns
+        stale_ms = min(controller.odometry_max_age_ms, RobotWatchConfig.stale_ms)
+        return WatchConfig(
+            frame=FrameConfig(image_px, tick_hz if camera_hz is None else min(camera_hz, tick_hz)),
+            output=OutputConfig(controller.limits, controller.step_s, period_ns / 1e9),
+            semantic=semantic or SemanticConfig(),
+            robot=RobotWatchConfig(late_ms=min(RobotWatchConfig.late_ms, stale_ms), stale_ms=stale_ms),
+            period_ns=period_ns,
+        )
+
+
+class Watch:
+    """One of each monitor."""
+
+    def __init__(self, config: WatchConfig, sources: Sources | None = None) -> None:
+        self._sources = sources or Sources()
+        self._frame = FrameMonitor(config.frame)
+        self._output = OutputMonitor(config.output)
+        self._semantic = SemanticMonitor(config.semantic)
+        self._robot = RobotMonitor(config.robot)
+        self._machine = MachineMonitor(config.period_ns)
+        self._content = 0
+        self.given_delay_s = config.semantic.given_delay_s
+
+    def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> FrameOutputs:
+        """Before the encoder: is the newest picture fit to be used?"""
+        outputs = self._frame.step(picture, T_odom_base, now_ns)
+        self._content = outputs.content
+        return outputs
+
+    def urgent(self) -> tuple[Finding, ...]:
+        """What must not wait for the next tick: other threads' findings, and a robot that has tipped over."""
+        return (*self._sources.findings.take(), *self._robot.tilt(self._sources.attitude()))
+
+    def tick(
+        self,
+        trajectory: npt.NDArray[np.float32] | None,
+        semantic: SemanticState | None,
+        pose: StampedPose | None,
+        last_tick_ns: int | None,
+        now_ns: int,
+    ) -> tuple[Finding, ...]:
+        """After the action expert: everything else, the urgent included."""
+        sources = self._sources
+        return (
+            *self.urgent(),
+            *self._output.step(trajectory, self._content, now_ns),
+            *self._semantic.step(semantic, sources.failed_generations(), now_ns),
+            *self._robot.step(pose, sources.states(), sources.battery(), now_ns),
+            *self._machine.step(last_tick_ns, sources.asleep_ns(), sources.heat(), now_ns),
+        )
