@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 from collections import deque
+from collections.abc import Callable
 
 
 class PowerHistory:
@@ -52,6 +54,32 @@ class PowerHistory:
             energy += self._first_w * before
             covered += before
         return energy / 1e9, covered / 1e9
+
+    def energy_since(self, now_ns: int) -> Callable[[int], float]:
+        """A function of an instant: energy in J from then until now; one pass here, cheap to call often."""
+        begins: list[int] = []
+        energies: list[float] = []
+        powers: list[float] = []
+        total = 0.0
+        newest = () if self._newest is None else ((self._newest[0], self._newest[0] + self._hold_ns, self._newest[1]),)
+        for begin_ns, end_ns, power_w in reversed((*self._pieces, *newest)):
+            if begin_ns < now_ns:
+                total += power_w * (min(end_ns, now_ns) - begin_ns)
+                begins.append(-begin_ns)
+                energies.append(total)
+                powers.append(power_w)
+        before_w = self._first_w or 0.0
+
+        def energy_j(since_ns: int) -> float:
+            # `begins` are negative because they go back in time and bisect wants them to grow.
+            index = bisect.bisect_left(begins, -since_ns)
+            if index == len(begins):
+                first_ns = -begins[-1] if begins else now_ns
+                return (total + before_w * max(0, first_ns - since_ns)) / 1e9
+            inside = energies[index] - powers[index] * (since_ns + begins[index])
+            return max(inside, energies[index - 1] if index else 0.0) / 1e9
+
+        return energy_j
 
     def average_w(self, now_ns: int, window_s: float) -> float | None:
         """Mean power of the last `window_s`; None without a sample in it."""

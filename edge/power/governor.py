@@ -111,10 +111,12 @@ class Governor:
             None if model is None else Levels(model.idle_w + model.control_w, model.reasoning_w(config.max_new_tokens))
         )
         self._estimate = LevelEstimator(start)
-        self._times = GenerationTimes()
+        self._times = GenerationTimes(OFF)
         self._history = PowerHistory(config.window_s)
         self._limits = HeatAndBattery(config.limits, OFF)
         self._level = 0
+        self._applied = 0
+        self._cap = 0
         self._worse_ns: int | None = None
         self._better_ns: int | None = None
         self._trim_w = 0.0
@@ -149,7 +151,7 @@ class Governor:
                 )
         else:
             self._level = 0
-        level = max(self._level, least)
+        level = self._applied = max(self._level, least)
         if least and level < OFF:
             pause_s = max(pause_s, self._generation_s(level) or 0.0)
         over = level == OFF and budget_w is not None and average_w is not None and average_w > budget_w * 1.02
@@ -177,7 +179,9 @@ class Governor:
                 share = min(1.0, max(0.0, (inputs.reasoning_s - last.reasoning_s) / dt_s))
             if inputs.generations > last.generations or (last.reasoning and not inputs.reasoning):
                 self._ended_ns = now_ns
-        self._times.update(inputs.generations, inputs.reasoning_s)
+        self._times.update(inputs.generations, inputs.reasoning_s, self._cap)
+        if not inputs.reasoning:
+            self._cap = self._applied  # what the next generation starts with
         power_w = inputs.power_w
         if power_w is not None and is_power(power_w):
             self._metered_ns = now_ns
@@ -195,14 +199,15 @@ class Governor:
         return budget_w - self._trim_w
 
     def _generation_s(self, level: int) -> float | None:
-        """Length of a generation at a level: measured at the present one, else scaled by the plan; None if unknown."""
-        model, measured = self._config.model, self._times.mean_s
+        """Length of a generation at a level: measured there, else scaled from another or planned; None if unknown."""
+        cap, model = min(level, OFF - 1), self._config.model
+        measured = self._times.nearest(cap)
+        if measured is None:
+            return None if model is None else model.generation_s(self._tokens(cap))
         if model is None:
-            # Without a plan nothing says how much of a generation is text: half of it.
-            known = None if measured is None else measured * (1 + _SHARES[level]) / (1 + _SHARES[min(self._level, 3)])
-            return known
-        planned = model.generation_s(self._tokens(level))
-        return planned if measured is None else measured * planned / model.generation_s(self._tokens(self._level))
+            # Without a plan nothing says how much of a generation is text: half of a full one.
+            return measured[1] * (1 + _SHARES[cap]) / (1 + _SHARES[measured[0]])
+        return measured[1] * model.generation_s(self._tokens(cap)) / model.generation_s(self._tokens(measured[0]))
 
     def _tokens(self, level: int) -> int:
         return round(self._config.max_new_tokens * _SHARES[min(level, OFF - 1)])
@@ -220,18 +225,22 @@ class Governor:
 
     def _pause_after_now(self, levels: Levels, aim_w: float, inputs: GovernorInputs, now_ns: int) -> float:
         """Pause since the last generation's end after which one more, with all that was drawn before, meets the aim."""
-        longest, planned = self._times.longest_s, self._generation_s(self._level)
-        if levels.at(1.0) <= aim_w or planned is None:
+        longest, mean_s = self._times.longest_s(min(self._level, OFF - 1)), self._generation_s(self._level)
+        if levels.at(1.0) <= aim_w or mean_s is None:
             return 0.0
-        generation_s = planned if longest is None else max(longest, planned)
+        generation_s = max(longest or 0.0, mean_s)
+        before_j = self._history.energy_since(now_ns)
         window_s = self._config.window_s
         ended_ns = now_ns if inputs.reasoning or self._ended_ns is None else self._ended_ns
         wait_s = 0.0
         while wait_s <= window_s:
             end_ns = now_ns + round((wait_s + generation_s) * 1e9)
-            before_j, _ = self._history.energy_j(min(now_ns, end_ns - round(window_s * 1e9)), now_ns)
             rest_s = min(wait_s, max(0.0, window_s - generation_s))
-            energy = before_j + levels.base_w * rest_s + levels.at(1.0) * min(generation_s, window_s)
+            energy = (
+                before_j(min(now_ns, end_ns - round(window_s * 1e9)))
+                + levels.base_w * rest_s
+                + levels.at(1.0) * min(generation_s, window_s)
+            )
             if energy <= aim_w * window_s:
                 break
             wait_s += _SEARCH_S
@@ -266,8 +275,6 @@ class Governor:
     def _change_level(self, by: int) -> None:
         self._level += by
         self._worse_ns = self._better_ns = None
-        if self._last is not None:
-            self._times.forget(self._last[1].reasoning_s)
 
     def _budget(self, level: int, pause_s: float) -> ReasoningBudget:
         if level == OFF:

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-LEARN_S = 2.0
+LEARN_S = 4.0
 """Time constant: a few times the period of the samples, shorter than a generation."""
 
 
@@ -55,35 +55,33 @@ class LevelEstimator:
 
 
 class GenerationTimes:
-    """How long generations take, from the counts of busy time and of finished generations."""
+    """How long generations take under each token cap, from counts of busy time and of finished generations."""
 
     KEEP = 4
 
-    def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=self.KEEP)
+    def __init__(self, caps: int) -> None:
+        self._recent: tuple[deque[float], ...] = tuple(deque(maxlen=self.KEEP) for _ in range(caps))
         self._done = 0
         self._busy_s = 0.0
 
-    def update(self, generations: int, busy_s: float) -> None:
-        """Counts so far; both only grow."""
+    def update(self, generations: int, busy_s: float, cap: int) -> None:
+        """Counts so far, which only grow, and the cap under which the last generation was started."""
         if generations > self._done:
-            self._recent.append((busy_s - self._busy_s) / (generations - self._done))
+            if cap < len(self._recent):
+                self._recent[cap].append((busy_s - self._busy_s) / (generations - self._done))
             self._done, self._busy_s = generations, busy_s
 
-    def forget(self, busy_s: float) -> None:
-        """Lengths that were taken under another token cap say nothing any more."""
-        self._recent.clear()
-        self._busy_s = busy_s
+    def longest_s(self, cap: int) -> float | None:
+        """Longest of the last few under that cap; None before the first."""
+        return max(self._recent[cap], default=None)
 
-    @property
-    def mean_s(self) -> float | None:
-        """Mean of the last few; None before the first."""
-        return sum(self._recent) / len(self._recent) if self._recent else None
-
-    @property
-    def longest_s(self) -> float | None:
-        """Longest of the last few."""
-        return max(self._recent, default=None)
+    def nearest(self, cap: int) -> tuple[int, float] | None:
+        """The cap nearest to it that was measured, and its mean; None if none was."""
+        known = [(abs(other - cap), other) for other in range(len(self._recent)) if self._recent[other]]
+        if not known:
+            return None
+        other = min(known)[1]
+        return other, sum(self._recent[other]) / len(self._recent[other])
 
 
 def worst_share(generation_s: float, pause_s: float, window_s: float) -> float:

@@ -14,8 +14,8 @@ from typing import Any, Final, Generic, TypeVar
 
 from edge.findings import Finding
 from edge.power.battery import BatteryReading, ReadBattery
-from edge.power.governor import OFF, Governor, GovernorInputs, GovernorOutputs
 from edge.power.governor import LEVELS as GOVERNOR_LEVELS
+from edge.power.governor import OFF, Governor, GovernorInputs, GovernorOutputs
 from edge.power.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
 from edge.power.overcurrent import OverCurrentEvents
 from edge.power.statistics import PowerStatistics

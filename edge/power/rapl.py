@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.power.meter import MeterError, PowerSample
-from edge.power.sysfs import SYSFS, read_int, read_text
+from edge.power.sysfs import read_int, read_text
 
 ZONES: Final = "class/powercap/intel-rapl:*"
 _TOP_ZONE = re.compile(r"intel-rapl:\d+")

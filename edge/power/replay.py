@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ class ReplayMeter:
     def __init__(self, samples: Sequence[PowerSample], name: str = "recording") -> None:
         """Raises MeterError unless there is a sample and stamps grow."""
         stamps = [sample.stamp_ns for sample in samples]
-        if not samples or any(b <= a for a, b in zip(stamps, stamps[1:], strict=False)):
+        if not samples or any(b <= a for a, b in itertools.pairwise(stamps)):
             raise MeterError(f"replay: {name}: expected samples with growing stamps, found {len(samples)}")
         self._samples, self._stamps = samples, stamps
         self._begin_ns: int | None = None
