@@ -1,0 +1,274 @@
+"""systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
+
+Two services of one user. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
+at once and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot. Both
+are restarted by systemd within seconds; it is the bridge's deadman that keeps the promise in milliseconds.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import Final
+
+from edge.device import CUDA, OPENVINO, TENSORRT
+from edge.unit_text import Setting, UnitError, argument, bound, render, word
+
+BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
+RUNNER_UNIT: Final = "tic-vla-edge-runner.service"
+SYSUSERS_FILE: Final = "tic-vla-edge.conf"
+DEFAULT_USER: Final = "tic-vla-edge"
+SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
+STATE_DIRECTORY: Final = Path("/var/lib/tic-vla-edge")
+FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
+"""systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
+BRIDGE_PRIORITY: Final = 60
+"""Above every priority that a target may give the control thread by default (50): the stop comes first."""
+BRIDGE_MEMORY: Final = "256M"
+MULTICAST: Final = IPv4Network("239.255.0.1/32")
+"""Where DDS participants announce themselves (RTPS 2.5, section 9.6.1.4.1)."""
+HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+"""Folders that a hardened service does not see: what it needs from there is shown to it, nothing else."""
+
+_USER = re.compile(r"[a-z_][a-z0-9_-]{0,30}", re.ASCII)
+_COMPILES: Final = (CUDA, TENSORRT, OPENVINO)
+NEED_DEVICES: Final = (CUDA, TENSORRT)
+"""Providers that compute on something other than the processor."""
+
+
+@dataclass(frozen=True)
+class ServiceInputs:
+    """All that the units depend on; paths absolute."""
+
+    programs: Path
+    """Folder of `edge-bridge` and `edge-run`."""
+    prefixes: tuple[Path, ...]
+    """Folders that Python itself and its packages are read from."""
+    robot: Path
+    artifacts: Path
+    engines: Path | None
+    instruction: str
+    user: str
+    networks: tuple[IPv4Network, ...]
+    """Where the robot is."""
+    over_loopback: bool
+    """The robot is simulated on this machine: no network has to be up first."""
+    providers: tuple[str, ...]
+    """ONNX Runtime's execution providers that the graphs use."""
+    devices: tuple[Path, ...]
+    """Device nodes that those need, as found on the machine."""
+    groups: tuple[str, ...]
+    """Groups that may open them."""
+    memory_bytes: int
+    """Memory that the runner may take."""
+    control_priority: int
+    bridge_cores: tuple[int, ...]
+    """Cores that the target leaves to neither of the runner's threads; empty: any."""
+
+    def __post_init__(self) -> None:
+        for name in ("programs", "robot", "artifacts", *(("engines",) if self.engines else ())):
+            if not getattr(self, name).is_absolute():
+                raise UnitError(f"{name} {getattr(self, name)}: expected an absolute path")
+        if set(str(self.programs)) & set("'\"\\"):
+            raise UnitError(
+                f"{self.programs}: systemd takes no program with quotes or backslashes in its path; move it"
+            )
+        if not _USER.fullmatch(self.user) or self.user == "root":
+            raise UnitError(f"--user {self.user}: expected the name of an ordinary user, such as {DEFAULT_USER}")
+        if not self.networks:
+            raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
+        if self.memory_bytes <= 0 or not 0 <= self.control_priority <= 99:
+            raise UnitError(
+                f"memory {self.memory_bytes} bytes, priority {self.control_priority}: expected > 0, 0 to 99"
+            )
+        if self.control_priority >= BRIDGE_PRIORITY:
+            raise UnitError(
+                f"the target's control_priority {self.control_priority} must be below the bridge's {BRIDGE_PRIORITY}: "
+                f"export again with --set runtime.control_priority=50"
+            )
+
+
+def bridge_unit(inputs: ServiceInputs) -> str:
+    """Text of the bridge's unit."""
+    command = [word(str(inputs.programs / "edge-bridge"))]
+    command += [argument(text) for text in ("--robot", str(inputs.robot), "--socket", str(SOCKET))]
+    service: list[Setting | str] = [
+        ("Type", "notify"),
+        ("NotifyAccess", "main"),
+        ("ExecStart", " ".join(command)),
+        ("User", inputs.user),
+        *_ending(watchdog_s=1, start_s=20, stop_s=2),
+        "Always, also after a clean exit: without it the robot has nobody that can stop it.",
+        ("Restart", "always"),
+        ("RestartSec", "100ms"),
+        "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
+        ("CPUSchedulingPolicy", "fifo"),
+        ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
+        *_cores(inputs.bridge_cores),
+        ("LimitRTPRIO", str(BRIDGE_PRIORITY)),
+        "A loop that spins: killed after this much computing without a pause (start-up takes less).",
+        ("LimitRTTIME", "5s"),
+        ("LimitMEMLOCK", BRIDGE_MEMORY),
+        ("OOMScoreAdjust", "-900"),
+        ("MemoryMax", BRIDGE_MEMORY),
+        ("TasksMax", "64"),
+        ("RuntimeDirectory", SOCKET.parent.name),
+        ("RuntimeDirectoryMode", "0700"),
+        ("RuntimeDirectoryPreserve", "restart"),
+        *_hardening(inputs, (inputs.robot,)),
+        ("PrivateDevices", "yes"),
+        ("ProcSubset", "pid"),
+        ("PrivateUsers", "yes"),
+        ("MemoryDenyWriteExecute", "yes"),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged @resources"),
+    ]
+    unit = [
+        ("Description", "tic-vla-edge bridge: the only process that commands the robot"),
+        *_network(inputs),
+        *_restarts(60),
+    ]
+    return _render("bridge", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def runner_unit(inputs: ServiceInputs) -> str:
+    """Text of the runner's unit."""
+    engines = () if inputs.engines is None else ("--engines", str(inputs.engines))
+    paths = ("--artifacts", str(inputs.artifacts), *engines, "--robot", str(inputs.robot), "--socket", str(SOCKET))
+    command = [word(str(inputs.programs / "edge-run")), *(argument(text) for text in paths)]
+    # One word with its text, so that a text that begins with a dash is no option.
+    command.append(argument(f"--instruction={inputs.instruction}"))
+    command += [argument("--record"), FLIGHT_LOG]
+    needed = (inputs.robot, inputs.artifacts, *(() if inputs.engines is None else (inputs.engines,)))
+    service: list[Setting | str] = [
+        ("Type", "notify"),
+        ("NotifyAccess", "main"),
+        ("ExecStart", " ".join(command)),
+        ("User", inputs.user),
+        *_ending(watchdog_s=3, start_s=180, stop_s=10),
+        "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
+        "nobody but the operator starts the robot again after it.",
+        ("Restart", "on-abnormal"),
+        ("RestartSec", "2s"),
+        "The control thread asks for real time by itself; the rest of the process stays ordinary.",
+        ("LimitRTPRIO", str(inputs.control_priority)),
+        ("LimitMEMLOCK", "infinity"),
+        "Dies first, and never makes the bridge wait for memory.",
+        ("OOMScoreAdjust", "500"),
+        ("OOMPolicy", "kill"),
+        ("MemoryMax", str(inputs.memory_bytes)),
+        ("MemorySwapMax", "0"),
+        ("TasksMax", "512"),
+        ("StateDirectory", STATE_DIRECTORY.name),
+        ("StateDirectoryMode", "0700"),
+        *_hardening(inputs, needed),
+        *_accelerator(inputs),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged"),
+    ]
+    unit = [
+        ("Description", "tic-vla-edge runner: drives the robot by its instruction"),
+        "Wants and not Requires: a bridge that restarts must not start the robot again by restarting the runner, whose",
+        "connection ends with the old bridge. After: at shutdown the runner stops first.",
+        ("Wants", BRIDGE_UNIT),
+        ("After", BRIDGE_UNIT),
+        # A start that fails slowly must be counted too, so the window holds several of the longest starts.
+        *_restarts(900),
+    ]
+    return _render("runner", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def sysusers(user: str) -> str:
+    """Text of a sysusers.d(5) file that makes the services' user."""
+    return f'# Made by edge-install units.\nu {user} - "tic-vla-edge services" - -\n'
+
+
+def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
+    comment = [f"Made by edge-install units: the {which} of one robot. Write it anew instead of editing it; see also"]
+    return render([*comment, "systemctl edit, which keeps changes of yours apart."], sections)
+
+
+def _network(inputs: ServiceInputs) -> list[Setting | str]:
+    if inputs.over_loopback:
+        return []
+    return [("Wants", "network-online.target"), ("After", "network-online.target")]
+
+
+def _restarts(window_s: int) -> list[Setting | str]:
+    return [("StartLimitIntervalSec", str(window_s)), ("StartLimitBurst", "5")]
+
+
+def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str]:
+    return [
+        ("TimeoutStartSec", str(start_s)),
+        ("WatchdogSec", str(watchdog_s)),
+        "SIGABRT does not reach a stopped process (systemd issue 1970); nothing is gained by a core dump either.",
+        ("WatchdogSignal", "SIGKILL"),
+        ("TimeoutAbortSec", "1"),
+        ("LimitCORE", "0"),
+        ("KillMode", "mixed"),
+        ("TimeoutStopSec", str(stop_s)),
+    ]
+
+
+def _cores(cores: Sequence[int]) -> list[Setting | str]:
+    return [("CPUAffinity", " ".join(str(core) for core in cores))] if cores else []
+
+
+def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
+    """What both services give up; `needed`: what they read besides Python."""
+    networks = " ".join(str(network) for network in (*inputs.networks, MULTICAST))
+    hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if _is_hidden(path)})
+    return [
+        "The robot's network and nothing else: its body is an unauthenticated peer.",
+        ("IPAddressDeny", "any"),
+        ("IPAddressAllow", networks),
+        ("RestrictAddressFamilies", "AF_UNIX AF_INET AF_NETLINK"),
+        ("NoNewPrivileges", "yes"),
+        ("CapabilityBoundingSet", ""),
+        ("AmbientCapabilities", ""),
+        ("ProtectSystem", "strict"),
+        ("ProtectHome", "tmpfs" if hidden else "yes"),
+        *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
+        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which anybody else could have put there.",
+        ("PrivateTmp", "yes"),
+        ("PrivateMounts", "yes"),
+        ("ProtectProc", "invisible"),
+        ("ProtectClock", "yes"),
+        ("ProtectHostname", "yes"),
+        ("ProtectKernelTunables", "yes"),
+        ("ProtectKernelModules", "yes"),
+        ("ProtectKernelLogs", "yes"),
+        ("ProtectControlGroups", "yes"),
+        ("DevicePolicy", "closed"),
+        ("RestrictNamespaces", "yes"),
+        ("RestrictSUIDSGID", "yes"),
+        ("LockPersonality", "yes"),
+        ("RemoveIPC", "yes"),
+        ("KeyringMode", "private"),
+        ("UMask", "0077"),
+        "A call outside the list fails like one without permission, which the program survives.",
+        ("SystemCallErrorNumber", "EPERM"),
+        ("SystemCallArchitectures", "native"),
+    ]
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(path.is_relative_to(folder) for folder in HIDDEN)
+
+
+def _accelerator(inputs: ServiceInputs) -> list[Setting | str]:
+    """What the graphs' providers need: nothing on a processor, the device's nodes otherwise."""
+    if not set(inputs.providers) & set(_COMPILES):
+        return [("PrivateDevices", "yes"), ("PrivateUsers", "yes"), ("MemoryDenyWriteExecute", "yes")]
+    nodes: list[Setting | str] = [("DeviceAllow", f"{word(str(node))} rw") for node in inputs.devices]
+    if not nodes and set(inputs.providers) & set(NEED_DEVICES):
+        nodes = ["DeviceAllow= is missing: no device of these providers was found where this was written."]
+    return [
+        "These providers compile code at run time and use devices: no PrivateDevices, no MemoryDenyWriteExecute.",
+        *nodes,
+        *((("SupplementaryGroups", " ".join(inputs.groups)),) if inputs.groups else ()),
+    ]
