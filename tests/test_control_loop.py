@@ -2,114 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-
-import numpy as np
 import pytest
 
-from edge.camera import Frame
-from edge.control_loop import ControlLoop
-from edge.controller import Controller, ControllerConfig
 from edge.geometry import SE2
-from edge.graph import GraphError
-from edge.pose_history import PoseHistory, StampedPose
-from edge.reasoning_loop import SemanticSlot
-from edge.ring import TokenRing
-from edge.semantic import SemanticState
-from firmware_bridge.config import LimitsConfig
-from firmware_bridge.link import BridgeStatus
-
-PERIOD_NS = 100_000_000
-LIMITS = LimitsConfig(
-    vx_min_mps=-0.4, vx_max_mps=0.8, vy_max_mps=0.3, wz_max_radps=1.0, accel_mps2=20.0, alpha_radps2=20.0
-)
-
-
-class FakePolicy:
-    """Walks straight ahead; remembers what it was given and can be told to fail."""
-
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
-        self.encoded = 0
-        self.calls: list[tuple[float, SE2, int]] = []
-        self.broken = False
-        self.blind = False
-
-    def encode(self, frame: np.ndarray) -> np.ndarray:
-        if self.blind:
-            raise GraphError("vision_encoder: broken")
-        self.bench.now_ns += self.bench.encode_ns
-        self.encoded += 1
-        return np.zeros((1, 4, 8), dtype=np.float32)
-
-    def act(
-        self, tokens: np.ndarray, state: tuple[float, ...], delay_s: float, offset: SE2, semantic: SemanticState
-    ) -> np.ndarray:
-        if self.broken:
-            raise GraphError("action_expert: broken")
-        self.calls.append((delay_s, offset, semantic.generation))
-        return np.cumsum(np.tile(np.float32([0.05, 0, 0]), (30, 1)), axis=0)
-
-
-class FakeSink:
-    """Collects commands; says what state the bridge is in."""
-
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
-        self.silent_ns = 0
-        self.commands: list[tuple[int, float, float]] = []
-        self.state = "armed"
-
-    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
-        self.commands.append((seq, vx_mps, wz_radps))
-        return True
-
-    def poll(self) -> BridgeStatus:
-        return BridgeStatus(self.bench.now_ns - self.silent_ns, self.state, "deadman", 0, 0, 0, (0.0, 0.0, 0.0), False)
-
-
-class Bench:
-    """A control loop on a clock that only the test moves."""
-
-    def __init__(self) -> None:
-        self.now_ns = 10**12
-        self.encode_ns = 0
-        self.frame: Frame | None = None
-        self.policy = FakePolicy(self)
-        self.sink = FakeSink(self)
-        self.history = PoseHistory()
-        self.ring = TokenRing(16)
-        self.slot = SemanticSlot()
-        self.stop = threading.Event()
-        config = ControllerConfig(LIMITS, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
-        self.loop = ControlLoop(
-            policy=self.policy,  # type: ignore[arg-type]
-            controller=Controller(config),
-            newest_frame=lambda: self.frame,
-            history=self.history,
-            ring=self.ring,
-            slot=self.slot,
-            sink=self.sink,
-            recorder=None,
-            period_ns=PERIOD_NS,
-            step_s=0.1,
-            stop=self.stop,
-            clock=lambda: self.now_ns,
-        )
-        self.loop.last_seq = 7
-
-    def see(self, x_m: float = 0.0) -> None:
-        self.history.put(StampedPose(self.now_ns, SE2(x_m, 0.0, 0.0), 0.4, 0.0, 0.0))
-        self.frame = Frame(self.now_ns, np.zeros((1, 8, 8, 3), dtype=np.uint8), b"")
-
-    def think(self, generation: int, x_m: float = 0.0) -> None:
-        kv = np.zeros((1, 3, 8), dtype=np.float32)
-        self.slot.state = SemanticState(generation, self.now_ns, SE2(x_m, 0, 0), self.now_ns, kv, {}, "", None)
-
-    def tick(self) -> tuple[float, str]:
-        command = self.loop.tick(self.now_ns)
-        self.now_ns += PERIOD_NS
-        return command.vx_mps, command.reason
+from tests.control_bench import PERIOD_NS, Bench
 
 
 @pytest.fixture
@@ -143,7 +39,7 @@ def test_the_delay_is_now_minus_the_anchor_and_the_offset_is_the_motion_since(be
     delay_s, offset, _ = bench.policy.calls[-1]
     assert delay_s == pytest.approx(2.0)
     assert offset.x_m == pytest.approx(0.8)
-    assert bench.loop.statistics.delay_error_ms[-1] < 1.0
+    assert (bench.loop.statistics.delay_error_ms.newest or 0.0) < 1.0
 
 
 def test_the_delay_is_taken_when_the_action_expert_is_called_not_when_the_tick_began(bench: Bench) -> None:
@@ -173,17 +69,6 @@ def test_every_encoded_frame_is_left_for_the_reasoning_thread_with_its_pose(benc
     assert newest.T_odom_base == SE2(3.0, 0.0, 0.0)
 
 
-def test_when_the_camera_stops_the_command_becomes_zero(bench: Bench) -> None:
-    bench.see()
-    bench.think(0)
-    reasons = []
-    for _ in range(8):
-        bench.history.put(StampedPose(bench.now_ns, SE2(0, 0, 0), 0.0, 0.0, 0.0))
-        reasons.append(bench.tick()[1])
-    assert reasons[:6] == ["ok"] * 6
-    assert reasons[6:] == ["stale-frame"] * 2
-
-
 def test_when_the_encoder_fails_fresh_camera_frames_do_not_keep_the_robot_going(bench: Bench) -> None:
     bench.see()
     bench.think(0)
@@ -208,7 +93,7 @@ def test_a_broken_action_expert_stops_the_robot_and_not_the_loop(bench: Bench) -
     bench.tick()
     bench.policy.broken = True
     bench.see()
-    assert bench.tick() == (0.0, "bad-output")
+    assert bench.tick() == (0.0, "output-not-finite")
 
 
 def test_sequence_numbers_continue_from_the_arming(bench: Bench) -> None:
@@ -237,4 +122,45 @@ def test_a_late_tick_is_counted_and_the_deadlines_it_slept_over_are_skipped(benc
     bench.sink.send_velocity = slow_send  # type: ignore[method-assign]
     bench.loop.run(bench.now_ns, None)
     assert bench.loop.statistics.missed == 2
-    assert bench.loop.statistics.tick_ms == [250.0]
+    assert bench.loop.statistics.tick_ms.newest == 250.0
+    assert bench.on_time == [False]
+
+
+def test_the_action_expert_is_never_told_a_delay_that_it_was_not_trained_for(bench: Bench) -> None:
+    bench.see()
+    bench.think(age_s=12.0)
+    bench.tick()
+    assert bench.policy.calls[-1][0] == 10.0
+    assert bench.loop.statistics.delay_s.newest == pytest.approx(12.0)
+
+
+def test_the_robot_stands_while_it_thinks_in_a_mode_that_takes_turns(bench: Bench) -> None:
+    bench.drive()
+    bench.slot.drive_until_ns = bench.now_ns
+    bench.see()
+    assert bench.tick() == (0.0, "thinking")
+    bench.slot.drive_until_ns = bench.now_ns + PERIOD_NS
+    bench.see()
+    assert bench.tick()[1] == "ok"
+
+
+def test_a_supervisor_that_has_stopped_the_run_ends_the_loop_after_a_zero(bench: Bench) -> None:
+    bench.drive()
+    bench.attitude.roll_rad = 1.0
+    bench.see()
+    said = bench.loop.run(bench.now_ns, None)
+    assert bench.loop.ended_by == "supervisor"
+    assert said is not None and said.startswith("The robot leans by more than 30°")
+    assert bench.sink.commands[-1][1:] == (0.0, 0.0)
+
+
+def test_the_watchdog_is_told_of_every_tick_whether_it_was_on_time(bench: Bench) -> None:
+    bench.see()
+
+    def wait(_seconds: float) -> bool:
+        bench.now_ns += PERIOD_NS // 2
+        return len(bench.on_time) == 3
+
+    bench.stop.wait = wait  # type: ignore[method-assign,assignment]
+    bench.loop.run(bench.now_ns, None)
+    assert bench.on_time == [True, True, True]
