@@ -9,13 +9,15 @@ from edge.geometry import SE2, interpolate
 
 @dataclass(frozen=True)
 class StampedPose:
-    """One fused pose: monotonic stamp, `T_odom_base`, body velocity."""
+    """One fused pose: monotonic stamp, `T_odom_base`, body velocity; the attitude that the robot reported with it."""
 
     stamp_ns: int
     T_odom_base: SE2
     vx_mps: float
     vy_mps: float
     wz_radps: float
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
 
 
 class PoseHistory:
@@ -42,6 +44,25 @@ class PoseHistory:
 
     def at(self, stamp_ns: int) -> SE2 | None:
         """`T_odom_base` at an instant, interpolated; the nearest end outside the history; None while it is empty."""
+        around = self._around(stamp_ns)
+        if around is None:
+            return None
+        before, after, fraction = around
+        return interpolate(before.T_odom_base, after.T_odom_base, fraction)
+
+    def attitude_at(self, stamp_ns: int) -> tuple[float, float] | None:
+        """Roll and pitch, rad, at an instant, found like `at` finds the pose."""
+        around = self._around(stamp_ns)
+        if around is None:
+            return None
+        before, after, f = around
+        return (
+            before.roll_rad + f * (after.roll_rad - before.roll_rad),
+            before.pitch_rad + f * (after.pitch_rad - before.pitch_rad),
+        )
+
+    def _around(self, stamp_ns: int) -> tuple[StampedPose, StampedPose, float] | None:
+        """The poses before and after an instant, and where it lies between them, 0..1."""
         count = self._count
         slots = list(self._slots)
         after: StampedPose | None = None
@@ -52,8 +73,7 @@ class PoseHistory:
                 break  # the writer has overtaken this end of the copy
             if before.stamp_ns <= stamp_ns:
                 if after is None:
-                    return before.T_odom_base
-                fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-                return interpolate(before.T_odom_base, after.T_odom_base, fraction)
+                    return before, before, 0.0
+                return before, after, (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
             after = before
-        return after.T_odom_base if after is not None else None
+        return None if after is None else (after, after, 0.0)
