@@ -55,8 +55,8 @@ class Cursor(NamedTuple):
 class Interval(NamedTuple):
     """Motion over some increments in the frame at their beginning, [3] (x m, y m, θ rad).
 
-    `uncorrected` [2], m: as the robot reported it. `gains` [3, 4]: how the parameters enter the reports. `white` [3, 3]:
-    covariance of what they do not explain.
+    `uncorrected` [2], m: as the robot reported it. `gains` [3, 4]: how the parameters enter the reports.
+    `white` [3, 3]: covariance of what they do not explain.
     """
 
     motion: Array

@@ -198,10 +198,8 @@ class VisualOdometry:
         """Track the corners from the previous frame into this one and back; False when too few come back."""
         assert self._previous is not None and self._key is not None
         before = self._tracked.astype(np.float32)[:, None, :]
-        after, ok, _ = cv2.calcOpticalFlowPyrLK(self._previous, grey, before, before.copy(), winSize=_PATCH, maxLevel=3)
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-            grey, self._previous, after, before.copy(), winSize=_PATCH, maxLevel=3
-        )
+        after, ok = _track(self._previous, grey, before)
+        back, ok_back = _track(grey, self._previous, after)
         apart = np.abs(back - before).reshape(-1, 2).max(axis=1)
         height, width = self._shape
         at = after.reshape(-1, 2)
