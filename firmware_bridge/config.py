@@ -6,12 +6,13 @@ and `go2.toml` only the `[dds]` addresses differ.
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
+
+from firmware_bridge.unitree.ids import REMOTE_KEYS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -20,11 +21,8 @@ else:
 
 PROTOCOLS: Final = ("unitree",)
 VELOCITY_FRAMES: Final = ("odom", "body")
+OPERATOR_SUFFIX: Final = ".operator"  # of the second socket, for `edge-bridge stop`, `arm` and `status`
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
-# Go2 Move limits as the maker documents them; a robot file may only lower them (protocol facts, "Move: body frame").
-GO2_VX_MPS: Final = (-2.5, 3.8)
-GO2_VY_MPS: Final = 1.0
-GO2_WZ_RADPS: Final = 4.0
 
 
 class ConfigError(ValueError):
@@ -34,6 +32,12 @@ class ConfigError(ValueError):
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ConfigError(message)
+
+
+def _require_between(low: float, value: float, high: float, key: str, *, above: bool = False) -> None:
+    """`above`: the lower end itself is not allowed."""
+    inside = low < value <= high if above else low <= value <= high
+    _require(inside, f"{key}: expected {low:g}..{high:g}, found {value}")
 
 
 @dataclass(frozen=True)
@@ -64,14 +68,42 @@ class BridgeConfig:
     def __post_init__(self) -> None:
         path = self.socket if self.socket.is_absolute() else runtime_dir() / self.socket
         object.__setattr__(self, "socket", path)
-        size = len(os.fsencode(path))
-        _require(size <= MAX_SOCKET_PATH_BYTES, f"bridge.socket: {size} bytes, the system allows 107: {path}")
-        _require(10 <= self.rate_hz <= 200, f"bridge.rate_hz: expected 10..200, found {self.rate_hz}")
+        size = len(os.fsencode(path)) + len(OPERATOR_SUFFIX)
+        _require(
+            size <= MAX_SOCKET_PATH_BYTES,
+            f"bridge.socket: {size} bytes with its suffix {OPERATOR_SUFFIX}, the system allows 107: {path}",
+        )
+        _require_between(10, self.rate_hz, 200, "bridge.rate_hz")
         # Above 250 ms the promise "zero on the wire within 300 ms" cannot be kept.
-        _require(20 <= self.deadman_ms <= 250, f"bridge.deadman_ms: expected 20..250, found {self.deadman_ms}")
-        _require(1 <= self.arm_timeout_s <= 60, f"bridge.arm_timeout_s: expected 1..60, found {self.arm_timeout_s}")
-        in_range = 100 <= self.state_timeout_ms <= 5000
-        _require(in_range, f"bridge.state_timeout_ms: expected 100..5000, found {self.state_timeout_ms}")
+        _require_between(20, self.deadman_ms, 250, "bridge.deadman_ms")
+        _require_between(1, self.arm_timeout_s, 60, "bridge.arm_timeout_s")
+        _require_between(100, self.state_timeout_ms, 5000, "bridge.state_timeout_ms")
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """What forbids motion besides the bridge's own rules.
+
+    `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
+    reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
+    `remote_deadband`: share of a stick's travel that is not yet a hand on it.
+    """
+
+    sport_version: str = "1.0.0.1"
+    accepted_error_codes: tuple[int, ...] = (0,)
+    battery_min_percent: int = 10
+    remote_estop_keys: tuple[str, ...] = ("L2", "B")
+    remote_deadband: float = 0.1
+    estop_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        _require_between(0, self.battery_min_percent, 90, "safety.battery_min_percent")
+        _require_between(0.01, self.remote_deadband, 0.5, "safety.remote_deadband")
+        keys = self.remote_estop_keys
+        known = len(keys) > 0 and set(keys) <= set(REMOTE_KEYS)
+        _require(known, f"safety.remote_estop_keys: expected one or more of {', '.join(REMOTE_KEYS)}, found {keys}")
+        file_ok = self.estop_file is None or self.estop_file.is_absolute()
+        _require(file_ok, f"safety.estop_file: expected an absolute path, found {self.estop_file}")
 
 
 @dataclass(frozen=True)
@@ -86,14 +118,13 @@ class LimitsConfig:
     alpha_radps2: float
 
     def __post_init__(self) -> None:
-        low, high = GO2_VX_MPS
-        _require(low <= self.vx_min_mps <= 0, f"limits.vx_min_mps: expected {low}..0, found {self.vx_min_mps}")
-        _require(0 < self.vx_max_mps <= high, f"limits.vx_max_mps: expected 0..{high}, found {self.vx_max_mps}")
-        _require(0 <= self.vy_max_mps <= GO2_VY_MPS, f"limits.vy_max_mps: expected 0..1, found {self.vy_max_mps}")
-        wz_ok = 0 < self.wz_max_radps <= GO2_WZ_RADPS
-        _require(wz_ok, f"limits.wz_max_radps: expected 0..{GO2_WZ_RADPS}, found {self.wz_max_radps}")
-        _require(0 < self.accel_mps2 <= 20, f"limits.accel_mps2: expected 0..20, found {self.accel_mps2}")
-        _require(0 < self.alpha_radps2 <= 50, f"limits.alpha_radps2: expected 0..50, found {self.alpha_radps2}")
+        # A Go2's Move limits as its maker documents them; a robot file may only lower them (protocol facts, "Move").
+        _require_between(-2.5, self.vx_min_mps, 0, "limits.vx_min_mps")
+        _require_between(0, self.vx_max_mps, 3.8, "limits.vx_max_mps", above=True)
+        _require_between(0, self.vy_max_mps, 1, "limits.vy_max_mps")
+        _require_between(0, self.wz_max_radps, 4, "limits.wz_max_radps", above=True)
+        _require_between(0, self.accel_mps2, 20, "limits.accel_mps2", above=True)
+        _require_between(0, self.alpha_radps2, 50, "limits.alpha_radps2", above=True)
 
 
 @dataclass(frozen=True)
@@ -105,9 +136,9 @@ class CameraConfig:
     timeout_ms: int
 
     def __post_init__(self) -> None:
-        _require(0 < self.rate_hz <= 60, f"camera.rate_hz: expected 0..60, found {self.rate_hz}")
-        _require(0 <= self.latency_ms <= 2000, f"camera.latency_ms: expected 0..2000, found {self.latency_ms}")
-        _require(10 <= self.timeout_ms <= 10000, f"camera.timeout_ms: expected 10..10000, found {self.timeout_ms}")
+        _require_between(0, self.rate_hz, 60, "camera.rate_hz", above=True)
+        _require_between(0, self.latency_ms, 2000, "camera.latency_ms")
+        _require_between(10, self.timeout_ms, 10000, "camera.timeout_ms")
 
 
 @dataclass(frozen=True)
@@ -120,7 +151,7 @@ class OdometryConfig:
     def __post_init__(self) -> None:
         frame_ok = self.velocity_frame in VELOCITY_FRAMES
         _require(frame_ok, f'odometry.velocity_frame: expected "odom" or "body", found {self.velocity_frame!r}')
-        _require(20 <= self.max_age_ms <= 2000, f"odometry.max_age_ms: expected 20..2000, found {self.max_age_ms}")
+        _require_between(20, self.max_age_ms, 2000, "odometry.max_age_ms")
 
 
 @dataclass(frozen=True)
@@ -134,6 +165,7 @@ class RobotConfig:
     limits: LimitsConfig
     camera: CameraConfig
     odometry: OdometryConfig
+    safety: SafetyConfig = SafetyConfig()
 
     def __post_init__(self) -> None:
         _require(self.protocol in PROTOCOLS, f"protocol: expected one of {PROTOCOLS}, found {self.protocol!r}")
@@ -149,7 +181,7 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
     """Read a robot file; `socket` and `domain` replace what it says. Raises ConfigError with one clear line."""
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"robot file {path}: cannot be read: {error}") from error
     try:
         config: RobotConfig = _build(RobotConfig, table, "")
@@ -166,6 +198,7 @@ _SECTIONS: Final = {
     "limits": LimitsConfig,
     "camera": CameraConfig,
     "odometry": OdometryConfig,
+    "safety": SafetyConfig,
 }
 
 
@@ -192,12 +225,13 @@ def _build(cls: Any, table: object, section: str) -> Any:
 def _convert(value: object, kind: str, where: str) -> object:
     if kind == "int" and isinstance(value, int) and not isinstance(value, bool):
         return value
-    if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+    if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
     if kind == "str" and isinstance(value, str) and value:
         return value
-    if kind == "Path" and isinstance(value, str) and value:
+    if kind in ("Path", "Path | None") and isinstance(value, str) and value and "\0" not in value:
         return Path(value)
-    if kind == "tuple[str, ...]" and isinstance(value, list) and all(isinstance(item, str) for item in value):
-        return tuple(value)
+    if kind.startswith("tuple[") and isinstance(value, list):
+        item = kind[len("tuple[") :].partition(",")[0]
+        return tuple(_convert(each, item, where) for each in value)
     raise ConfigError(f"{where}: expected {kind}, found {value!r}")

@@ -4,8 +4,9 @@ Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
   1 arm       empty
   2 stop      empty
   3 velocity  seq u64, stamp_ns i64 (time.monotonic_ns of the command), vx, vy m/s, wz rad/s as f64
-  4 status    stamp_ns i64, state u8, zero_after_stop u8, last_seq u64, commands u64, rejected u64,
-              last command 3 x f64, then the reason as UTF-8
+  4 status    stamp_ns i64, state u8, zero_after_stop u8, cause u8, blocked_by u8, last_seq u64, commands u64,
+              rejected u64, last command 3 x f64, then the reason as UTF-8
+Version 1 had neither cause nor blocked_by.
 """
 
 from __future__ import annotations
@@ -15,15 +16,35 @@ from dataclasses import dataclass
 from typing import Final
 
 MAGIC: Final = b"TVEB"
-VERSION: Final = 1
+VERSION: Final = 2
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
+CAUSES: Final = (
+    "none",
+    "client_stop",  # the runner asked for it
+    "client_lost",  # the runner's connection has closed
+    "deadman",  # no good command in time
+    "shutdown",  # the bridge was told to end
+    "suspended",  # the machine slept
+    "estop",  # an operator, the local input or the remote's emergency keys
+    "remote_takeover",  # a stick or key of the robot's remote
+    "second_commander",  # motion or mode requests that are not ours
+    "link_down",  # the network does not take our commands
+    "state_silent",  # no usable report from the robot
+    "wrong_mode",  # the robot left its walking modes
+    "robot_error",  # the robot's error code
+    "tipped",  # rolled or pitched beyond 30 degrees
+    "robot_moving",  # found moving when the bridge started
+    "not_standing",  # it did not stand up in time
+    "battery_low",  # less charge than the robot file asks for
+    "wrong_robot",  # another service version than the robot file's
+)
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512
 
 _ARM, _STOP, _VELOCITY, _STATUS = 1, 2, 3, 4
 _HEADER: Final = struct.Struct("<4sBBH")
 _VELOCITY_BODY: Final = struct.Struct("<Qq3d")
-_STATUS_BODY: Final = struct.Struct("<qBBQQQ3d")
+_STATUS_BODY: Final = struct.Struct("<qBBBBQQQ3d")
 
 
 class LinkError(ValueError):
@@ -56,7 +77,8 @@ class BridgeStatus:
     """What the bridge is doing: `commands` velocity commands written to the robot, `last_command` the newest of them.
 
     `zero_after_stop`: stopped, and a zero velocity has been written since, and nothing else. It is True too when the
-    bridge never commanded the robot at all.
+    bridge never commanded the robot at all. `cause` (of CAUSES) says why it last stopped or refused to arm, `reason`
+    the same in words; `blocked_by` (of CAUSES) says what would make it refuse to arm now.
     """
 
     stamp_ns: int
@@ -67,6 +89,8 @@ class BridgeStatus:
     rejected: int
     last_command: tuple[float, float, float]
     zero_after_stop: bool
+    cause: str = "none"
+    blocked_by: str = "none"
 
 
 Message = Arm | Stop | Velocity | BridgeStatus
@@ -83,8 +107,9 @@ def encode(message: Message) -> bytes:
         return _frame(_VELOCITY, _VELOCITY_BODY.pack(message.seq, message.stamp_ns, *velocity))
     reason = message.reason.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", "ignore").encode("utf-8")
     counters = (message.last_seq, message.commands, message.rejected)
-    state = STATES.index(message.state)
-    body = _STATUS_BODY.pack(message.stamp_ns, state, message.zero_after_stop, *counters, *message.last_command)
+    flags = (STATES.index(message.state), message.zero_after_stop)
+    causes = (CAUSES.index(message.cause), CAUSES.index(message.blocked_by))
+    body = _STATUS_BODY.pack(message.stamp_ns, *flags, *causes, *counters, *message.last_command)
     return _frame(_STATUS, body + reason)
 
 
@@ -108,15 +133,16 @@ def decode(data: bytes) -> Message:
 
 
 def _decode_status(body: bytes) -> BridgeStatus:
-    stamp_ns, state, zero, last_seq, commands, rejected, *velocity = _STATUS_BODY.unpack_from(body)
-    if state >= len(STATES) or zero > 1:
-        raise LinkError(f"state {state}, flag {zero}")
+    stamp_ns, state, zero, cause, blocked_by, *counters, vx, vy, wz = _STATUS_BODY.unpack_from(body)
+    if state >= len(STATES) or zero > 1 or max(cause, blocked_by) >= len(CAUSES):
+        raise LinkError(f"state {state}, flag {zero}, causes {cause} and {blocked_by}")
     try:
         reason = body[_STATUS_BODY.size :].decode("utf-8")
     except UnicodeDecodeError as error:
         raise LinkError("reason is not UTF-8") from error
-    vx, vy, wz = velocity
-    return BridgeStatus(stamp_ns, STATES[state], reason, last_seq, commands, rejected, (vx, vy, wz), zero == 1)
+    last_seq, commands, rejected = counters
+    head = (stamp_ns, STATES[state], reason, last_seq, commands, rejected, (vx, vy, wz), zero == 1)
+    return BridgeStatus(*head, CAUSES[cause], CAUSES[blocked_by])
 
 
 def _frame(kind: int, body: bytes) -> bytes:

@@ -47,6 +47,18 @@ def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
         ('protocol = "unitree"', 'protocol = "carrier pigeon"', "protocol: expected one of"),
         ('velocity_frame = "odom"', 'velocity_frame = "map"', "odometry.velocity_frame"),
         ("[limits]", "[limits", "cannot be read"),
+        ("accel_mps2 = 2.0", f"accel_mps2 = {10**400}", "limits.accel_mps2: expected float"),
+        (
+            "battery_min_percent = 10",
+            "battery_min_percent = 91",
+            "safety.battery_min_percent: expected 0..90, found 91",
+        ),
+        ('["L2", "B"]', '["L2", "C"]', "safety.remote_estop_keys: expected one or more of R1"),
+        ('["L2", "B"]', "[]", "safety.remote_estop_keys: expected one or more of R1"),
+        ("remote_deadband = 0.1", "remote_deadband = 0", "safety.remote_deadband: expected 0.01..0.5, found 0.0"),
+        ("remote_deadband = 0.1", 'estop_file = "gpio"', "safety.estop_file: expected an absolute path"),
+        ("accepted_error_codes = [0]", "accepted_error_codes = [true]", "expected int, found True"),
+        ('socket = "bridge.sock"', 'socket = "a\\u0000b"', "bridge.socket: expected Path"),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, before: str, after: str, complaint: str) -> None:

@@ -61,10 +61,14 @@ class Bus:
             ) from error
         self._topics: dict[str, Topic[Any]] = {}
 
-    def reader(self, name: str, kind: Any, *, depth: int = 1, reliable: bool = False) -> DataReader[Any]:
-        """Reader of the newest `depth` samples; best effort matches every writer."""
+    def reader(
+        self, name: str, kind: Any, *, depth: int = 1, reliable: bool = False, foreign: bool = False
+    ) -> DataReader[Any]:
+        """Reader of the newest `depth` samples; best effort matches every writer. `foreign`: not those of this Bus."""
         reliability = Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort
-        return DataReader(self.participant, self._topic(name, kind), Qos(reliability, Policy.History.KeepLast(depth)))
+        local = Policy.IgnoreLocal.Participant if foreign else Policy.IgnoreLocal.Nothing
+        qos = Qos(reliability, Policy.History.KeepLast(depth), local)
+        return DataReader(self.participant, self._topic(name, kind), qos)
 
     def writer(self, name: str, kind: Any, *, depth: int = 1) -> DataWriter[Any]:
         """Reliable writer that never waits for a slow reader: the newest `depth` samples replace older ones."""

@@ -130,3 +130,12 @@ class SportModeState_(IdlStruct, typename="unitree_go.msg.dds_.SportModeState_")
     foot_position_body: F32x12
     foot_speed_body: F32x12
     path_point: PathPoints
+
+
+@dataclass
+class WirelessController_(IdlStruct, typename="unitree_go.msg.dds_.WirelessController_"):
+    lx: t.float32
+    ly: t.float32
+    rx: t.float32
+    ry: t.float32
+    keys: t.uint16

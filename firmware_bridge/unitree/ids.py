@@ -10,9 +10,13 @@ from typing import Final
 
 SPORT_SERVICE: Final = "sport"
 VIDEO_SERVICE: Final = "videohub"
+MOTION_SWITCHER_SERVICE: Final = "motion_switcher"
+ROBOT_STATE_SERVICE: Final = "robot_state"
+OBSTACLES_AVOID_SERVICE: Final = "obstacles_avoid"
 SPORT_STATE_TOPIC: Final = "rt/sportmodestate"
 LOW_STATE_TOPIC: Final = "rt/lowstate"
 LF_LOW_STATE_TOPIC: Final = "rt/lf/lowstate"  # the same at a low frequency
+REMOTE_TOPIC: Final = "rt/wirelesscontroller"
 
 API_VERSION: Final = 1  # every service answers it with its version as bare text
 SERVICE_VERSION: Final = "1.0.0.1"
@@ -27,6 +31,7 @@ MOVE: Final = 1008  # {"x","y","z"}: m/s, m/s, rad/s in the body frame; never an
 GET_IMAGE_SAMPLE: Final = 1001  # of videohub
 
 SPORT_API_NAMES: Final = {
+    API_VERSION: "Version",
     DAMP: "Damp",
     BALANCE_STAND: "BalanceStand",
     STOP_MOVE: "StopMove",
@@ -36,7 +41,20 @@ SPORT_API_NAMES: Final = {
     MOVE: "Move",
 }
 # The only ids that ever leave this machine: the same field can ask for a back flip (faults table, "Unitree hazards").
-BRIDGE_ALLOWED: Final = frozenset({MOVE, STOP_MOVE, STAND_UP, RECOVERY_STAND, BALANCE_STAND})
+BRIDGE_ALLOWED: Final = frozenset({API_VERSION, MOVE, STOP_MOVE, STAND_UP, RECOVERY_STAND, BALANCE_STAND})
+# Services that can move the robot or change what moves it, with their requests that only ask. Every other request there
+# that is not ours is a second commander's.
+COMMANDING_SERVICES: Final = {
+    SPORT_SERVICE: frozenset({API_VERSION, 2055}),  # AutoRecoveryGet
+    MOTION_SWITCHER_SERVICE: frozenset({API_VERSION, 1001, 1005}),  # CheckMode, GetSilent
+    ROBOT_STATE_SERVICE: frozenset({API_VERSION, 1002, 1003}),  # SetReportFreq, ServiceList
+    OBSTACLES_AVOID_SERVICE: frozenset({API_VERSION, 1002}),  # SwitchGet
+}
+# Bits of WirelessController_.keys, lowest first.
+REMOTE_KEYS: Final = (
+    *("R1", "L1", "start", "select", "R2", "L2", "F1", "F2"),
+    *("A", "B", "X", "Y", "up", "right", "down", "left"),
+)
 
 OK: Final = 0
 ERROR_NOT_IMPLEMENTED: Final = 3203

@@ -1,29 +1,15 @@
-"""Client side of Unitree's request/response services over two DDS topics.
-
-The robot is an untrusted peer (faults table, "Unitree, known hazards"): what it sends is bounded, matched by identity
-id and otherwise dropped and counted.
-"""
+"""Calls to the robot's services that wait for their answer: the runner's and the tests', never the bridge's."""
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import dataclass
 from typing import Final
 
-from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
-from firmware_bridge.unitree.idl import (
-    Request_,
-    RequestHeader_,
-    RequestIdentity_,
-    RequestLease_,
-    RequestPolicy_,
-    Response_,
-)
-from firmware_bridge.unitree.ids import request_topic, response_topic
+from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.requests import MAX_BINARY_BYTES, Requester, Response, make_request, move_parameter
 
-MAX_DATA_CHARS: Final = 64 * 1024
-MAX_BINARY_BYTES: Final = 8 * 1024 * 1024  # a 720p JPEG is about 0.15 MB
+__all__ = ["MAX_BINARY_BYTES", "Response", "RpcClient", "RpcError", "make_request", "move_parameter"]
+
 _MATCH_POLL_S: Final = 0.01
 _NS: Final = 1_000_000_000
 
@@ -36,76 +22,13 @@ class RpcError(RuntimeError):
         self.code = code
 
 
-@dataclass(frozen=True)
-class Response:
-    """One bounds-checked answer."""
-
-    request_id: int
-    api_id: int
-    code: int
-    data: str
-    binary: bytes
-
-    @classmethod
-    def checked(cls, sample: Response_ | None) -> Response | None:
-        """The sample's content, or None when it did not decode or is larger than any real answer."""
-        if sample is None or len(sample.data) > MAX_DATA_CHARS or len(sample.binary) > MAX_BINARY_BYTES:
-            return None
-        header = sample.header
-        return cls(header.identity.id, header.identity.api_id, header.status.code, sample.data, bytes(sample.binary))
-
-
-def make_request(request_id: int, api_id: int, parameter: str, *, noreply: bool) -> Request_:
-    """A request without lease, priority or binary part, as the maker's client sends it."""
-    identity = RequestIdentity_(request_id, api_id)
-    header = RequestHeader_(identity, RequestLease_(0), RequestPolicy_(0, noreply))
-    return Request_(header, parameter, b"")
-
-
-def move_parameter(vx_mps: float, vy_mps: float, wz_radps: float) -> str:
-    """Parameter text of the sport service's Move."""
-    return json.dumps({"x": vx_mps, "y": vy_mps, "z": wz_radps})
-
-
-class RpcClient:
+class RpcClient(Requester):
     """One service as a client sees it: `send` and `responses` never wait, `call` blocks its caller only."""
 
     def __init__(self, bus: Bus, service: str, *, allowed: frozenset[int] | None = None) -> None:
         """`allowed`: the only API ids this client may put on the wire; None allows every id."""
-        self.service = service
-        self.malformed = 0
-        self.failed_writes = 0
-        self._allowed = allowed
-        self._last_id = 0
-        self._writer = bus.writer(request_topic(service), Request_)
-        self._reader = bus.reader(response_topic(service), Response_, depth=8, reliable=True)
+        super().__init__(bus, service, allowed=allowed)
         self._waitset = bus.waitset(self._reader)
-
-    def send(self, api_id: int, parameter: str = "", *, noreply: bool = False) -> int | None:
-        """Write a request without waiting for anything; its id, or None when DDS did not take it.
-
-        Raises ValueError for an id outside the allow-list: that is a defect of the caller, never of its input.
-        """
-        if self._allowed is not None and api_id not in self._allowed:
-            raise ValueError(f"{self.service}: api id {api_id} is not on the allow-list")
-        self._last_id = max(self._last_id + 1, time.monotonic_ns())
-        try:
-            self._writer.write(make_request(self._last_id, api_id, parameter, noreply=noreply))
-        except DDS_ERRORS:
-            self.failed_writes += 1
-            return None
-        return self._last_id
-
-    def responses(self) -> list[Response]:
-        """Answers that have arrived since the last look, other clients' included."""
-        answers = []
-        for sample in take_each(self._reader):
-            response = Response.checked(sample)
-            if response is None:
-                self.malformed += 1
-            else:
-                answers.append(response)
-        return answers
 
     def connected(self) -> bool:
         """Whether the service's two ends have been discovered."""

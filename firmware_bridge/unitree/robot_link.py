@@ -1,0 +1,129 @@
+"""The bridge's end of the robot's network: what it hears there as one `Report` a step, and the requests it writes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from firmware_bridge.config import RobotConfig
+from firmware_bridge.core import Call, Move, Remote, Report
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.unitree.idl import Request_, SportModeState_, WirelessController_
+from firmware_bridge.unitree.idl_low import LowState_
+from firmware_bridge.unitree.requests import Requester, move_parameter
+from firmware_bridge.unitree.state import RobotState, StampOrder, battery_state, robot_state, within
+
+_MAX_UNANSWERED: Final = 32
+_MAX_VERSION_CHARS: Final = 40
+_FAILING_WRITES: Final = 3  # in a row: 60 ms at 50 Hz, inside the 100 ms of fault matrix row 46
+_BATTERY_PERIOD_NS: Final = 1_000_000_000  # decoding a low state costs as much as ten other messages
+_MAX_STICK: Final = 1.5  # full travel is 1
+
+
+class RobotLink:
+    """All readers and the only writer. Nothing here waits. Raises DdsError when the bus cannot be joined."""
+
+    def __init__(self, config: RobotConfig, say: Callable[[str], None]) -> None:
+        """`say` is told, in one line, when the robot answers a request with an error."""
+        self._say = say
+        self._velocity_frame = config.odometry.velocity_frame
+        self._deadband = config.safety.remote_deadband
+        self._estop_keys = sum(1 << ids.REMOTE_KEYS.index(key) for key in config.safety.remote_estop_keys)
+        self._bus = bus = Bus(config.dds)
+        self._sport = Requester(bus, ids.SPORT_SERVICE, allowed=ids.BRIDGE_ALLOWED)
+        self._states = bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_)
+        self._low_states = bus.reader(ids.LF_LOW_STATE_TOPIC, LowState_)
+        self._remotes = bus.reader(ids.REMOTE_TOPIC, WirelessController_, depth=8)
+        self._requests = [
+            (service, harmless, bus.reader(ids.request_topic(service), Request_, depth=8, foreign=True))
+            for service, harmless in ids.COMMANDING_SERVICES.items()
+        ]
+        self._order = StampOrder()
+        self._battery_due_ns = 0
+        self._sent: dict[int, int] = {}  # request id -> api id, of what has not been answered
+        self._malformed = 0
+
+    def counters(self) -> dict[str, int]:
+        """What was dropped or refused so far."""
+        sport = self._sport
+        return {
+            "malformed": self._malformed + sport.malformed,
+            "reordered": self._order.dropped,
+            "failed_writes": sport.failed_writes,
+        }
+
+    def read(self, now_ns: int) -> Report:
+        """Everything that has arrived since the last call."""
+        return Report(
+            self._newest_state(),
+            self._remote(),
+            self._foreign(),
+            self._battery_percent(now_ns),
+            self._answers(),
+            self._sport.failing >= _FAILING_WRITES,
+        )
+
+    def write(self, request: Move | Call) -> None:
+        """Send one request and wait for nothing; what the network does not take is counted."""
+        if isinstance(request, Move):
+            parameter = move_parameter(request.vx_mps, request.vy_mps, request.wz_radps)
+            self._sport.send(ids.MOVE, parameter, noreply=True)
+            return
+        request_id = self._sport.send(request.api_id)
+        if request_id is not None:
+            if len(self._sent) >= _MAX_UNANSWERED:
+                self._sent.clear()
+            self._sent[request_id] = request.api_id
+
+    def _newest_state(self) -> RobotState | None:
+        newest = None
+        for sample in take_each(self._states):
+            state = None if sample is None else robot_state(sample, time.monotonic_ns(), self._velocity_frame)
+            if state is None:
+                self._malformed += 1
+            elif self._order.accept(state):
+                newest = state
+        return newest
+
+    def _remote(self) -> Remote | None:
+        in_use = estop = heard = False
+        for sample in take_each(self._remotes):
+            if sample is None or not within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
+                self._malformed += 1
+                continue
+            heard = True
+            in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
+            estop |= sample.keys & self._estop_keys == self._estop_keys
+        return Remote(in_use, estop) if heard else None
+
+    def _foreign(self) -> str | None:
+        foreign = None
+        for service, harmless, reader in self._requests:
+            for sample in take_each(reader):
+                api_id = "unreadable request" if sample is None else sample.header.identity.api_id
+                if api_id not in harmless:
+                    foreign = f"{service} {api_id}"
+        return foreign
+
+    def _battery_percent(self, now_ns: int) -> int | None:
+        if now_ns < self._battery_due_ns:
+            return None
+        self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
+        battery: Any = None
+        for sample in take_each(self._low_states):
+            battery = None if sample is None else battery_state(sample, now_ns)
+            self._malformed += battery is None
+        return None if battery is None else battery.soc_percent
+
+    def _answers(self) -> str | None:
+        """The version the sport service has told us, if it has; errors go to the operator."""
+        version = None
+        for answer in self._sport.responses():
+            api_id = self._sent.pop(answer.request_id, None)
+            if api_id is not None and answer.code != ids.OK:
+                self._say(f"the robot answered {ids.SPORT_API_NAMES[api_id]} with error {answer.code}")
+            elif api_id == ids.API_VERSION:
+                version = answer.data[:_MAX_VERSION_CHARS] or "nothing"
+        return version
