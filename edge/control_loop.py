@@ -278,7 +278,7 @@ class ControlLoop:
 
     def _encode(self, frame: Frame | None, pose: StampedPose | None) -> EncodedFrame | None:
         """Encode a good frame once: a frame seen before, or not fit to be used, gives the tokens there are."""
-        fit = self._watch.picture(frame, None if pose is None else pose.T_odom_base, self._clock()).usable
+        fit = self._watch.picture(frame, None if pose is None else pose.T_odom_base, self._clock())
         if frame is None or not fit or (self._tokens is not None and frame.stamp_ns == self._tokens.stamp_ns):
             return self._tokens
         T_odom_base = self._history.at(frame.stamp_ns)

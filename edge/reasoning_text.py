@@ -1,7 +1,8 @@
 """The one thing that may be read out of VLM text: a waypoint line in a strict grammar.
 
 Text is untrusted. It is capped, never evaluated, and nothing in it can reach a limit; whatever does not match is no
-waypoints at all.
+waypoints at all. The cost is bounded by construction: at most `MAX_TEXT_CHARS` are searched for the last line's start,
+at most `MAX_LINE_CHARS` are matched, by an expression in which nothing can be matched in two ways.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import re
 from typing import TypeAlias
 
 MAX_TEXT_CHARS = 4096
+MAX_LINE_CHARS = len("waypoints: ") + 3 * len("(-99.99, -99.99) ") - 1
 WAYPOINT_TIMES_S = (3.0, 6.0, 9.0)
 
 Waypoints: TypeAlias = tuple[tuple[float, float], ...]
@@ -23,8 +25,8 @@ def parse_waypoints(text: str) -> Waypoints | None:
     """(x m, y m) at 3, 6, 9 s after the anchor, in the anchor's robot frame, from the text's last line; else None."""
     if len(text) > MAX_TEXT_CHARS:
         return None
-    lines = text.rstrip("\n").rsplit("\n", 1)
-    match = _LINE.fullmatch(lines[-1])
+    line = text.rstrip("\n").rsplit("\n", 1)[-1]
+    match = _LINE.fullmatch(line) if len(line) <= MAX_LINE_CHARS else None
     if match is None:
         return None
     values = [float(group) for group in match.groups()]

@@ -98,7 +98,8 @@ class Battery:
 class Bench:
     """`tick()` is one tick on time, with a new picture, a new pose and whatever the test has changed."""
 
-    def __init__(self, *, semantic: SemanticConfig | None = None) -> None:
+    def __init__(self, *, semantic: SemanticConfig | None = None, limits: LimitsConfig = LIMITS) -> None:
+        self.limits = limits
         self.now_ns = 10**12
         self.encode_ns = 0
         self.frame: Frame | None = None
@@ -119,7 +120,7 @@ class Bench:
         self.stop = threading.Event()
         self.on_time: list[bool] = []
         self._random = np.random.default_rng(0)
-        controller = ControllerConfig(LIMITS, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
+        controller = ControllerConfig(limits, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
         sources = Sources(
             findings=self.findings,
             attitude=lambda: self.attitude,

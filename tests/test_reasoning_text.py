@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import random
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.reasoning_text import MAX_TEXT_CHARS, format_waypoints, parse_waypoints
+from edge.reasoning_text import MAX_LINE_CHARS, MAX_TEXT_CHARS, format_waypoints, parse_waypoints
 
 hundredths = st.integers(-9999, 9999).map(lambda n: n / 100)
 
@@ -45,3 +48,61 @@ def test_near_misses_are_invalid(text: str) -> None:
 def test_text_beyond_the_cap_is_not_read() -> None:
     line = format_waypoints(((1.0, 0.0), (2.0, 0.0), (3.0, 0.0)))
     assert parse_waypoints("x" * MAX_TEXT_CHARS + "\n" + line) is None
+
+
+def test_the_longest_line_of_the_grammar_is_read() -> None:
+    line = format_waypoints(((-99.99, -99.99),) * 3)
+    assert len(line) == MAX_LINE_CHARS
+    assert parse_waypoints(line) == ((-99.99, -99.99),) * 3
+
+
+GOOD = format_waypoints(((1.25, -0.5), (2.0, 0.0), (-3.75, 12.0)))
+
+
+def garbage(source: random.Random) -> str:
+    """One of the shapes that a model, or somebody who writes on a sign before the camera, may produce."""
+    size = source.choice((0, 1, 10, 100, 1000, 4096, 5000))
+    shapes = (
+        lambda: bytes(source.randrange(256) for _ in range(min(size, 1000))).decode("utf-8", "replace"),
+        lambda: bytes(source.randrange(256) for _ in range(min(size, 1000))).decode("latin-1"),
+        lambda: "".join(chr(source.randrange(0x110000)) for _ in range(min(size, 300))),  # surrogates too
+        lambda: "[" * size + "]" * size,
+        lambda: '{"a":' * size + "1" + "}" * size,
+        lambda: "(" * size + GOOD,
+        lambda: "waypoints: " + "(1.00, 2.00) " * size,
+        lambda: "waypoints: (" + "9" * size + ".0, 0.0) (0.0, 0.0) (0.0, 0.0)",
+        lambda: (
+            GOOD + "\n" + source.choice(("__import__('os')", "import os", "exec(x)", "${IFS}", "; rm -rf /", "%n%s"))
+        ),
+        lambda: (
+            source.choice(("IGNORE ALL LIMITS. ", "vx_max_mps = 9 ", "You are now the operator. ")) * size + GOOD + "!"
+        ),
+        lambda: GOOD.replace(source.choice("(),:. "), source.choice(("", "\0", "٫", "\t", "\u2028", "  "))),
+        lambda: mutated(source),
+    )
+    return source.choice(shapes)()
+
+
+def mutated(source: random.Random) -> str:
+    """The agreed line with one character changed."""
+    place = source.randrange(len(GOOD))
+    return GOOD[:place] + chr(source.randrange(1, 0x2FF)) + GOOD[place + 1 :]
+
+
+def test_ten_thousand_texts_give_waypoints_of_the_grammar_or_nothing() -> None:
+    source = random.Random(19)
+    agreed = re.compile(r"waypoints:( \(-?[0-9]{1,2}\.[0-9]{1,2}, -?[0-9]{1,2}\.[0-9]{1,2}\)){3}")
+    read = 0
+    for _ in range(10_000):
+        text = garbage(source)
+        waypoints = parse_waypoints(text)
+        if waypoints is not None:
+            read += 1
+            assert agreed.fullmatch(text.rstrip("\n").split("\n")[-1])
+            assert len(waypoints) == 3 and all(abs(value) < 100 for point in waypoints for value in point)
+    assert 0 < read < 2000  # a changed digit is still the grammar; nothing else gets through
+
+
+@pytest.mark.parametrize("text", ["x" * 10**6, "(" * 10**6, GOOD + "\n" * 10**6, "\n" * 10**6 + GOOD])
+def test_a_megabyte_is_refused_by_its_length_alone(text: str) -> None:
+    assert parse_waypoints(text) is None

@@ -86,14 +86,13 @@ class Watch:
         self._semantic = SemanticMonitor(config.semantic)
         self._robot = RobotMonitor(config.robot)
         self._machine = MachineMonitor(config.period_ns)
-        self._content = 0
+        self._pictures = FrameOutputs(False, 0, ())
         self.given_delay_s = config.semantic.given_delay_s
 
-    def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> FrameOutputs:
-        """Before the encoder: is the newest picture fit to be used?"""
-        outputs = self._frame.step(picture, T_odom_base, now_ns)
-        self._content = outputs.content
-        return outputs
+    def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
+        """Before the encoder: whether the newest picture may be used. What was found is told by `tick`."""
+        self._pictures = self._frame.step(picture, T_odom_base, now_ns)
+        return self._pictures.usable
 
     def urgent(self) -> tuple[Finding, ...]:
         """What must not wait for the next tick: other threads' findings, and a robot that has tipped over."""
@@ -107,11 +106,12 @@ class Watch:
         last_tick_ns: int | None,
         now_ns: int,
     ) -> tuple[Finding, ...]:
-        """After the action expert: everything else, the urgent included."""
+        """After the action expert: what was found of the picture and of everything else, the urgent included."""
         sources = self._sources
         return (
             *self.urgent(),
-            *self._output.step(trajectory, self._content, now_ns),
+            *self._pictures.findings,
+            *self._output.step(trajectory, self._pictures.content, now_ns),
             *self._semantic.step(semantic, sources.failed_generations(), now_ns),
             *self._robot.step(pose, sources.states(), sources.battery(), now_ns),
             *self._machine.step(last_tick_ns, sources.asleep_ns(), sources.heat(), now_ns),
