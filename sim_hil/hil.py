@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pybullet
 
@@ -24,13 +24,19 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_
 from firmware_bridge.config import ConfigError, DdsConfig
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, DdsError
+from sim_hil.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names
 from sim_hil.simulation import Simulation
 from sim_hil.trace import TraceWriter
 from sim_hil.unitree import sport
 from sim_hil.unitree.camera_process import CameraProcess
+from sim_hil.unitree.drifting import DriftingOdometry
+from sim_hil.unitree.remote import Remote
 from sim_hil.unitree.service import Received, ServiceServer
 from sim_hil.unitree.state import OdometryFrame, StatePublishers
+
+if TYPE_CHECKING:
+    from sim_hil.faults.injector import FaultInjector
 
 BATCH_NS: Final = 4_000_000
 MAX_LAG_NS: Final = 200_000_000  # behind by more than this, the simulated world falls behind instead of racing
@@ -45,6 +51,7 @@ _RUN_FAILURES: Final = (RuntimeError, ValueError, OSError, pybullet.error, *DDS_
 EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
+  edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
 exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
 is written all the same, or trace or result could not be written; 2 bad arguments"""
 
@@ -56,6 +63,7 @@ class Go2Hil:
         self._scene = scene
         self._args = args
         self._trace: TraceWriter | None = None
+        self._faults: FaultInjector | None = None
         self._simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui)
         try:
             self._bus = Bus(dds)
@@ -66,6 +74,7 @@ class Go2Hil:
                 size=args.camera,
                 dds=dds,
                 state_length=len(self._simulation.render_state()),
+                faults=args.faults is not None,
             )
         except BaseException:
             self._simulation.close()
@@ -75,14 +84,35 @@ class Go2Hil:
         self._motion_switcher = ServiceServer(self._bus, sport.MOTION_SWITCHER_SERVICE)
         self._servers = (self._sport, self._robot_state, self._motion_switcher)
         self._waitset = self._bus.waitset(*(server.reader for server in self._servers))
-        self._publishers = StatePublishers(self._bus, OdometryFrame(scene.start), _STEPS_PER_S)
+        remote = Remote()
+        if args.faults is not None:
+            self._faults = self._injector(args.faults, remote)
+        self._publishers = StatePublishers(
+            self._bus,
+            _odometry(scene, args),
+            _STEPS_PER_S,
+            remote=remote,
+            faults=None if self._faults is None else self._faults.states,
+        )
         self._log = sport.CommandLog()
         self._steps = 0
+        self._slipped_s = 0.0
+        self._was_commanded = False
         self._duration_s = 0.0
         self._video_frames = 0
         self._video_malformed = 0
         self._path_m = 0.0
         self._last_xy: tuple[float, float] | None = None
+
+    def _injector(self, path: Path, remote: Remote) -> FaultInjector:
+        # Imported here: without --faults the code that makes anything go wrong is not even loaded.
+        from sim_hil.faults.injector import FaultInjector
+
+        try:
+            return FaultInjector(path, remote=remote, camera=self._camera.tell)
+        except OSError:
+            self.close()
+            raise
 
     def start(self, trace: TraceWriter | None, stop: list[int]) -> bool:
         """Write the first line of `trace`, wait for the camera; False when a signal number appears in `stop` first.
@@ -115,6 +145,7 @@ class Go2Hil:
                 lag_ns = now_ns - schedule_ns - self._steps * _STEP_NS
                 if lag_ns > MAX_LAG_NS:
                     schedule_ns += lag_ns - MAX_LAG_NS
+                    self._slipped_s += (lag_ns - MAX_LAG_NS) / 1e9  # the robot's clock does not stand still with it
                 for _ in range(min(lag_ns, MAX_LAG_NS) // _STEP_NS):
                     self._step()
                 self._camera.show(self._simulation.render_state())
@@ -124,11 +155,23 @@ class Go2Hil:
 
     def close(self) -> None:
         """End the camera process and the simulation."""
+        if self._faults is not None:
+            self._faults.close()
         self._camera.close()
         self._simulation.close()
 
+    def _serve_sport(self) -> list[Received]:
+        def handle(api_id: int, parameter: str) -> tuple[int, str]:
+            return sport.handle_sport(self._simulation, api_id, parameter)
+
+        if self._faults is None:
+            return self._sport.serve(handle)
+        self._faults.poll(time.monotonic_ns())
+        self._publishers.overdue()
+        return self._faults.sport.serve(self._sport, handle)
+
     def _serve(self) -> None:
-        for request in self._sport.serve(lambda api, text: sport.handle_sport(self._simulation, api, text)):
+        for request in self._serve_sport():
             self._heard(request)
         for request in self._robot_state.serve(sport.handle_robot_state):
             self._heard(request)
@@ -141,6 +184,10 @@ class Go2Hil:
                 count = event["count"]
                 assert isinstance(count, int)
                 self._video_malformed += count
+            elif event["event"] == "fault" and self._faults is not None:
+                fault, effect_ns = event["fault"], event["t_ns"]
+                assert isinstance(fault, str) and isinstance(effect_ns, int)
+                self._faults.took_effect(fault, effect_ns)
             elif event["event"] == "request":
                 t_ns, api_id, parameter = event["t_ns"], event["api_id"], event["parameter"]
                 assert isinstance(t_ns, int) and isinstance(api_id, int) and isinstance(parameter, str)
@@ -164,11 +211,20 @@ class Go2Hil:
         step = self._steps
         due = self._publishers.due(step)
         if due:
-            self._publishers.publish(due, self._simulation.truth())
+            self._publishers.publish(due, self._simulation.truth(), step * Simulation.DT_S + self._slipped_s)
+        if self._faults is not None:
+            self._note_command()
         if step % (_STEPS_PER_S // POSE_HZ) == 0:
             self._note_pose()
         if step % (_STEPS_PER_S // PEOPLE_HZ) == 0:
             self._note("people", poses=[[float(v) for v in row] for row in self._simulation.people()])
+
+    def _note_command(self) -> None:
+        """Trace when the robot itself begins and ends to obey a velocity: what it hears may have come late, or not."""
+        commanded = self._simulation.commanded
+        if any(commanded) != self._was_commanded:
+            self._was_commanded = any(commanded)
+            self._note("commanded", velocity=list(commanded))
 
     def _note_pose(self) -> None:
         truth = self._simulation.truth()
@@ -203,6 +259,12 @@ class Go2Hil:
             "video_frames": self._video_frames,
             "state_hz": round(self._publishers.sport_states_sent / duration_s, 2) if duration_s > 0 else 0.0,
         }
+
+
+def _odometry(scene: Scene, args: argparse.Namespace) -> OdometryFrame:
+    if args.odometry_noise == "none":
+        return OdometryFrame(scene.start)
+    return DriftingOdometry(scene.start, OdometryNoise(LEVELS[args.odometry_noise], args.seed))
 
 
 @contextlib.contextmanager
@@ -242,11 +304,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scene", required=True, metavar="NAME", help=f"one of: {', '.join(scene_names())}")
     parser.add_argument("--protocol", required=True, choices=("unitree",), help="what it speaks")
     parser.add_argument("--people", type=int, default=0, metavar="N", help="walking people (default 0)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the people (default 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of people and odometry noise (default 0)")
     parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="DDS domain (default 0)")
     parser.add_argument("--interface", default="lo", help="network interface (default lo)")
     parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH", help="default 320x180")
+    parser.add_argument(
+        "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
+    )
+    parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults to inject at this local socket")
     parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     parser.add_argument("--gui", action="store_true", help="show the physics in a window")

@@ -156,6 +156,11 @@ class Simulation:
         """Command a body-frame velocity, in force for 1 s of simulation time; ignored unless balanced on its feet."""
         self._go2.sport.request_move(vx_mps, vy_mps, wz_radps)
 
+    @property
+    def commanded(self) -> tuple[float, float, float]:
+        """The velocity command in force in the robot: zero when it may not move, or its last command has expired."""
+        return self._go2.sport.commanded
+
     def truth(self) -> RobotTruth:
         """Ground truth of the robot now. Raises SimulationClosedError when the physics is gone."""
         try:

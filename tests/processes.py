@@ -9,16 +9,15 @@ import contextlib
 import json
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from tools.host_stall import HostStall
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 GO2_SIM = REPOSITORY / "firmware_bridge" / "robots" / "go2_sim.toml"
 _READY_TIMEOUT_S = 40.0
-_SLEEP_S = 0.001
-_STALL_NS = 5_000_000  # a 1 ms sleep that takes longer was not woken in time: the machine was busy elsewhere
 
 
 class Running:
@@ -61,38 +60,6 @@ def running(module: str, *arguments: object, folder: Path, ready: str = "ready")
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-
-class HostStall:
-    """How long this machine kept a thread waiting that asked for 1 ms, over and over; a context manager.
-
-    A bound in milliseconds on other processes means what it says only as far as the machine lets anybody run.
-    """
-
-    def __init__(self) -> None:
-        self._stalls: list[tuple[int, int]] = []  # (when the sleep should have ended, when it did)
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="host-stall", daemon=True)
-
-    def __enter__(self) -> HostStall:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ending.set()
-        self._thread.join()
-
-    def between_ns(self, begin_ns: int, end_ns: int) -> int:
-        """Sum of the stalls inside a window, 0 on a machine with time to spare."""
-        return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
-
-    def _watch(self) -> None:
-        while not self._ending.is_set():
-            due_ns = time.monotonic_ns() + int(_SLEEP_S * 1e9)
-            time.sleep(_SLEEP_S)
-            woken_ns = time.monotonic_ns()
-            if woken_ns - due_ns > _STALL_NS:
-                self._stalls.append((due_ns, woken_ns))
 
 
 def check_stop_latency(latency_ns: int, bound_ns: int, since_ns: int, host: HostStall) -> None:

@@ -30,15 +30,25 @@ class CameraProcess:
     """Starts the camera process, hands it the pose, reads its events. It ends when this object or process does."""
 
     def __init__(
-        self, scene: str, *, people: int, seed: int, size: tuple[int, int], dds: DdsConfig, state_length: int
+        self,
+        scene: str,
+        *,
+        people: int,
+        seed: int,
+        size: tuple[int, int],
+        dds: DdsConfig,
+        state_length: int,
+        faults: bool = False,
     ) -> None:
-        """`size`: (width, height) in pixels; `state_length`: numbers in a render state."""
+        """`size`: (width, height) in pixels; `state_length`: numbers in a render state; `faults`: take `tell`."""
         self._pose = SnapshotWriter(state_length)
         command = [sys.executable, "-m", "sim_hil.unitree.videohub", "--scene", scene]
         command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
         command += ["--domain", str(dds.domain), "--interface", dds.interface, "--pose-fd", str(self._pose.fd)]
         for peer in dds.peers:
             command += ["--peer", peer]
+        if faults:
+            command += ["--faults"]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(self._pose.fd,)
         )
@@ -49,6 +59,13 @@ class CameraProcess:
     def show(self, render_state: NDArray[np.float64]) -> None:
         """Make this the state that the next frame is rendered from; takes microseconds."""
         self._pose.write(render_state)
+
+    def tell(self, line: bytes) -> None:
+        """Send a fault command to a camera started with `faults`; one that has died is noticed by `events`."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(line + b"\n")
+            self._process.stdin.flush()
 
     def wait_ready(self, stop: Sequence[int]) -> bool:
         """Wait until the service answers; False when something appears in `stop` first. Raises CameraProcessError."""

@@ -1,19 +1,30 @@
-"""The simulated Go2's state topics: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`."""
+"""The simulated Go2's state topics: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`.
+
+And `rt/wirelesscontroller` at 100 Hz, the remote that nobody touches.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
 
 from cyclonedds.pub import DataWriter
 
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.crc import low_state_crc
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
-from firmware_bridge.unitree.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_
+from firmware_bridge.unitree.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.idl_low import BmsState_, LowState_, MotorState_
+from sim_hil.battery import CELLS, Battery, BatteryReading, load_w
 from sim_hil.go2 import RobotTruth
+from sim_hil.unitree.remote import Remote
 
+if TYPE_CHECKING:
+    from sim_hil.faults.states import StateFaults
+
+WIRELESS_HZ: Final = 100  # the maker's MuJoCo simulator
 SPORT_STATE_HZ: Final = 50
 LOW_STATE_HZ: Final = 500
 LF_HZ: Final = 20  # the maker names no number; owners report 15 to 20
@@ -49,9 +60,25 @@ class OdometryFrame:
 
     def quaternion(self, wxyz: Any) -> list[float]:
         """An orientation (w, x, y, z) in the odometry frame."""
-        w, x, y, z = (float(v) for v in wxyz)
-        c, s = math.cos(-self._theta_rad / 2), math.sin(-self._theta_rad / 2)
-        return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+        return turned_quaternion([float(v) for v in wxyz], -self._theta_rad)
+
+    def velocity(self, vector: Any) -> list[float]:
+        """A world velocity [3] as the robot reports it, in the odometry frame."""
+        return self.rotate(vector)
+
+    def yaw_speed(self, wz_radps: float) -> float:
+        """A yaw rate as the robot reports it."""
+        return wz_radps
+
+    def update(self, truth: RobotTruth) -> None:
+        """Called once before the messages of an instant are made; an exact odometry has nothing to do."""
+
+
+def turned_quaternion(wxyz: list[float], yaw_rad: float) -> list[float]:
+    """An orientation turned by a yaw angle about the frame's z axis."""
+    w, x, y, z = wxyz
+    c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
 
 
 def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
@@ -78,8 +105,8 @@ def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame) -> SportModeSta
         foot_raise_height=_FOOT_RAISE_M,
         position=odometry.position(truth.position_m),
         body_height=truth.body_height_m,
-        velocity=odometry.rotate(truth.velocity_world_mps),
-        yaw_speed=float(truth.gyro_radps[2]),
+        velocity=odometry.velocity(truth.velocity_world_mps),
+        yaw_speed=odometry.yaw_speed(float(truth.gyro_radps[2])),
         range_obstacle=[0.0] * 4,  # this robot has no range sensor; zero is what the maker's simulator sends
         foot_force=_foot_force(truth),
         foot_position_body=truth.foot_position_body_m.ravel().tolist(),
@@ -107,7 +134,7 @@ class LowStateMessage:
             for index in range(_MOTORS)
         ]
         imu = IMUState_([1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3, [0.0] * 3, 40)
-        # No battery model: full, at its nominal 28.8 V.
+        # Until the first reading: full, at its nominal 28.8 V.
         battery = BmsState_(0, 0, 8, 100, 0, 0, b"\x1e\x1e", b"\x1e\x1e", [3600] * 8 + [0] * 7)
         self.message = LowState_(
             head=b"\xfe\xef",
@@ -133,6 +160,14 @@ class LowStateMessage:
             reserve=0,
             crc=0,
         )
+
+    def charge(self, reading: BatteryReading) -> None:
+        """Report this battery from the next message on; the current is below zero while it is being emptied."""
+        message, battery = self.message, self.message.bms_state
+        battery.soc = round(reading.soc_percent)
+        battery.current = -round(1000 * reading.current_a)  # mA
+        battery.cell_vol = [round(1000 * reading.voltage_v / CELLS)] * CELLS + [0] * 7  # mV
+        message.power_v, message.power_a = reading.voltage_v, reading.current_a
 
     def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
         """The message for this instant, checksum included."""
@@ -176,13 +211,24 @@ class _Periodic:
 
 
 class StatePublishers:
-    """Publishes what is due at each physics step; low states are computed for a reader only."""
+    """Publishes what is due at each physics step; all but the sport state is computed for a reader only."""
 
-    def __init__(self, bus: Bus, odometry: OdometryFrame, steps_per_s: int) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        odometry: OdometryFrame,
+        steps_per_s: int,
+        *,
+        remote: Remote | None = None,
+        faults: StateFaults | None = None,
+    ) -> None:
         def periodic(topic: str, kind: Any, rate_hz: int, *, always: bool = False) -> _Periodic:
             return _Periodic(bus.writer(topic, kind), max(steps_per_s // rate_hz, 1), steps_per_s, always=always)
 
         self._odometry = odometry
+        self._remote = remote or Remote()
+        self._faults = faults
+        self._battery, self._loaded_s = Battery(), 0.0
         self._low_message = LowStateMessage()
         self._sport = (
             periodic(ids.SPORT_STATE_TOPIC, SportModeState_, SPORT_STATE_HZ, always=True),  # its rate is reported
@@ -192,23 +238,54 @@ class StatePublishers:
             periodic(ids.LOW_STATE_TOPIC, LowState_, LOW_STATE_HZ),
             periodic("rt/lf/lowstate", LowState_, LF_HZ),
         )
+        self._wireless = periodic(ids.REMOTE_TOPIC, WirelessController_, WIRELESS_HZ)
 
     def due(self, step: int) -> list[_Periodic]:
         """Which topics want a sample after this physics step; hand the list to `publish`."""
-        return [topic for topic in (*self._sport, *self._low) if topic.due(step)]
+        return [topic for topic in (*self._sport, *self._low, self._wireless) if topic.due(step)]
 
-    def publish(self, due: list[_Periodic], truth: RobotTruth) -> None:
-        """Write one instant to the topics that are due."""
+    def publish(self, due: list[_Periodic], truth: RobotTruth, stamp_s: float) -> None:
+        """Write one instant to the topics that are due; `stamp_s` is the robot's own clock."""
+        truth = replace(truth, time_s=stamp_s)
         sport = [topic for topic in due if topic in self._sport]
         if sport:
-            state = sport_mode_state(truth, self._odometry)
-            for topic in sport:
-                topic.write(state)
+            self._odometry.update(truth)
+            self._empty_battery(truth)
+            self._write_sport(sport, sport_mode_state(truth, self._odometry))
         low = [topic for topic in due if topic in self._low]
         if low:
-            message = self._low_message.fill(truth, self._odometry)
-            for topic in low:
-                topic.write(message)
+            self._write_low(low, truth)
+        if self._wireless in due:
+            remote = self._remote
+            self._wireless.write(WirelessController_(remote.lx, remote.ly, remote.rx, remote.ry, remote.keys))
+
+    def overdue(self) -> None:
+        """Write what faults have held back until now."""
+        if self._faults is not None:
+            for late in self._faults.due(time.monotonic_ns()):
+                self._sport[0].write(late)
+
+    def _write_sport(self, topics: list[_Periodic], state: SportModeState_) -> None:
+        for topic in topics:
+            if self._faults is None:
+                topic.write(state)
+            elif topic is self._sport[0]:
+                for message in self._faults.deliver(state, time.monotonic_ns()):
+                    topic.write(message)
+
+    def _write_low(self, topics: list[_Periodic], truth: RobotTruth) -> None:
+        self._low_message.message.wireless_remote = self._remote.as_bytes()
+        message = self._low_message.fill(truth, self._odometry)
+        if self._faults is not None:
+            if not self._faults.alter_low(message):
+                return
+            message.crc = low_state_crc(message)
+        for topic in topics:
+            topic.write(message)
+
+    def _empty_battery(self, truth: RobotTruth) -> None:
+        elapsed_s, self._loaded_s = truth.time_s - self._loaded_s, truth.time_s
+        self._low_message.charge(self._battery.step(load_w(truth.joint_tau_nm, truth.joint_dq_radps), elapsed_s))
 
     @property
     def sport_states_sent(self) -> int:

@@ -27,11 +27,13 @@ from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus
 from sim_hil.camera import CameraWorld
 from sim_hil.scene import load_scene
+from sim_hil.sensor_noise import SensorNoise
 from sim_hil.unitree.service import Received, ServiceServer
 from sim_hil.unitree.snapshot import SnapshotReader, TornSnapshotError
 
 JPEG_QUALITY: Final = 85
 _PARENT_CHECK_NS: Final = 50_000_000
+_FAULTS_CHECK_NS: Final = 5_000_000  # a fault takes effect, and a held answer leaves, within this
 ERROR_NO_IMAGE: Final = 100  # the video service's own error code
 
 
@@ -79,6 +81,10 @@ class VideoHub:
         if self._server.malformed != self._malformed:
             self._tell({"event": "malformed", "count": self._server.malformed - self._malformed})
             self._malformed = self._server.malformed
+        self._answer(waiting)
+
+    def _answer(self, waiting: list[Received]) -> None:
+        """One picture for all of `waiting`."""
         if not waiting:
             return
         try:
@@ -91,8 +97,11 @@ class VideoHub:
             if jpeg is None:
                 self._server.reply(request, ERROR_NO_IMAGE)
             else:
-                self._server.reply(request, ids.OK, "", jpeg)
-                self._tell({"event": "frame", "t_ns": time.monotonic_ns()})
+                self._send(request, jpeg)
+
+    def _send(self, request: Received, jpeg: bytes) -> None:
+        self._server.reply(request, ids.OK, "", jpeg)
+        self._tell({"event": "frame", "t_ns": time.monotonic_ns()})
 
 
 def _event_pipe() -> TextIO:
@@ -114,6 +123,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--interface", required=True)
     parser.add_argument("--peer", action="append", default=[])
     parser.add_argument("--pose-fd", type=int, required=True)
+    parser.add_argument("--faults", action="store_true")
     args = parser.parse_args(argv)
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -127,21 +137,33 @@ def main(argv: list[str] | None = None) -> int:
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
 
+    noise = SensorNoise(args.width, args.height, args.seed)
+
     def render() -> bytes | None:
         state = poses.read()
-        return None if state is None else encode_jpeg(world.render(state, args.width, args.height))
+        return None if state is None else encode_jpeg(noise.add(world.render(state, args.width, args.height)))
 
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     server = ServiceServer(bus, ids.VIDEO_SERVICE)
     waitset = bus.waitset(server.reader)
-    hub = VideoHub(server, render, tell)
+    hub, alive, check_ns = VideoHub(server, render, tell), _parent_lives, _PARENT_CHECK_NS
+    if args.faults:
+        from sim_hil.faults.camera import FaultyVideoHub  # not loaded where no fault may be injected
+
+        size, check_ns = (args.width, args.height), _FAULTS_CHECK_NS
+        hub = faulty = FaultyVideoHub(server, render, tell, size=size, commands_fd=sys.stdin.fileno())
+        alive = faulty.listen
     # BrokenPipeError: the parent died between two looks at stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
         tell({"event": "ready"})
-        while not select.select([sys.stdin], [], [], 0)[0]:
-            waitset.wait(_PARENT_CHECK_NS)
+        while alive():
+            waitset.wait(check_ns)
             hub.serve()
     return 0
+
+
+def _parent_lives() -> bool:
+    return not select.select([sys.stdin], [], [], 0)[0]
 
 
 if __name__ == "__main__":

@@ -1,0 +1,142 @@
+"""A camera that fails: the video service's answers held back, repeated, old, or not the picture they should be."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.faults.commands import CLEAR, FaultCommand, FaultCommandError, parse
+from sim_hil.unitree.service import Received, ServiceServer
+from sim_hil.unitree.videohub import VideoHub, encode_jpeg
+
+_HISTORY_NS: Final = 5_000_000_000
+_NOISE_LEVELS: Final = 4  # grey levels of noise in a covered or blinded picture: its pixels differ every time
+_READ_BYTES: Final = 4096
+
+
+class FaultyVideoHub(VideoHub):
+    """The video service with faults switched by lines on a descriptor, whose end of file ends the process."""
+
+    def __init__(
+        self,
+        server: ServiceServer,
+        render: Callable[[], bytes | None],
+        tell: Callable[[dict[str, object]], None],
+        *,
+        size: tuple[int, int],
+        commands_fd: int,
+    ) -> None:
+        """`size`: (width, height) of a picture, pixels."""
+        super().__init__(server, render, tell)
+        self._size = size
+        self._fd = commands_fd
+        os.set_blocking(commands_fd, False)
+        self._partial = b""
+        self._on: dict[str, FaultCommand] = {}
+        self._untold: set[str] = set()
+        self._held: list[Received] = []
+        self._due: deque[tuple[int, Received, bytes]] = deque()
+        self._history: deque[tuple[int, bytes]] = deque()
+        self._frozen: bytes | None = None
+        self._capture_ns = 0
+        self._rng = np.random.default_rng(0)
+
+    def listen(self) -> bool:
+        """Take the commands that have come; False when whoever sent them has gone."""
+        try:
+            data = os.read(self._fd, _READ_BYTES)
+        except BlockingIOError:
+            return True
+        if not data:
+            return False
+        *lines, self._partial = (self._partial + data).split(b"\n")
+        for line in lines:
+            try:
+                self._switch(parse(line))
+            except FaultCommandError as error:  # our own parent has checked it
+                raise RuntimeError(f"camera faults: {error}") from error
+        return True
+
+    def _switch(self, command: FaultCommand) -> None:
+        if command.fault == CLEAR:
+            self._on.clear()
+            self._untold.clear()
+            self._frozen = None
+        elif command.on:
+            self._on[command.fault] = command
+            self._untold.add(command.fault)
+            self._frozen = None
+            if command.fault == "camera-stop":  # what it does is nothing, from now on
+                self._took_effect()
+        else:
+            self._on.pop(command.fault, None)
+            self._untold.discard(command.fault)
+            self._tell({"event": "fault", "fault": command.fault, "t_ns": time.monotonic_ns()})
+
+    def _took_effect(self) -> None:
+        for name in sorted(self._untold):
+            self._tell({"event": "fault", "fault": name, "t_ns": time.monotonic_ns()})
+        self._untold.clear()
+
+    def _answer(self, waiting: list[Received]) -> None:
+        now_ns = time.monotonic_ns()
+        waiting = self._held + waiting
+        self._held = []
+        if "camera-stop" in self._on:
+            waiting = []
+        rate = self._on.get("camera-half-rate")
+        if rate is not None and waiting:
+            period_ns = round(1e9 / rate.number("rate_hz"))
+            if now_ns - self._capture_ns < period_ns:
+                self._took_effect()
+                self._held, waiting = waiting, []
+            else:
+                self._capture_ns = now_ns
+        super()._answer(waiting)
+        while self._due and (self._due[0][0] <= now_ns or "camera-slow" not in self._on):
+            _, request, jpeg = self._due.popleft()
+            super()._send(request, jpeg)
+
+    def _send(self, request: Received, jpeg: bytes) -> None:
+        now_ns = time.monotonic_ns()
+        self._history.append((now_ns, jpeg))
+        while now_ns - self._history[0][0] > _HISTORY_NS:
+            self._history.popleft()
+        jpeg = self._spoiled(jpeg, now_ns)
+        slow = self._on.get("camera-slow")
+        self._took_effect()
+        if slow is not None:
+            self._due.append((now_ns + round(slow.number("delay_s") * 1e9), request, jpeg))
+        else:
+            super()._send(request, jpeg)
+
+    def _spoiled(self, jpeg: bytes, now_ns: int) -> bytes:
+        on, (width, height) = self._on, self._size
+        if "camera-freeze" in on:
+            self._frozen = self._frozen or jpeg
+            jpeg = self._frozen
+        if "camera-stale" in on:
+            then_ns = now_ns - round(on["camera-stale"].number("delay_s") * 1e9)
+            jpeg = next((old for t_ns, old in reversed(self._history) if t_ns <= then_ns), self._history[0][1])
+        if "camera-black" in on:
+            jpeg = encode_jpeg(self._noise(width, height, 0))
+        if "camera-saturated" in on:
+            jpeg = encode_jpeg(self._noise(width, height, 256 - _NOISE_LEVELS))
+        if "camera-wrong-size" in on:
+            wrong = on["camera-wrong-size"]
+            picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+            size = (round(wrong.number("width")), round(wrong.number("height")))
+            jpeg = encode_jpeg(cv2.cvtColor(cv2.resize(picture, size), cv2.COLOR_BGR2RGB).astype(np.uint8))
+        if "camera-torn" in on:
+            jpeg = jpeg[: round(len(jpeg) * on["camera-torn"].number("share"))]
+        return jpeg
+
+    def _noise(self, width: int, height: int, floor: int) -> NDArray[np.uint8]:
+        return self._rng.integers(floor, floor + _NOISE_LEVELS, (height, width, 3), dtype=np.uint8, endpoint=False)

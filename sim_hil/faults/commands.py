@@ -1,0 +1,150 @@
+"""The faults that `edge-hil --faults` can inject, by name with their parameters, and the lines that ask for them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+L2_B: Final = 0x220  # bits of WirelessController_.keys: R1 L1 start select R2 L2 F1 F2 A B X Y up right down left
+CLEAR: Final = "clear"
+MAX_LINE_BYTES: Final = 2000
+
+Value = float | str
+Range = tuple[float, float]
+
+
+class FaultCommandError(ValueError):
+    """A line that asks for nothing we can inject; one line that says why."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One fault: which part of the robot's side makes it, what it is, and its parameters as (default, range).
+
+    A text parameter has the texts it may be instead of a range. `once`: switching it off changes nothing more.
+    """
+
+    where: str
+    says: str
+    numbers: Mapping[str, tuple[float, Range]] = field(default_factory=dict)
+    texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # the first is the default
+    once: bool = False
+
+
+def _kinds() -> dict[str, FaultKind]:
+    seconds = (0.0, 60.0)
+    return {
+        "camera-stop": FaultKind("camera", "requests for a picture are never answered"),
+        "camera-freeze": FaultKind("camera", "every answer is the first picture since then"),
+        "camera-stale": FaultKind("camera", "every answer is the picture of delay_s ago", {"delay_s": (1.0, seconds)}),
+        "camera-slow": FaultKind("camera", "every answer comes delay_s late", {"delay_s": (1.0, seconds)}),
+        "camera-half-rate": FaultKind(
+            "camera", "pictures come at rate_hz, whoever asks", {"rate_hz": (5.0, (0.1, 60))}
+        ),
+        "camera-black": FaultKind("camera", "the lens is covered: sensor noise only"),
+        "camera-saturated": FaultKind("camera", "the lens looks into a lamp: white with noise"),
+        "camera-torn": FaultKind(
+            "camera", "every JPEG ends after a share of its bytes", {"share": (0.5, (0.01, 0.99))}
+        ),
+        "camera-wrong-size": FaultKind(
+            "camera", "pictures of another size", {"width": (160.0, (16, 4096)), "height": (160.0, (16, 4096))}
+        ),
+        "odometry-jump": FaultKind(
+            "state",
+            "the pose moves by a step and stays there",
+            {"dx_m": (1.0, (-100, 100)), "dy_m": (0.0, (-100, 100)), "dtheta_rad": (0.0, (-3.2, 3.2))},
+            once=True,
+        ),
+        "odometry-freeze": FaultKind(
+            "state", "pose and velocity stay what they are", {}, {"stamp": ("runs", "frozen")}
+        ),
+        "odometry-nan": FaultKind(
+            "state", "a field is not a number, or the quaternion zero", {}, {"field": ("position", "velocity", "rpy")}
+        ),
+        "odometry-lag": FaultKind("state", "the sport state comes delay_s late", {"delay_s": (0.3, seconds)}),
+        "odometry-bias": FaultKind("state", "the velocity reads dv_mps too high", {"dv_mps": (1.0, (-10, 10))}),
+        "state-silent": FaultKind("state", "no state is sent on any topic"),
+        "state-loss": FaultKind("state", "a share of the states is lost", {"percent": (50.0, (0, 100))}),
+        "state-reorder": FaultKind("state", "neighbouring sport states change places"),
+        "state-duplicate": FaultKind("state", "every sport state is sent twice"),
+        "tip-over": FaultKind(
+            "state", "the attitude reads as tilted", {"roll_rad": (0.0, (-3.2, 3.2)), "pitch_rad": (0.7, (-1.6, 1.6))}
+        ),
+        "low-battery": FaultKind("state", "the battery reads nearly empty", {"soc_percent": (5.0, (0, 100))}),
+        "error-code": FaultKind("state", "the robot reports an error", {"code": (1001.0, (0, 2**32 - 1))}),
+        "remote-keys": FaultKind("remote", "keys are held down on the remote", {"keys": (float(L2_B), (0, 65535))}),
+        "remote-stick": FaultKind("remote", "a stick is pushed on the remote", {"ly": (0.6, (-1, 1))}),
+        "stop-unanswered": FaultKind(
+            "sport", "a StopMove is obeyed, answered delay_s later", {"delay_s": (10.0, seconds)}
+        ),
+        "late-move": FaultKind(
+            "sport", "one Move is held until delay_s after the next StopMove", {"delay_s": (0.2, seconds)}, once=True
+        ),
+        "deaf": FaultKind("sport", "requests of the sport service are lost"),
+    }
+
+
+KINDS: Final[Mapping[str, FaultKind]] = MappingProxyType(_kinds())
+
+
+@dataclass(frozen=True)
+class FaultCommand:
+    """One line: switch a fault on or off, every parameter filled in. `CLEAR` switches everything off."""
+
+    fault: str
+    on: bool
+    values: Mapping[str, Value]
+
+    def number(self, name: str) -> float:
+        """A parameter that is a number."""
+        return float(self.values[name])
+
+    def text(self, name: str) -> str:
+        """A parameter that is a text."""
+        return str(self.values[name])
+
+    def line(self) -> bytes:
+        """The line that `parse` makes this of."""
+        return json.dumps({"fault": self.fault, "on": self.on, **self.values}).encode()
+
+
+def parse(line: bytes) -> FaultCommand:
+    """The command of a line such as {"fault": "odometry-lag", "on": true, "delay_s": 0.3}. Raises FaultCommandError."""
+    if len(line) > MAX_LINE_BYTES:
+        raise FaultCommandError(f"expected at most {MAX_LINE_BYTES} bytes, found {len(line)}")
+    try:
+        table = json.loads(line)
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict):
+        raise FaultCommandError(f"expected a JSON object, found {line[:60]!r}")
+    name, on = table.pop("fault", None), table.pop("on", True)
+    if name == CLEAR and not table:
+        return FaultCommand(CLEAR, False, {})
+    if name not in KINDS or not isinstance(on, bool):
+        raise FaultCommandError(f"expected on or off of one of {', '.join(KINDS)}, found fault {name!r}, on {on!r}")
+    return FaultCommand(name, on, _values(name, KINDS[name], table))
+
+
+def _values(name: str, kind: FaultKind, table: dict[str, object]) -> dict[str, Value]:
+    for key in table:
+        if key not in kind.numbers and key not in kind.texts:
+            known = ", ".join((*kind.numbers, *kind.texts)) or "no parameter"
+            raise FaultCommandError(f"{name}: expected {known}, found {key!r}")
+    values: dict[str, Value] = {}
+    for key, (default, (low, high)) in kind.numbers.items():
+        value = table.get(key, default)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or not low <= value <= high:  # type: ignore[operator]
+            raise FaultCommandError(f"{name}.{key}: expected {low:g} to {high:g}, found {value!r}")
+        values[key] = float(value)  # type: ignore[arg-type]
+    for key, choices in kind.texts.items():
+        text = table.get(key, choices[0])
+        if text not in choices:
+            raise FaultCommandError(f"{name}.{key}: expected one of {', '.join(choices)}, found {text!r}")
+        values[key] = str(text)
+    return values
