@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge import engines
+from edge import engines, install_units
 from edge.artifact_files import ArtifactError
 from edge.cli import (
     EXIT_BAD_INPUT,
@@ -19,12 +19,19 @@ from edge.cli import (
     write_result,
 )
 from edge.manifest import load_artifacts
+from edge.prompt import InstructionError
+from edge.unit_text import UnitError
+from firmware_bridge.config import ConfigError
 
 EXAMPLES = """examples:
   edge-install engines --artifacts out/orin
   edge-install engines --artifacts out/orin --engines /var/lib/tic-vla/engines --json -
+  edge-install units --artifacts out/orin --robot go2.toml --instruction "walk to the vending machine" --out units
+  sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
+       --instruction-file /etc/tic-vla/instruction.txt --system
 
-exit codes: 0 done, 2 bad arguments or input, 3 refused (artifacts, device), 130 interrupted
+exit codes: 0 done, 1 systemd finds fault with the units, 2 bad arguments or input, 3 refused (artifacts, device),
+            130 interrupted
 """
 
 
@@ -42,6 +49,8 @@ def parser() -> argparse.ArgumentParser:
         "--engines", type=Path, metavar="DIR", help="where to keep them (default: DIR.engines beside it)"
     )
     build.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    service = commands.add_parser("units", help="write the systemd units of bridge and runner, and check them")
+    install_units.add_arguments(service)
     return p
 
 
@@ -50,32 +59,40 @@ def _say(line: str) -> None:
     sys.stderr.flush()
 
 
-def main(argv: Sequence[str] | None = None, machine: engines.Machine | None = None) -> int:
+def main(
+    argv: Sequence[str] | None = None, machine: engines.Machine | None = None, host: install_units.Host | None = None
+) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    started_ns = time.monotonic_ns()
     try:
         check_result_target(args.json)
-        directory = args.artifacts.absolute()
-        where = args.engines.absolute() if args.engines is not None else engines.default_directory(directory)
-        if where == directory or directory in where.parents:
-            _say(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
-            return EXIT_BAD_INPUT
-        artifacts = load_artifacts(directory)
-        graphs = engines.build(artifacts, where, _say, machine)
-        if not graphs:
-            _say(f"{artifacts.target}: no graph needs an engine")
-        wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
-        write_result(args.json, {"engines": str(where), "graphs": graphs, "wall_s": wall_s})
+        if args.command == "units":
+            return install_units.run(args, _say, host)
+        return _build_engines(args, machine)
     except (ArtifactError, engines.EngineError) as error:
         _say(str(error))
         return EXIT_REFUSED
-    except OSError as error:
+    except (OSError, ConfigError, InstructionError, UnitError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted; what was built is kept, run it again to go on")
+        _say("interrupted; what was finished is kept, run it again to go on")
         return EXIT_INTERRUPTED
+
+
+def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) -> int:
+    started_ns = time.monotonic_ns()
+    directory = args.artifacts.absolute()
+    where = args.engines.absolute() if args.engines is not None else engines.default_directory(directory)
+    if where == directory or directory in where.parents:
+        _say(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
+        return EXIT_BAD_INPUT
+    artifacts = load_artifacts(directory)
+    graphs = engines.build(artifacts, where, _say, machine)
+    if not graphs:
+        _say(f"{artifacts.target}: no graph needs an engine")
+    wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
+    write_result(args.json, {"engines": str(where), "graphs": graphs, "wall_s": wall_s})
     return EXIT_DONE
 
 

@@ -1,0 +1,272 @@
+"""`edge-install units`: gathers what the units depend on, writes them, asks systemd about them; starts nothing."""
+
+from __future__ import annotations
+
+import argparse
+import pwd
+import socket
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+
+from edge import engines, units
+from edge.artifact_files import ArtifactError, read_manifest
+from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
+from edge.device_nodes import device_nodes
+from edge.manifest import Artifacts, load_artifacts
+from edge.prompt import check_instruction
+from edge.target_facts import TargetFacts, target_facts
+from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
+from edge.unit_text import UnitError
+from firmware_bridge.config import DdsConfig, load_robot_config
+
+SYSTEM_UNITS: Final = Path("etc/systemd/system")
+SYSTEM_USERS: Final = Path("etc/sysusers.d")
+_MAX_INSTRUCTION_BYTES: Final = 16_384
+
+Addresses = Mapping[str, Sequence[tuple[str, str]]]
+"""Network interfaces: IPv4 addresses with their netmasks."""
+
+
+def interface_addresses() -> Addresses:
+    """This machine's interfaces."""
+    return {
+        name: [(entry.address, entry.netmask) for entry in entries if entry.family == socket.AF_INET and entry.netmask]
+        for name, entries in psutil.net_if_addrs().items()
+    }
+
+
+def user_exists(name: str) -> bool:
+    """Whether this machine has a user of that name."""
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class Host:
+    """The machine as this module meets it; tests give others."""
+
+    root: Path = Path("/")
+    addresses: Callable[[], Addresses] = interface_addresses
+    user_exists: Callable[[str], bool] = user_exists
+    check: Callable[[Sequence[Path]], UnitVerdict] = check_units
+    programs: Path = field(default_factory=lambda: Path(sys.executable).parent)
+    prefixes: tuple[Path, ...] = field(
+        default_factory=lambda: (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[1])
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Command line of `edge-install units`."""
+    parser.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
+    parser.add_argument("--robot", type=Path, required=True, metavar="FILE.toml", help="the robot and its limits")
+    text = parser.add_mutually_exclusive_group(required=True)
+    text.add_argument("--instruction", metavar="TEXT", help="what the robot is to do, in plain words")
+    text.add_argument("--instruction-file", type=Path, metavar="FILE", help="the same, read from a file now")
+    place = parser.add_mutually_exclusive_group(required=True)
+    place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be looked at or copied")
+    place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
+    parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
+    parser.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
+    parser.add_argument(
+        "--user", default=units.DEFAULT_USER, metavar="NAME", help=f"who runs both (default: {units.DEFAULT_USER})"
+    )
+    parser.add_argument(
+        "--network",
+        action="append",
+        default=[],
+        metavar="CIDR",
+        help="the robot's network, may be repeated (default: that of the robot file's interface, and its peers)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+
+
+def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None = None) -> int:
+    """Write the units and check them; the exit code.
+
+    Raises UnitError, ConfigError, InstructionError or OSError for bad input, ArtifactError for artifacts to be refused.
+    """
+    host = host or Host()
+    inputs = gather(args, host)
+    if set(inputs.providers) & set(units.NEED_DEVICES) and not inputs.devices:
+        lacking = "no device of " + " or ".join(inputs.providers) + " is on this machine"
+        if args.system:
+            raise ArtifactError(f"{lacking}: the runner could not start; install on the device that it is made for")
+        say(f"{lacking}: run this on the device itself before you use the runner's unit")
+    contents = _contents(args, inputs, host)
+    written = _write(contents, force=args.force)
+    for path in contents:
+        say(f"{path}: {'written' if path in written else 'is up to date'}")
+    verdict = host.check([path for path in contents if path.suffix == ".service"])
+    _report(verdict, say)
+    commands = _commands(contents, system=args.system)
+    say("nothing was enabled or started. To do so:")
+    for command in commands:
+        say(f"  {command}")
+    result: dict[str, Any] = {
+        "files": [str(path) for path in contents],
+        "written": [str(path) for path in written],
+        "verify": list(verdict.complaints),
+        "verify_other_units": list(verdict.others),
+        "exposure": verdict.exposure,
+        "max_exposure": MAX_EXPOSURE,
+        "not_checked": list(verdict.not_checked),
+        "commands": commands,
+    }
+    write_result(args.json, result)
+    return EXIT_DONE if verdict.good else EXIT_CHECK_FAILED
+
+
+def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
+    """Everything that the units say, from the arguments, the artifacts, the robot file and the machine."""
+    robot = load_robot_config(args.robot, socket=units.SOCKET)
+    artifacts = load_artifacts(args.artifacts.resolve())
+    facts = target_facts(read_manifest(artifacts.directory))
+    if facts is None:
+        raise ArtifactError(f"{artifacts.directory}: its manifest has no target; export again")
+    if args.target is not None and args.target != artifacts.target:
+        raise ArtifactError(
+            f"{artifacts.directory}: made for {artifacts.target}, expected {args.target}; export for {args.target}"
+        )
+    for program in ("edge-bridge", "edge-run"):
+        if not (host.programs / program).exists():
+            raise UnitError(f"{host.programs / program}: missing; install the package there: pip install tic-vla-edge")
+    providers = tuple(sorted({graph.session.provider for graph in artifacts.graphs.values()}))
+    nodes = device_nodes(providers, host.root)
+    folder = None
+    if engines.needed(artifacts):
+        folder = (args.engines or engines.default_directory(artifacts.directory)).resolve()
+    return units.ServiceInputs(
+        programs=host.programs,
+        prefixes=host.prefixes,
+        robot=args.robot.resolve(),
+        artifacts=artifacts.directory,
+        engines=folder,
+        instruction=check_instruction(_instruction(args)),
+        user=args.user,
+        networks=robot_networks(robot.dds, args.network, host.addresses),
+        over_loopback=robot.dds.interface == "lo",
+        providers=providers,
+        devices=tuple(node.path for node in nodes),
+        groups=tuple(sorted({node.group for node in nodes if node.group is not None})),
+        memory_bytes=facts.available_bytes,
+        control_priority=artifacts.runtime.control_priority,
+        bridge_cores=_bridge_cores(artifacts, facts),
+    )
+
+
+def _instruction(args: argparse.Namespace) -> str:
+    if args.instruction_file is None:
+        return str(args.instruction)
+    data = args.instruction_file.read_bytes()[: _MAX_INSTRUCTION_BYTES + 1]
+    try:
+        return str(data.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise UnitError(f"--instruction-file {args.instruction_file}: not UTF-8 text") from None
+
+
+def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
+    """Cores that the target gives to neither thread of the runner; none if it gives no cores at all."""
+    taken = {*artifacts.runtime.control_cores, *artifacts.runtime.reasoning_cores}
+    return tuple(sorted(set(range(facts.cores)) - taken)) if taken else ()
+
+
+def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
+    """Where the robot may be: the networks given, else that of the robot file's interface and its peers.
+
+    Raises UnitError when the file alone does not tell.
+    """
+    networks: set[IPv4Network] = set()
+    for text in given:
+        try:
+            networks.add(IPv4Network(text))
+        except (AddressValueError, NetmaskValueError, ValueError) as error:
+            raise UnitError(f"--network {text}: {error}; expected for example 192.168.123.0/24") from None
+    if networks:
+        return tuple(sorted(networks))
+    own = addresses().get(dds.interface, ())
+    if not own:
+        raise UnitError(
+            f"the robot file's interface {dds.interface!r} has no IPv4 address here, so the robot's network is not "
+            f"known: bring it up or give --network, e.g. 192.168.123.0/24"
+        )
+    networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
+    for peer in dds.peers:
+        try:
+            address = IPv4Address(peer)
+        except AddressValueError:
+            raise UnitError(
+                f"dds.peers: {peer!r} is no IPv4 address; give the robot's network with --network"
+            ) from None
+        if not any(address in network for network in networks):
+            networks.add(IPv4Network(address))
+    return tuple(sorted(networks))
+
+
+def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host) -> dict[Path, str]:
+    """Text of every file by its path."""
+    folder = host.root / SYSTEM_UNITS if args.system else args.out.absolute()
+    contents = {
+        folder / units.BRIDGE_UNIT: units.bridge_unit(inputs),
+        folder / units.RUNNER_UNIT: units.runner_unit(inputs),
+    }
+    if not host.user_exists(inputs.user):
+        users = host.root / SYSTEM_USERS if args.system else folder
+        contents[users / units.SYSUSERS_FILE] = units.sysusers(inputs.user)
+    return contents
+
+
+def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
+    """Write what differs, each file in one rename; refuses before the first if one is in the way."""
+    wanted: dict[Path, str] = {}
+    for path, text in contents.items():
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise UnitError(f"{path}: is no plain file; remove it first")
+        if path.exists() and path.read_text(encoding="utf-8", errors="replace") == text:
+            continue
+        if path.exists() and not force:
+            raise UnitError(f"{path}: exists and differs; replace it with --force")
+        wanted[path] = text
+    for path, text in wanted.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text)
+        # systemd complains about units that anybody may write, and needs to read them as nobody in particular.
+        path.chmod(0o644)
+    return list(wanted)
+
+
+def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
+    for line in verdict.complaints:
+        say(f"verify: {line}")
+    for line in verdict.others:
+        say(f"verify, about other units of this machine: {line}")
+    for name, score in verdict.exposure.items():
+        judged = "at most" if score <= MAX_EXPOSURE else "above"
+        say(f"{name}: exposure {score}, {judged} {MAX_EXPOSURE}")
+    for line in verdict.not_checked:
+        say(f"skipped: {line}")
+
+
+def _commands(contents: Mapping[Path, str], *, system: bool) -> list[str]:
+    """Commands that make the services run, for the operator to give."""
+    prepare = [] if system else [f"sudo cp {path} {_home_of(path)}" for path in contents]
+    prepare += ["sudo systemd-sysusers"] if any(path.suffix == ".conf" for path in contents) else []
+    return [
+        *prepare,
+        "sudo systemctl daemon-reload",
+        f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
+        f"sudo systemctl enable --now {units.RUNNER_UNIT}",
+    ]
+
+
+def _home_of(path: Path) -> str:
+    return f"/{SYSTEM_USERS if path.suffix == '.conf' else SYSTEM_UNITS}/"

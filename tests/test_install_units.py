@@ -1,0 +1,246 @@
+"""`edge-install units`: what it gathers, what it writes, what it refuses to overwrite; it starts nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.artifact_files import seal
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
+from edge.device_nodes import device_nodes
+from edge.install import main
+from edge.install_units import Host, robot_networks
+from edge.unit_check import UnitVerdict
+from edge.unit_text import UnitError
+from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE
+from export.target import load_target
+from firmware_bridge.config import DdsConfig
+from tests.processes import REPOSITORY
+
+GO2 = REPOSITORY / "firmware_bridge" / "robots" / "go2.toml"
+ADDRESSES = {"lo": [("127.0.0.1", "255.0.0.0")], "eth0": [("192.168.123.99", "255.255.255.0")]}
+GOOD = UnitVerdict((), (), {BRIDGE_UNIT: 1.3, RUNNER_UNIT: 1.4}, ())
+
+
+@pytest.fixture
+def host(tmp_path: Path) -> Host:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name in ("edge-bridge", "edge-run"):
+        (programs / name).write_text("#!/bin/sh\n")
+        (programs / name).chmod(0o755)
+    return Host(
+        root=tmp_path / "root",
+        addresses=lambda: ADDRESSES,
+        user_exists=lambda _name: False,
+        check=lambda _paths: GOOD,
+        programs=programs,
+        prefixes=(Path("/usr"),),
+    )
+
+
+Units = Callable[..., tuple[int, dict[str, Any] | None]]
+
+
+@pytest.fixture
+def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
+    """Runs the command; its exit code and its result."""
+
+    def run(*more: str, on: Host = host, artifacts: Path = artifacts_dir, text: str = "walk") -> Any:
+        result = tmp_path / "result.json"
+        result.unlink(missing_ok=True)
+        place = [] if "--system" in more else ["--out", str(tmp_path / "units")]
+        words = ["--artifacts", str(artifacts), "--robot", str(GO2), "--json", str(result), *place, *more]
+        if "--instruction-file" not in more:
+            words += ["--instruction", text]
+        code = main(["units", *words], host=on)
+        return code, json.loads(result.read_text()) if result.exists() else None
+
+    return run
+
+
+def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Units, tmp_path: Path) -> None:
+    code, result = units()
+    assert code == EXIT_DONE
+    assert {path.name for path in (tmp_path / "units").iterdir()} == {BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE}
+    assert result is not None
+    assert result["exposure"] == GOOD.exposure
+    assert result["commands"][-2:] == [
+        f"sudo systemctl enable --now {BRIDGE_UNIT}",
+        f"sudo systemctl enable --now {RUNNER_UNIT}",
+    ]
+
+
+def test_a_user_that_exists_is_not_made_again(units: Units, host: Host, tmp_path: Path) -> None:
+    units(on=replace(host, user_exists=lambda _name: True))
+    assert {path.name for path in (tmp_path / "units").iterdir()} == {BRIDGE_UNIT, RUNNER_UNIT}
+
+
+def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Host) -> None:
+    code, _ = units("--system")
+    assert code == EXIT_DONE
+    assert (host.root / "etc/systemd/system" / RUNNER_UNIT).stat().st_mode & 0o777 == 0o644
+    assert (host.root / "etc/sysusers.d" / SYSUSERS_FILE).is_file()
+
+
+def test_the_runners_memory_is_what_the_target_leaves_it(units: Units, tmp_path: Path) -> None:
+    units()
+    device = load_target("cpu", "nano").device
+    available = round((device.memory_gib - device.reserved_gib) * (1 << 30))
+    assert f"\nMemoryMax={available}\n" in (tmp_path / "units" / RUNNER_UNIT).read_text()
+
+
+def test_the_instruction_can_come_from_a_file(units: Units, tmp_path: Path) -> None:
+    (tmp_path / "instruction.txt").write_text("walk to\nthe door\n")
+    units("--instruction-file", str(tmp_path / "instruction.txt"))
+    assert '"--instruction=walk to the door"' in (tmp_path / "units" / RUNNER_UNIT).read_text()
+
+
+def test_a_second_run_writes_nothing(units: Units) -> None:
+    units()
+    code, result = units()
+    assert (code, result and result["written"]) == (EXIT_DONE, [])
+
+
+def test_a_file_that_differs_is_replaced_only_by_force(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units()
+    before = (tmp_path / "units" / RUNNER_UNIT).read_text()
+    (tmp_path / "units" / BRIDGE_UNIT).unlink()
+    code, _ = units(text="stop")
+    assert code == EXIT_BAD_INPUT
+    assert "--force" in capsys.readouterr().err
+    assert (tmp_path / "units" / RUNNER_UNIT).read_text() == before
+    assert not (tmp_path / "units" / BRIDGE_UNIT).exists(), "nothing is written when one file is in the way"
+    assert units("--force", text="stop")[0] == EXIT_DONE
+    assert (tmp_path / "units" / RUNNER_UNIT).read_text() != before
+
+
+def test_a_link_is_never_written_through(units: Units, tmp_path: Path) -> None:
+    (tmp_path / "units").mkdir()
+    (tmp_path / "units" / BRIDGE_UNIT).symlink_to(tmp_path / "elsewhere")
+    assert units("--force")[0] == EXIT_BAD_INPUT
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize(
+    "verdict",
+    [replace(GOOD, complaints=("unknown key",)), replace(GOOD, exposure={BRIDGE_UNIT: 3.1})],
+    ids=["complaint", "exposed"],
+)
+def test_what_systemd_finds_fault_with_is_a_failed_check(units: Units, host: Host, verdict: UnitVerdict) -> None:
+    code, result = units(on=replace(host, check=lambda _paths: verdict))
+    assert code == EXIT_CHECK_FAILED
+    assert result is not None
+
+
+def test_artifacts_of_another_target_are_refused(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
+    assert units("--target", "orin")[0] == EXIT_REFUSED
+    assert "expected orin" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "x" * 401, "a \u202e b"])
+def test_an_instruction_that_cannot_be_given_is_bad_input(units: Units, text: str) -> None:
+    assert units(text=text)[0] == EXIT_BAD_INPUT
+
+
+def test_a_program_that_is_not_installed_is_named(
+    units: Units, host: Host, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert units(on=replace(host, programs=tmp_path))[0] == EXIT_BAD_INPUT
+    assert "edge-bridge: missing" in capsys.readouterr().err
+
+
+@pytest.fixture
+def orin_dir(artifacts_dir: Path, tmp_path: Path) -> Path:
+    """The same graphs under a manifest of the Jetson target."""
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "orin"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    target = load_target("orin", "nano")
+    manifest["target"] = target.name
+    manifest["provenance"]["target"] = target.to_dict()
+    for name, entry in manifest["graphs"].items():
+        entry["session"] = target.session(name, entry["inputs"])
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    return copy
+
+
+def jetson(host: Host) -> Host:
+    nodes = host.root / "dev"
+    (nodes / "nvgpu" / "igpu0").mkdir(parents=True)
+    for name in ("nvmap", "nvhost-ctrl", "nvgpu/igpu0/as", "sda"):
+        (nodes / name).touch()
+        (nodes / name).chmod(0o666)
+    return host
+
+
+def test_the_jetsons_runner_gets_its_nodes_and_its_engines(
+    units: Units, host: Host, orin_dir: Path, tmp_path: Path
+) -> None:
+    code, _ = units("--target", "orin", on=jetson(host), artifacts=orin_dir)
+    text = (tmp_path / "units" / RUNNER_UNIT).read_text()
+    assert code == EXIT_DONE
+    assert [line for line in text.splitlines() if line.startswith("DeviceAllow")] == [
+        'DeviceAllow="/dev/nvgpu/igpu0/as" rw',
+        'DeviceAllow="/dev/nvhost-ctrl" rw',
+        'DeviceAllow="/dev/nvmap" rw',
+    ]
+    assert f'"--engines" "{tmp_path}/orin.engines"' in text
+
+
+def test_a_runner_without_its_device_is_written_to_be_looked_at_but_not_installed(
+    units: Units, orin_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert units(artifacts=orin_dir)[0] == EXIT_DONE
+    assert "run this on the device" in capsys.readouterr().err
+    assert units("--system", artifacts=orin_dir)[0] == EXIT_REFUSED
+
+
+def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> None:
+    (tmp_path / "dev").mkdir()
+    (tmp_path / "dev" / "nvmap").touch()
+    (tmp_path / "dev" / "nvmap").chmod(0o660)
+    (node,) = device_nodes(("CUDAExecutionProvider",), tmp_path)
+    assert node.path == Path("/dev/nvmap")
+    assert node.group is not None
+
+
+def test_a_processor_has_no_node(tmp_path: Path) -> None:
+    assert device_nodes(("CPUExecutionProvider",), tmp_path) == []
+
+
+def networks(dds: DdsConfig, *given: str) -> list[str]:
+    return [str(network) for network in robot_networks(dds, given, lambda: ADDRESSES)]
+
+
+def test_the_robots_network_is_that_of_its_interface() -> None:
+    assert networks(DdsConfig(0, "eth0")) == ["192.168.123.0/24"]
+    assert networks(DdsConfig(0, "lo", ("127.0.0.1",))) == ["127.0.0.0/8"]
+
+
+def test_a_peer_outside_of_it_is_let_through_too() -> None:
+    assert networks(DdsConfig(0, "eth0", ("10.0.0.7",))) == ["10.0.0.7/32", "192.168.123.0/24"]
+
+
+def test_a_network_that_is_given_replaces_what_was_found() -> None:
+    assert networks(DdsConfig(0, "wlan0", ("robot.local",)), "10.1.0.0/30") == ["10.1.0.0/30"]
+
+
+@pytest.mark.parametrize(
+    ("dds", "given"),
+    [
+        (DdsConfig(0, "wlan0"), ()),
+        (DdsConfig(0, "eth0", ("robot.local",)), ()),
+        (DdsConfig(0, "eth0"), ("10.0.0.1/8",)),
+    ],
+)
+def test_a_network_that_is_not_known_is_asked_for(dds: DdsConfig, given: tuple[str, ...]) -> None:
+    with pytest.raises(UnitError, match="--network"):
+        networks(dds, *given)
