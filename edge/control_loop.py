@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from edge.camera import Frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
+from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
 from edge.geometry import SE2
 from edge.graph import GraphError
@@ -139,8 +140,7 @@ class ControlLoop:
             now_ns = self._clock()
             silent_ns = 0 if status is None else now_ns - status.stamp_ns
             if status is not None and (status.state == "stopped" or silent_ns > BRIDGE_SILENCE_NS):
-                self.ended_by = "bridge"
-                return status.reason if status.state == "stopped" else f"no word from it for {silent_ns / 1e9:.1f} s"
+                return self._ended_by_bridge(status, now_ns)
             behind = (now_ns - deadline_ns) // self._period_ns
             # Deadlines that a late tick has slept over are skipped, not made up for: each counts as a missed tick.
             self.statistics.missed += max(0, behind)
@@ -148,6 +148,16 @@ class ControlLoop:
                 self._on_tick(behind <= 0)
             deadline_ns += self._period_ns * max(1, behind + 1)
         return None
+
+    def _ended_by_bridge(self, status: BridgeStatus, now_ns: int) -> str:
+        """Why, in words; what it is in the fault table goes into the log and to the operator."""
+        self.ended_by = "bridge"
+        fault, why = "bridge-hung", f"no word from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
+        if status.state == "stopped":
+            fault, why = FAULT_OF_CAUSE.get(status.cause, ""), status.reason
+        if fault:
+            self._supervise((Finding(fault, why),), now_ns)
+        return why
 
     def tick(self, deadline_ns: int) -> VelocityCommand:
         """One pass; returns the command it sent."""

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from edge.fault_row import Action, Fault
 
 BRIDGE: tuple[Fault, ...] = (
+    Fault(
+        "commands-late", 22, Action.STOP, 300, "bridge",
+        "The bridge got no good command in time.",
+        "Something else uses the processor: edge-doctor says what; then arm again.",
+        "tests/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
+    ),
     Fault(
         "graph-hung", 23, Action.STOP, 300, "bridge",
         "A graph's run does not come back (driver or GPU hang): no commands come.",
@@ -27,7 +36,7 @@ BRIDGE: tuple[Fault, ...] = (
         "control-thread-dead", 28, Action.STOP, 300, "bridge",
         "The runner lives but its control thread does not: no commands come.",
         "The watchdog restarts the runner; report it with the journal.",
-        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+        "tests/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
     ),
     Fault(
         "runner-frozen", 29, Action.STOP, 300, "bridge",
@@ -51,49 +60,61 @@ BRIDGE: tuple[Fault, ...] = (
         "link-lost", 35, Action.STOP, 1300, "bridge",
         "Nothing comes from the robot any more.",
         "Check the cable to the robot and that the robot is on, then arm again.",
-        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+        "tests/test_bridge_dangers.py::test_without_the_robots_state_zero_goes_out_after_the_deadmans_time_and_the_state_is_not_latched",
     ),
     Fault(
         "message-reordered", 36, Action.NOTHING, 0, "bridge",
         "A command came twice or in the wrong order and was dropped.",
         "Nothing to do.",
-        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+        "tests/test_bridge_core.py::TestGate::test_a_sequence_number_that_does_not_increase_is_rejected",
     ),
     Fault(
         "message-flood", 37, Action.NOTHING, 0, "bridge",
         "Old messages arrived in a burst and were dropped by their age.",
         "Nothing to do.",
-        "tests/test_bridge_core.py::test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command",
+        "tests/test_bridge_core.py::TestDeadman::test_a_queue_of_old_commands_after_a_suspended_runner_is_refused",
     ),
     Fault(
         "late-motion", 38, Action.STOP, 40, "bridge",
         "A motion command overtook the stop; the stop was sent again.",
         "Nothing to do: zero goes on being sent.",
-        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+        "tests/test_bridge_dangers.py::TestStopAgain::test_a_late_move_is_followed_by_a_zero_within_40_ms_whenever_it_comes",
     ),
     Fault(
         "stop-call-blocked", 39, Action.NOTHING, 0, "bridge",
         "The robot does not answer StopMove; zero velocity was sent before it.",
         "If it stays, restart the robot.",
-        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+        "tests/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
         "second-commander", 40, Action.STOP, 500, "bridge",
         "Somebody else commands the robot.",
         "Close the other program or app; only one may command the robot.",
-        "tests/test_bridge_process.py::test_a_second_client_is_turned_away_and_the_first_drives_on",
+        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+    ),
+    Fault(
+        "robot-mode-left", 42, Action.STOP, 1000, "bridge",
+        "The robot left its walking modes by itself.",
+        "Look at the robot: it may have fallen or been taken over; then arm again.",
+        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+    ),
+    Fault(
+        "robot-error", 42, Action.STOP, 1000, "bridge",
+        "The robot reports an error of its own.",
+        "Look the error code up in the maker's manual before arming again.",
+        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
         "robot-link-down", 46, Action.STOP, 100, "bridge",
         "Commands cannot be sent: the network to the robot is down or its queue is full.",
         "Check the network interface in the robot file.",
-        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
         "emergency-stop", 47, Action.STOP, 60, "bridge",
         "The emergency stop was pressed, or the remote took over.",
         "Find out why, release it, then arm again.",
-        "tests/test_bridge_process.py::test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move",
+        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
 )  # fmt: skip
 
@@ -144,13 +165,13 @@ START: tuple[Fault, ...] = (
         "wrong-robot", 58, Action.STOP, 0, "start",
         "The robot file is for another robot or protocol.",
         "Name the file of the robot that is connected.",
-        "tests/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
+        "tests/test_bridge_dangers.py::TestIdentity::test_another_robot_is_refused_before_anything_moves",
     ),
     Fault(
         "restart-storm", 59, Action.STOP, 0, "start",
         "The runner failed five times within 60 s and is not started again.",
         "Look at its journal: journalctl -u edge-runner.",
-        "tests/test_edge_run.py::test_artifacts_that_do_not_verify_are_refused_by_name",
+        "tests/test_units.py::test_slow_failing_starts_of_the_runner_are_counted_within_one_window",
     ),
     Fault(
         "upgrade-interrupted", 60, Action.STOP, 0, "start",
@@ -159,3 +180,21 @@ START: tuple[Fault, ...] = (
         "tests/test_export_directory.py::test_what_a_killed_export_was_replacing_comes_back",
     ),
 )  # fmt: skip
+
+FAULT_OF_CAUSE: Mapping[str, str] = MappingProxyType(
+    {
+        "deadman": "commands-late",
+        "suspended": "suspended",
+        "estop": "emergency-stop",
+        "remote_takeover": "emergency-stop",
+        "second_commander": "second-commander",
+        "link_down": "robot-link-down",
+        "state_silent": "link-lost",
+        "wrong_mode": "robot-mode-left",
+        "robot_error": "robot-error",
+        "tipped": "tipped-over",
+        "robot_moving": "bridge-killed",
+        "wrong_robot": "wrong-robot",
+    }
+)
+"""What a stop of the bridge is in this table, by the cause that its status names (firmware_bridge.link.CAUSES)."""

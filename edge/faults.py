@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from edge.fault_row import LAST_ROW, Action, Escalation, Fault, table
-from edge.fault_rows_elsewhere import BRIDGE, START
+from edge.fault_rows_elsewhere import BRIDGE, FAULT_OF_CAUSE, START
 from edge.fault_rows_runner import INPUTS, MACHINE, MODEL
 
-__all__ = ["FAULTS", "LAST_ROW", "NOT_HERE", "Action", "Escalation", "Fault"]
+__all__ = ["FAULTS", "FAULT_OF_CAUSE", "LAST_ROW", "NOT_HERE", "Action", "Escalation", "Fault"]
 
 FAULTS: Mapping[str, Fault] = table(INPUTS, MODEL, MACHINE, BRIDGE, START)
 """Every fault by name."""
@@ -22,7 +22,6 @@ NOT_HERE: Mapping[int, str] = MappingProxyType(
     {
         32: "needs a real robot: power cut of the computer with the bridge",
         41: "MAVLink: no robot file speaks it yet",
-        42: "MAVLink: no robot file speaks it yet",
         43: "CAN: no robot file speaks it yet",
         44: "CAN: no robot file speaks it yet",
         45: "CAN: no robot file speaks it yet",

@@ -12,7 +12,6 @@ from edge.controller import Controller, ControllerConfig
 from edge.findings import FindingQueue
 from edge.geometry import SE2
 from edge.graph import GraphError
-from edge.monitors.machine import Heat
 from edge.monitors.semantic import SemanticConfig
 from edge.monitors.watch import Sources, Watch, WatchConfig
 from edge.pose_history import PoseHistory, StampedPose
@@ -71,6 +70,7 @@ class FakeSink:
         self.commands: list[tuple[int, float, float]] = []
         self.stamps_ns: list[int] = []
         self.state = "armed"
+        self.cause = "none"
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
         self.commands.append((seq, vx_mps, wz_radps))
@@ -78,7 +78,8 @@ class FakeSink:
         return True
 
     def poll(self) -> BridgeStatus:
-        return BridgeStatus(self.bench.now_ns - self.silent_ns, self.state, "deadman", 0, 0, 0, (0.0, 0.0, 0.0), False)
+        stamp_ns = self.bench.now_ns - self.silent_ns
+        return BridgeStatus(stamp_ns, self.state, "deadman", 0, 0, 0, (0.0, 0.0, 0.0), False, self.cause)
 
 
 class Attitude:
@@ -87,12 +88,6 @@ class Attitude:
     received_ns = 0
     roll_rad = 0.0
     pitch_rad = 0.0
-
-
-class Battery:
-    """Charge of the robot."""
-
-    soc_percent = 80.0
 
 
 class Bench:
@@ -109,8 +104,6 @@ class Bench:
         self.failed = 0
         self.asleep_ns = 0
         self.attitude = Attitude()
-        self.battery = Battery()
-        self.heat = Heat()
         self.findings = FindingQueue()
         self.policy = FakePolicy(self)
         self.sink = FakeSink(self)
@@ -125,8 +118,6 @@ class Bench:
             findings=self.findings,
             attitude=lambda: self.attitude,
             states=lambda: self.states,
-            battery=lambda: self.battery,
-            heat=lambda: self.heat,
             failed_generations=lambda: self.failed,
             asleep_ns=lambda: self.asleep_ns,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from edge.faults import FAULT_OF_CAUSE
 from edge.geometry import SE2
 from tests.control_bench import PERIOD_NS, Bench
 
@@ -164,3 +165,19 @@ def test_the_watchdog_is_told_of_every_tick_whether_it_was_on_time(bench: Bench)
     bench.stop.wait = wait  # type: ignore[method-assign,assignment]
     bench.loop.run(bench.now_ns, None)
     assert bench.on_time == [True, True, True]
+
+
+@pytest.mark.parametrize(("cause", "fault"), sorted(FAULT_OF_CAUSE.items()))
+def test_what_the_bridge_stopped_for_is_told_as_a_fault_of_the_table(bench: Bench, cause: str, fault: str) -> None:
+    bench.see()
+    bench.sink.state, bench.sink.cause = "stopped", cause
+    bench.loop.run(bench.now_ns, None)
+    assert bench.loop.ended_by == "bridge"
+    assert bench.loop.supervision.active[0] == fault
+
+
+def test_a_stop_that_the_runner_itself_asked_for_is_no_fault(bench: Bench) -> None:
+    bench.see()
+    bench.sink.state, bench.sink.cause = "stopped", "client_stop"
+    bench.loop.run(bench.now_ns, None)
+    assert not bench.loop.supervision.stop

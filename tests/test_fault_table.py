@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from edge.faults import FAULTS, LAST_ROW, NOT_HERE, Action, Escalation, Fault
+from edge.faults import FAULT_OF_CAUSE, FAULTS, LAST_ROW, NOT_HERE, Action, Escalation, Fault
 from edge.findings import Finding, FindingQueue
+from firmware_bridge.link import CAUSES
 
 ROOT = Path(__file__).parents[1]
 ROWS = sorted(FAULTS.values(), key=lambda fault: (fault.row, fault.name))
@@ -23,9 +24,12 @@ def test_every_row_of_the_matrix_is_in_the_table_or_has_a_reason_not_to_be() -> 
 
 @pytest.mark.parametrize("fault", ROWS, ids=lambda fault: fault.name)
 def test_the_test_that_injects_a_fault_exists(fault: Fault) -> None:
-    file, name = fault.test_id.split("::")
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    file, *names = fault.test_id.split("::")
+    body = ast.parse((ROOT / file).read_text(encoding="utf-8")).body
+    for name in names:
+        found = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name]
+        assert found, f"{file} has no {name}"
+        body = found[0].body
 
 
 @pytest.mark.parametrize("fault", ROWS, ids=lambda fault: fault.name)
@@ -33,31 +37,55 @@ def test_a_name_is_lower_case_with_hyphens(fault: Fault) -> None:
     assert re.fullmatch(r"[a-z]+(-[a-z]+)*", fault.name)
 
 
-def test_what_is_found_by_the_code_is_in_the_table_and_what_is_in_the_table_is_found() -> None:
-    used: set[str] = set()
-    for path in (ROOT / "edge").rglob("*.py"):
-        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Finding":
-                used |= {node.value for node in ast.walk(call.args[0]) if _is_name(node)}
-    reached = used | {f.escalation.to for f in ROWS if f.name in used and f.escalation}
-    ours = {f.name for f in ROWS if f.where == "runner" and f.action is not Action.NOTHING}
-    assert reached <= set(FAULTS)
-    assert ours - reached == set()
+def test_what_is_found_by_the_code_is_in_the_table() -> None:
+    found = {
+        name
+        for path in (ROOT / "edge").rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Finding"
+        for name in _texts(call.args[0])
+    }
+    assert found and found <= set(FAULTS)
 
 
-def _is_name(node: ast.AST) -> bool:
-    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+def test_what_the_runner_is_said_to_notice_it_does_notice() -> None:
+    named = {
+        name
+        for path in (ROOT / "edge").rglob("*.py")
+        if not path.name.startswith("fault")
+        for name in _texts(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    named |= {fault.escalation.to for fault in ROWS if fault.name in named and fault.escalation}
+    ours = {fault.name for fault in ROWS if fault.where == "runner" and fault.action is not Action.NOTHING}
+    assert ours - named == set()
+
+
+def _texts(tree: ast.AST) -> set[str]:
+    return {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
 
 
 def test_control_code_never_reads_the_wall_clock() -> None:
-    wall = re.compile(r"\btime\.time\b|\btime_ns\(\)|datetime\.now|CLOCK_REALTIME|\.utcnow|date\.today")
-    readers = [
-        path.name
-        for path in sorted((ROOT / "edge").rglob("*.py"))
-        if wall.search(path.read_text(encoding="utf-8").replace("monotonic_ns()", ""))
-    ]
-    # The recorder writes the date into the log, once and for people.
-    assert set(readers) <= {"recorder.py", "log_part.py"}
+    wall = re.compile(r"\btime\.time(_ns)?\b|datetime\.now|CLOCK_REALTIME|\.utcnow|date\.today")
+    control = _imported("edge.control_loop", set()) | _imported("firmware_bridge.bridge", set())
+    assert {"edge.supervisor", "edge.monitors.frame", "firmware_bridge.core"} <= control
+    # The flight log writes the date once, for people.
+    readers = {name for name in control if wall.search(_file(name).read_text(encoding="utf-8"))}
+    assert readers <= {"edge.recorder", "edge.log_part"}
+
+
+def _file(module: str) -> Path:
+    return ROOT / (module.replace(".", "/") + ".py")
+
+
+def _imported(module: str, seen: set[str]) -> set[str]:
+    """The module and all of ours that it needs."""
+    if module not in seen and _file(module).exists():
+        seen.add(module)
+        for node in ast.walk(ast.parse(_file(module).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
+                    _imported(name, seen)
+    return seen
 
 
 def test_a_finding_that_is_not_in_the_table_cannot_be_made() -> None:
@@ -93,6 +121,13 @@ def test_a_row_that_cannot_be_true_is_refused(change: dict[str, object]) -> None
 def test_an_escalation_needs_two_findings_and_a_time() -> None:
     with pytest.raises(ValueError, match="escalation"):
         Escalation("x", 1, 1000)
+
+
+def test_every_cause_for_which_the_bridge_stops_is_in_the_table_or_is_no_fault_while_driving() -> None:
+    ours = {"none", "client_stop", "client_lost", "shutdown"}  # the runner's own doing, or its end
+    refused = {"not_standing", "battery_low"}  # only at arming
+    assert set(FAULT_OF_CAUSE) | ours | refused == set(CAUSES)
+    assert set(FAULT_OF_CAUSE.values()) <= set(FAULTS)
 
 
 def test_what_latches_is_what_stops() -> None:

@@ -1,9 +1,8 @@
-"""Is this machine fit to drive? Late ticks, a clock that jumped, sleep, heat."""
+"""Is this machine fit to drive? Late ticks, a clock that jumped, sleep. (Its heat: `edge.power`.)"""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 from edge.findings import Finding
 
@@ -17,17 +16,6 @@ SLEPT_NS = 100_000_000
 """The clock that counts sleep and the one that does not part by less than this, unless the machine slept."""
 
 
-@dataclass(frozen=True)
-class Heat:
-    """What the power monitor knows of the machine's temperature."""
-
-    throttled: bool = False
-    """Its clocks have been lowered."""
-    at_trip: bool = False
-    """It is at the temperature at which it switches itself off."""
-    temperature_c: float | None = None
-
-
 class MachineMonitor:
     """Remembers the last ticks and the last readings of both clocks."""
 
@@ -37,7 +25,7 @@ class MachineMonitor:
         self._last_ns: int | None = None
         self._asleep_ns: int | None = None
 
-    def step(self, last_tick_ns: int | None, asleep_ns: int, heat: Heat | None, now_ns: int) -> tuple[Finding, ...]:
+    def step(self, last_tick_ns: int | None, asleep_ns: int, now_ns: int) -> tuple[Finding, ...]:
         """Judge the tick before this one and the machine.
 
         `last_tick_ns`: from that tick's deadline to its command; `asleep_ns`: boot time less monotonic time, which
@@ -54,9 +42,6 @@ class MachineMonitor:
         self._asleep_ns = asleep_ns if self._asleep_ns is None else max(self._asleep_ns, asleep_ns)
         if last_tick_ns is not None:
             self._judge_ticks(last_tick_ns, findings)
-        if heat is not None and (heat.at_trip or heat.throttled):
-            detail = "" if heat.temperature_c is None else f"{heat.temperature_c:.0f} °C"
-            findings.append(Finding("thermal-trip" if heat.at_trip else "thermal-throttle", detail))
         return tuple(findings)
 
     def _judge_ticks(self, last_tick_ns: int, findings: list[Finding]) -> None:

@@ -13,9 +13,9 @@ from edge.controller import ControllerConfig
 from edge.findings import Finding, FindingQueue
 from edge.geometry import SE2
 from edge.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs, Picture
-from edge.monitors.machine import Heat, MachineMonitor
+from edge.monitors.machine import MachineMonitor
 from edge.monitors.output import OutputConfig, OutputMonitor
-from edge.monitors.robot import Attitude, Charge, RobotMonitor, RobotWatchConfig
+from edge.monitors.robot import Attitude, RobotMonitor, RobotWatchConfig
 from edge.monitors.semantic import SemanticConfig, SemanticMonitor
 from edge.pose_history import StampedPose
 from edge.semantic import SemanticState
@@ -35,12 +35,10 @@ class Sources:
     """What monitors ask for in every tick; none may wait or raise. The defaults know nothing."""
 
     findings: FindingQueue = field(default_factory=FindingQueue)
-    """What other threads have found: odometry, power."""
+    """What other threads have found: odometry, battery, heat."""
     attitude: Callable[[], Attitude | None] = lambda: None
     states: Callable[[], int | None] = lambda: None
     """State messages of the robot so far."""
-    battery: Callable[[], Charge | None] = lambda: None
-    heat: Callable[[], Heat | None] = lambda: None
     failed_generations: Callable[[], int] = lambda: 0
     asleep_ns: Callable[[], int] = asleep_ns
 
@@ -113,6 +111,6 @@ class Watch:
             *self._pictures.findings,
             *self._output.step(trajectory, self._pictures.content, now_ns),
             *self._semantic.step(semantic, sources.failed_generations(), now_ns),
-            *self._robot.step(pose, sources.states(), sources.battery(), now_ns),
-            *self._machine.step(last_tick_ns, sources.asleep_ns(), sources.heat(), now_ns),
+            *self._robot.step(pose, sources.states(), now_ns),
+            *self._machine.step(last_tick_ns, sources.asleep_ns(), now_ns),
         )
