@@ -1,6 +1,7 @@
 """JSON schemas of the flight log's topics, so that a viewer (Foxglove) can list and plot the fields.
 
-A table, not code: one entry per topic. Names carry their units; stamps are monotonic ns of the recording machine.
+A table, not code: one entry per topic. Names carry their units; stamps are monotonic ns of the recording machine. A
+number that is not finite is null in the log, so whatever is computed may be null.
 """
 
 from __future__ import annotations
@@ -10,18 +11,26 @@ from typing import Any
 
 Schema = dict[str, Any]
 
+_ANY: Schema = {}
 _INT: Schema = {"type": "integer"}
 _NUMBER: Schema = {"type": "number"}
 _TEXT: Schema = {"type": "string"}
+_FLAG: Schema = {"type": "boolean"}
 _INT_OR_NULL: Schema = {"type": ["integer", "null"]}
 _NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
+_TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
+_TEXTS: Schema = {"type": "array", "items": _TEXT}
 _VECTOR: Schema = {"type": "array", "items": _NUMBER_OR_NULL}
 _VECTOR_OR_NULL: Schema = {"type": ["array", "null"], "items": _NUMBER_OR_NULL}
+_ROWS: Schema = {"type": "array", "items": _VECTOR}
 _ROWS_OR_NULL: Schema = {"type": ["array", "null"], "items": _VECTOR}
+_NUMBERS_BY_NAME: Schema = {"type": "object", "additionalProperties": _NUMBER_OR_NULL}
 
 
-def _record(title: str, **properties: Schema) -> Schema:
-    return {"title": title, "type": "object", "properties": properties}
+def _record(title: str, optional: tuple[str, ...] = (), **properties: Schema) -> Schema:
+    """An object with these properties; all but the optional ones are always there."""
+    required = [name for name in properties if name not in optional]
+    return {"title": title, "type": "object", "properties": properties, "required": required}
 
 
 COMPRESSED_IMAGE: Schema = _record(
@@ -36,17 +45,21 @@ COMPRESSED_IMAGE: Schema = _record(
 SCHEMAS: Mapping[str, Schema] = {
     "/run": _record(
         "tic_vla.Run",
+        ("limits", "release"),
         instruction=_TEXT,
         mode=_TEXT,
         artifacts=_TEXT,
         manifest_sha256=_TEXT,
+        release=_INT_OR_NULL,  # counter of the artifacts' signature
         robot=_TEXT,
-        release_delay={},
+        limits=_NUMBERS_BY_NAME,  # LimitsConfig: what the commands were held to
+        release_delay=_ANY,
         started_ns=_INT,
         tick_period_ms=_NUMBER,
     ),
     "/tick": _record(
         "tic_vla.Tick",
+        ("supervisor", "speed_scale", "active"),
         tick=_INT,
         now_ns=_INT,
         start_ns=_INT,
@@ -61,14 +74,18 @@ SCHEMAS: Mapping[str, Schema] = {
         delay_s=_NUMBER_OR_NULL,
         offset=_VECTOR_OR_NULL,
         pose=_VECTOR_OR_NULL,
-        state=_VECTOR_OR_NULL,
-        trajectory=_ROWS_OR_NULL,
+        state=_VECTOR_OR_NULL,  # vx m/s, vy m/s, ωz rad/s
+        trajectory=_ROWS_OR_NULL,  # (x m, y m, θ rad) at whole seconds
         target=_VECTOR_OR_NULL,
         command=_VECTOR,
         reason=_TEXT,
+        supervisor=_TEXT,  # STARTING, READY, RUNNING, DEGRADED, STOPPED
+        speed_scale=_NUMBER,
+        active=_TEXTS,  # names of the faults present
     ),
     "/semantic": _record(
         "tic_vla.Semantic",
+        ("frame_poses", "max_new_tokens"),
         generation=_INT,
         anchor_ns=_INT,
         anchor_pose=_VECTOR_OR_NULL,
@@ -76,8 +93,10 @@ SCHEMAS: Mapping[str, Schema] = {
         finished_ns=_INT,
         ready_ns=_INT,
         release_delay_s=_NUMBER,
-        frames_ns={"type": "array", "items": _INT},
+        frames_ns={"type": "array", "items": _INT},  # stamps of /camera, oldest first
+        frame_poses=_ROWS,  # (x m, y m, θ rad) at those: what the prompt's past motion was told from
         prompt_tokens=_INT,
+        max_new_tokens=_INT,
         new_tokens=_INT,
         text=_TEXT,
         waypoints=_ROWS_OR_NULL,
@@ -86,6 +105,46 @@ SCHEMAS: Mapping[str, Schema] = {
         context_ms=_NUMBER,
     ),
     "/camera": COMPRESSED_IMAGE,
+    "/fault": _record(
+        "tic_vla.Fault",
+        name=_TEXT,
+        row=_INT_OR_NULL,  # of the fault matrix
+        action=_TEXT,  # LIMIT, ZERO, STOP
+        change={"enum": ["raised", "cleared"]},
+        detail=_TEXT,
+        state=_TEXT,  # of the supervisor, after it
+        speed_scale=_NUMBER,
+    ),
+    "/power": _record(
+        "tic_vla.Power",
+        total_w=_NUMBER_OR_NULL,
+        rails=_NUMBERS_BY_NAME,  # W by label
+        average_w=_NUMBER_OR_NULL,
+        budget_w=_NUMBER_OR_NULL,
+        level=_ANY,  # of the governor
+        pause_s=_NUMBER,
+        token_cap=_INT_OR_NULL,
+        tagged=_TEXT,  # measured, modelled
+        source=_TEXT,
+        temperature_c=_NUMBER_OR_NULL,
+    ),
+    "/odometry": _record(
+        "tic_vla.Odometry",
+        raw_pose=_VECTOR,  # x m, y m, θ rad, as the robot says
+        velocity=_VECTOR,  # vx m/s, vy m/s, ωz rad/s
+        gyro_wz_radps=_NUMBER_OR_NULL,
+        pose=_VECTOR_OR_NULL,  # fused
+        covariance=_ROWS_OR_NULL,  # 3×3 of the fused pose, m² and rad²
+        drift_m_per_m=_NUMBER_OR_NULL,
+        drift_deg_per_m=_NUMBER_OR_NULL,
+        command=_VECTOR_OR_NULL,
+    ),
+    "/battery": _record(
+        "tic_vla.Battery",
+        soc_percent=_NUMBER_OR_NULL,
+        voltage_v=_NUMBER_OR_NULL,
+        current_a=_NUMBER_OR_NULL,
+    ),
     "/result": {"title": "tic_vla.Result", "type": "object"},
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import CRCValidationError, StreamReader
 
+_MAGIC = b"\x89MCAP0\r\n"
 _RECORD_LIMIT_BYTES = 256 * 1024 * 1024
 
 # What the MCAP reader raises at a cut: too few bytes for a number, a string, a compressed block, or a bad checksum.
@@ -25,16 +27,47 @@ class RecordingError(ValueError):
     """The file is not a flight log at all."""
 
 
-def read_messages(path: str | Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Yield (topic, stamp_ns, payload) in file order and end quietly at the first record that is cut or damaged.
+def part_path(path: Path, number: int) -> Path:
+    """Where part `number` (from 1) of the recording at `path` lies: `flight.mcap`, `flight.002.mcap`, …"""
+    return path if number == 1 else path.with_name(f"{path.stem}.{number:03d}{path.suffix}")
 
+
+def parts(path: Path) -> list[Path]:
+    """`path` and those of its continuations that exist, in order; middle ones may have been discarded."""
+    pattern = re.compile(rf"{re.escape(path.stem)}\.(\d{{3,}}){re.escape(path.suffix)}", re.ASCII)
+    found: list[tuple[int, Path]] = []
+    if path.parent.is_dir():
+        for beside in path.parent.iterdir():
+            match = pattern.fullmatch(beside.name)
+            if match is not None and beside == part_path(path, number := int(match[1])) and number > 1:
+                found.append((number, beside))
+    return [path, *(part for _, part in sorted(found))]
+
+
+def read_messages(path: str | Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    """Yield (topic, stamp_ns, payload) in file order, of the file and then of its continuations.
+
+    A part ends quietly at the first record that is cut or damaged; each continuation repeats the `/run` record.
     `payload` is the JSON object as recorded; `jpeg_bytes` turns that of `/camera` into the picture. Raises
     RecordingError when the file does not start like an MCAP file, OSError when it cannot be read.
     """
-    path = Path(path)
+    first, *others = parts(Path(path))
+    if not _is_mcap(first):
+        raise RecordingError(f"{first} is not an MCAP file: expected the MCAP signature in its first 8 bytes")
+    yield from _read_part(first)
+    for part in others:
+        if _is_mcap(part):  # the process may have died before the first byte of it
+            yield from _read_part(part)
+
+
+def _is_mcap(path: Path) -> bool:
     with path.open("rb") as stream:
-        if stream.read(8) != b"\x89MCAP0\r\n":
-            raise RecordingError(f"{path} is not an MCAP file: expected the MCAP signature in its first 8 bytes")
+        return stream.read(len(_MAGIC)) == _MAGIC
+
+
+def _read_part(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    with path.open("rb") as stream:
+        stream.seek(len(_MAGIC))
         records = StreamReader(
             stream, skip_magic=True, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES
         ).records

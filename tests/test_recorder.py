@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
@@ -20,8 +21,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from edge.recorder import Recorder, encode
-from edge.recording import RecordingError, jpeg_bytes, read_messages
+from edge.log_part import encode
+from edge.recorder import Recorder, RecorderLimits, space_refusal
+from edge.recording import RecordingError, jpeg_bytes, parts, read_messages
 
 JPEG = b"\xff\xd8\xff\xe0 not a picture, but bytes of one \xff\xd9"
 
@@ -65,6 +67,20 @@ def test_camera_bytes_become_a_foxglove_compressed_image(tmp_path: Path) -> None
     assert jpeg_bytes(payload) == JPEG
 
 
+def test_the_summary_of_a_finished_file_lists_every_record(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    for index in range(50):
+        recorder.put("/tick", 1_000 + index, {"tick": index})
+    recorder.put("/camera", 2_000, JPEG)
+    assert recorder.close()
+    with (tmp_path / "flight.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and summary.statistics is not None
+    by_topic = {channel.topic: summary.statistics.channel_message_counts[n] for n, channel in summary.channels.items()}
+    assert by_topic == {"/tick": 50, "/camera": 1}
+    assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (1_000, 2_000)
+
+
 def test_an_ordinary_mcap_reader_sees_topics_and_schemas(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "flight.mcap")
     recorder.put("/camera", 1, JPEG)
@@ -86,7 +102,7 @@ def test_an_ordinary_mcap_reader_sees_topics_and_schemas(tmp_path: Path) -> None
 def test_a_hanging_disk_costs_the_caller_records_not_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk_answers = threading.Event()
     monkeypatch.setattr("edge.recorder.os.fsync", lambda _: disk_answers.wait())
-    recorder = Recorder(tmp_path / "flight.mcap", capacity=8)
+    recorder = Recorder(tmp_path / "flight.mcap", RecorderLimits(records=8))
     for index in range(10):
         recorder.put("/tick", index, {"tick": index})  # returns although the writer is stuck
     recorder.put("/camera", 10, JPEG)
@@ -96,8 +112,57 @@ def test_a_hanging_disk_costs_the_caller_records_not_time(tmp_path: Path, monkey
     disk_answers.set()
 
 
+def test_nobody_who_records_waits_for_a_thread_that_holds_a_lock(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flight.mcap")
+    with recorder._lock:  # as a writer thread would that the scheduler has put aside just there
+        recorder.put("/tick", 1, {"tick": 0})
+    assert recorder.close()
+    assert _ticks(tmp_path / "flight.mcap") == [0]
+
+
+def test_the_caller_encodes_nothing(tmp_path: Path) -> None:
+    encoded_in: list[str] = []
+
+    class Watched(dict):
+        def items(self):  # what the encoder asks for
+            encoded_in.append(threading.current_thread().name)
+            return super().items()
+
+    recorder = Recorder(tmp_path / "flight.mcap")
+    recorder.put("/tick", 1, Watched(tick=0))
+    assert recorder.close()
+    assert encoded_in == ["recorder"]
+
+
+def test_a_device_that_takes_nothing_for_a_while_loses_nothing_that_the_queue_holds(tmp_path: Path) -> None:
+    path = tmp_path / "stalled.mcap"
+    os.mkfifo(path)
+    device = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    recorder = Recorder(path, RecorderLimits(records=600))
+    noise = [os.urandom(300).hex() for _ in range(600)]
+    for tick in range(600):  # more than a pipe holds: the writer is stuck inside the kernel
+        recorder.put("/tick", tick, {"tick": tick, "noise": noise[tick]})
+    refused = 0
+    while refused == 0:
+        recorder.put("/tick", 600, {"tick": 600, "noise": noise[0]})
+        refused = recorder.dropped.get("/tick", 0)
+    assert len(recorder._queue) <= 600, "and memory stays bounded"
+    copy = tmp_path / "copy.mcap"
+    closing = threading.Thread(target=recorder.close, args=(30,))
+    closing.start()
+    with copy.open("wb") as out:
+        while closing.is_alive():  # the device takes again
+            with contextlib.suppress(BlockingIOError):
+                out.write(os.read(device, 1 << 20))
+        while data := os.read(device, 1 << 20):
+            out.write(data)
+    os.close(device)
+    assert recorder.error is None
+    assert _ticks(copy)[:600] == list(range(600))
+
+
 def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flight.mcap", capacity_bytes=1000)
+    recorder = Recorder(tmp_path / "flight.mcap", RecorderLimits(picture_bytes=1000))
     recorder.put("/camera", 1, b"x" * 1001)
     assert recorder.close()
     assert recorder.dropped == {"/camera": 1}
@@ -113,6 +178,120 @@ def test_a_disk_that_is_full_stops_writing_and_is_reported(tmp_path: Path) -> No
     assert "/dev/full stopped: No space left on device" in (recorder.error or "")
     assert recorder.dropped["/tick"] >= 1
     assert recorder.close() is False
+
+
+FILL_THE_DISK = """
+import resource, sys, time
+from edge.recorder import Recorder
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+recorder = Recorder(sys.argv[1])
+given = 0
+while recorder.error is None:
+    recorder.put("/camera", given, bytes(range(256)) * 40)
+    given += 1
+    time.sleep(0.001)
+print(given, recorder.dropped.get("/camera", 0), recorder.error)
+"""
+
+
+def test_on_a_disk_that_fills_up_what_was_written_can_be_read_and_the_rest_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    done = subprocess.run([sys.executable, "-c", FILL_THE_DISK, str(path)], capture_output=True, text=True, timeout=60)
+    given, dropped, error = done.stdout.split(maxsplit=2)
+    assert "stopped: File too large" in error
+    assert path.stat().st_size == 300_000
+    whole = len(list(read_messages(path)))
+    assert whole > 0
+    assert whole + int(dropped) >= int(given), "never fewer are counted than are missing"
+
+
+def test_below_the_floor_of_free_space_nothing_is_written_until_there_is_room_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = [100]
+    monkeypatch.setattr("edge.recorder._free", lambda _: (free[0], 1_000))
+    path = tmp_path / "flight.mcap"
+    recorder = Recorder(path, RecorderLimits(free_bytes=200))
+    recorder.put("/run", 1, {"instruction": "go"})
+    assert _wait_for(lambda: recorder.dropped == {"/run": 1})
+    assert "is paused" in (recorder.error or "") and "delete old logs" in (recorder.error or "")
+    free[0] = 249  # above the floor, but not clearly
+    recorder.put("/tick", 2, {"tick": 0})
+    assert _wait_for(lambda: recorder.dropped == {"/run": 1, "/tick": 1})
+    free[0] = 250
+    assert _wait_for(lambda: recorder.error is None, 20)
+    recorder.put("/tick", 3, {"tick": 1})
+    assert recorder.close()
+    assert [(topic, stamp_ns) for topic, stamp_ns, _ in read_messages(path)] == [("/run", 1), ("/tick", 3)]
+
+
+@pytest.mark.parametrize(
+    ("free", "total", "refused"),
+    [(69, 1_000, True), (70, 1_000, False), (100, 1_000, False), (19, 20, True), (20, 20, False)],
+)
+def test_a_robot_is_not_armed_with_less_than_seven_percent_of_the_disk_free(
+    free: int, total: int, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edge.recorder._free", lambda _: (free, total))
+    reason = space_refusal(Path("flight.mcap"), RecorderLimits(free_bytes=20))
+    assert (reason is not None) == refused
+    assert reason is None or "delete old logs" in reason
+
+
+def _record_parts(path: Path, count: int, limits: RecorderLimits) -> Recorder:
+    """Records of about 1 kB of noise, so that compression does not change how many parts there are."""
+    recorder = Recorder(path, limits)
+    recorder.put("/run", 0, {"instruction": "go"})
+    for tick in range(count):
+        recorder.put("/tick", 1 + tick, {"tick": tick, "noise": os.urandom(1_000).hex()})
+    assert recorder.close(30)
+    return recorder
+
+
+def test_a_long_recording_goes_on_in_further_parts_that_are_read_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    limits = RecorderLimits(part_bytes=400_000, total_bytes=10**9)
+    recorder = _record_parts(path, 1_500, limits)
+    assert [part.name for part in parts(path)[:3]] == ["flight.mcap", "flight.002.mcap", "flight.003.mcap"]
+    assert all(part.stat().st_size < 400_000 + 300_000 for part in parts(path)), "a part and at most one chunk"
+    assert recorder.dropped == {}
+    assert _ticks(path) == list(range(1_500))
+    assert recorder.statistics()["bytes"] == sum(part.stat().st_size for part in parts(path))
+
+
+def test_every_part_is_whole_by_itself_and_says_what_run_it_belongs_to(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    _record_parts(path, 1_000, RecorderLimits(part_bytes=400_000, total_bytes=10**9))
+    for part in parts(path):
+        with part.open("rb") as stream:
+            assert make_reader(stream).get_summary() is not None
+        assert next(read_messages(part))[0] == "/run"
+
+
+def test_beyond_the_limit_the_oldest_part_but_the_first_is_given_up(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    limits = RecorderLimits(part_bytes=400_000, total_bytes=2_000_000)
+    recorder = _record_parts(path, 3_000, limits)
+    assert sum(part.stat().st_size for part in parts(path)) <= 2_000_000 + 300_000
+    assert recorder.statistics()["discarded_parts"] > 0
+    ticks = _ticks(path)
+    assert ticks[0] == 0 and ticks[-1] == 2_999, "how it began and how it ended"
+    assert ticks == sorted(ticks)
+
+
+def test_a_continuation_of_another_recording_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "flight.002.mcap").write_bytes(b"somebody else's")
+    recorder = Recorder(tmp_path / "flight.mcap")
+    assert "flight.002.mcap of another recording" in (recorder.error or "")
+    assert not (tmp_path / "flight.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "change", [{"records": 0}, {"free_bytes": -1}, {"total_bytes": 2 * 256 * 1024 * 1024}], ids=str
+)
+def test_limits_that_make_no_sense_are_refused_by_name(change: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(change))):
+        RecorderLimits(**change)
 
 
 def _disk_fails_after(monkeypatch: pytest.MonkeyPatch, good_flushes: int) -> list[int]:
@@ -209,7 +388,7 @@ def test_numpy_values_and_non_finite_numbers_are_valid_json() -> None:
 
 
 def test_threads_may_record_at_the_same_time(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flight.mcap", capacity=10_000)
+    recorder = Recorder(tmp_path / "flight.mcap", RecorderLimits(records=10_000))
     threads = [
         threading.Thread(target=lambda name=name: [recorder.put(name, n, {"n": n}) for n in range(500)])
         for name in ("/tick", "/semantic", "/other")
