@@ -7,7 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edge.artifact_files import MANIFEST_NAME, SEAL, ArtifactError, FileIdentity, hash_file, read_file, read_manifest
+from edge.artifact_files import (
+    MANIFEST_NAME,
+    SEAL,
+    SIGNATURE_NAME,
+    ArtifactError,
+    FileIdentity,
+    check_entry,
+    hash_file,
+    parse_manifest,
+    read_file,
+    read_manifest_bytes,
+)
+from edge.external_data import ExternalDataError, external_data
+from edge.signature import Trust
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
@@ -23,6 +36,8 @@ _POSITIVE = frozenset(
         "step_s",
     }
 )
+
+_LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
 
 
 @dataclass(frozen=True)
@@ -95,6 +110,11 @@ class RuntimeConfig:
     img_start_id: int
     img_end_id: int
     img_context_id: int
+    control_cores: tuple[int, ...]
+    """Processor cores of the control thread; empty: the runner decides by those it finds."""
+    reasoning_cores: tuple[int, ...]
+    control_priority: int
+    """Real-time priority of the control thread, 1 to 99; 0: none."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -102,6 +122,8 @@ class RuntimeConfig:
                 raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {value}")
         if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
             raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
+        if self.control_priority > 99:
+            raise ArtifactError(f"{MANIFEST_NAME}: runtime.control_priority {self.control_priority}, expected 0 to 99")
 
 
 @dataclass(frozen=True)
@@ -119,6 +141,8 @@ class Artifacts:
     """Every file but the graphs' data files."""
     identities: Mapping[str, FileIdentity]
     """The data files as they were when they were hashed."""
+    release: int | None = None
+    """Release counter of the signature that was asked for; None: none was."""
 
     @property
     def language_graphs(self) -> tuple[str, ...]:
@@ -137,14 +161,22 @@ class Artifacts:
                 raise ArtifactError(f"{path}: changed while it was being opened; start again")
 
 
-def load_artifacts(directory: Path) -> Artifacts:
-    """Verify every file's size and SHA-256, the schema version and the I/O contract; raises ArtifactError."""
-    manifest = read_manifest(directory)
+def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
+    """Verify every file's size and SHA-256, the schema version and the I/O contract; raises ArtifactError.
+
+    With `trust`, the signature comes first, before the manifest is even parsed, and the release is remembered last.
+    """
+    raw = read_manifest_bytes(directory)
+    release = None if trust is None else trust.check(directory, raw)
+    manifest = parse_manifest(directory, raw)
     files = _section(manifest, "files")
+    for name, entry in files.items():
+        check_entry(name, entry)
     data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
     contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
     identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
-    unlisted = sorted(p.name for p in directory.iterdir() if p.name not in files and p.name != MANIFEST_NAME)
+    known = {*files, MANIFEST_NAME, SIGNATURE_NAME}
+    unlisted = sorted(path.name for path in directory.iterdir() if path.name not in known)
     if unlisted:
         raise ArtifactError(f"{directory / unlisted[0]}: not listed in the manifest; export again into a new directory")
     pair = all(name in _section(manifest, "graphs") for name in LANGUAGE_PAIR)
@@ -173,9 +205,27 @@ def load_artifacts(directory: Path) -> Artifacts:
         graphs=graphs,
         contents=contents,
         identities=identities,
+        release=release,
     )
     check_contract(artifacts)
+    for graph in graphs.values():
+        _check_external_data(graph, contents[graph.file], identities)
+    if trust is not None and release is not None:
+        trust.accept(release)
     return artifacts
+
+
+def _check_external_data(graph: GraphContract, content: bytes, identities: Mapping[str, FileIdentity]) -> None:
+    """Weights outside a graph lie in the data files that the manifest lists for it, and inside those."""
+    try:
+        for data in external_data(content):
+            if data.location not in graph.data_files:
+                raise ExternalDataError(f"weights in {data.location!r}, which the manifest does not list for it")
+            size = identities[data.location].size
+            if data.offset + (data.length or 0) > size:
+                raise ExternalDataError(f"weights beyond the {size} bytes of {data.location}")
+    except ExternalDataError as error:
+        raise ArtifactError(f"{graph.file}: {error}; export again") from error
 
 
 def _section(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -237,16 +287,16 @@ def _runtime(section: dict[str, Any]) -> RuntimeConfig:
     fields = RuntimeConfig.__dataclass_fields__
     if set(section) != set(fields):
         raise ArtifactError(f"{MANIFEST_NAME}: runtime has {sorted(section)}, expected {sorted(fields)}")
-    offsets = section["frame_offsets_s"]
-    numbers = [value for key, value in section.items() if key != "frame_offsets_s"]
-    if not isinstance(offsets, list) or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6 for v in [*numbers, *offsets]
+    lists = {key: section[key] for key in _LISTS}
+    numbers = {key: value for key, value in section.items() if key not in lists}
+    if not all(isinstance(values, list) and len(values) <= 1024 for values in lists.values()) or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6
+        for v in [*numbers.values(), *(v for values in lists.values() for v in values)]
     ):
         raise ArtifactError(f"{MANIFEST_NAME}: runtime values must be numbers that are not negative")
-    values = {
-        key: value if key == "step_s" else int(value) for key, value in section.items() if key != "frame_offsets_s"
-    }
-    return RuntimeConfig(frame_offsets_s=tuple(float(v) for v in offsets), **values)
+    values: dict[str, Any] = {key: value if key == "step_s" else int(value) for key, value in numbers.items()}
+    values |= {key: tuple((float if key == "frame_offsets_s" else int)(v) for v in lists[key]) for key in _LISTS}
+    return RuntimeConfig(**values)
 
 
 def check_contract(artifacts: Artifacts) -> None:

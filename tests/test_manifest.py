@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from edge.artifact_files import ArtifactError, seal
+from edge.artifact_files import SCHEMA_VERSION, ArtifactError, seal
 from edge.graph import Graph
 from edge.language import LanguageModel
 from edge.manifest import load_artifacts
@@ -115,7 +116,7 @@ def test_a_listed_path_that_leaves_the_directory_is_refused(copy: Path, name: st
         load_artifacts(copy)
 
 
-@pytest.mark.parametrize("version", [0, 1, 3, "2", None])
+@pytest.mark.parametrize("version", [0, SCHEMA_VERSION - 1, SCHEMA_VERSION + 1, str(SCHEMA_VERSION), None])
 def test_another_schema_version_is_refused(copy: Path, version: object) -> None:
     edit(copy, lambda m: m.update(schema_version=version))
     with pytest.raises(ArtifactError, match="schema version"):
@@ -153,6 +154,9 @@ def test_widths_that_do_not_fit_one_another_are_refused(copy: Path) -> None:
         {"tick_period_ms": 0},
         {"frame_offsets_s": []},
         {"frame_offsets_s": [1e5]},
+        {"control_cores": 3},
+        {"reasoning_cores": [-1]},
+        {"control_priority": 100},
         {"max_context": 0},
         {"max_new_tokens": -1},
         {"step_s": "0.1"},
@@ -195,8 +199,8 @@ def test_weights_outside_the_graph_cannot_be_reached(copy: Path, monkeypatch: py
     # The file is there, in the working directory, with weights of the right size.
     monkeypatch.chdir(copy.parent)
     assert Path("planted.bin").exists()
-    with pytest.raises(ArtifactError, match="cannot open"):
-        Graph(load_artifacts(copy), "semantic_context", threads=1)
+    with pytest.raises(ArtifactError, match=r"semantic_context\.onnx: weights in 'planted\.bin'"):
+        load_artifacts(copy)
 
 
 def test_a_tokenizer_that_is_none_is_refused(copy: Path) -> None:
@@ -205,12 +209,47 @@ def test_a_tokenizer_that_is_none_is_refused(copy: Path) -> None:
         LanguageModel(load_artifacts(copy))
 
 
-def test_a_file_that_is_no_graph_is_refused_when_opened(copy: Path) -> None:
-    (copy / "action_expert.onnx").write_bytes(b"not a graph")
-    entry = {"bytes": 11, "sha256": hashlib.sha256(b"not a graph").hexdigest()}
-    edit(copy, lambda m: m["files"].update({"action_expert.onnx": entry}))
+def test_a_file_that_is_no_graph_is_refused(copy: Path) -> None:
+    replace(copy, "action_expert.onnx", b"not a graph")
+    with pytest.raises(ArtifactError, match=r"action_expert\.onnx: not an ONNX model"):
+        load_artifacts(copy)
+
+
+def test_a_graph_that_onnx_runtime_does_not_take_is_refused_when_opened(copy: Path) -> None:
+    replace(copy, "action_expert.onnx", onnx.ModelProto(ir_version=10).SerializeToString())
     with pytest.raises(ArtifactError, match="cannot open"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
+
+
+@pytest.mark.parametrize("name", ["model.pt", "weights.npy", "weights.pkl", "run.sh", "plugin.so", "model.onnx.py"])
+def test_a_listed_file_of_a_kind_that_artifacts_never_have_is_refused(copy: Path, name: str) -> None:
+    replace(copy, name, b"harmless")
+    with pytest.raises(ArtifactError, match=rf"{name}.*of no kind that artifacts have"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"), [(b"\x80\x04\x95", "a pickle"), (b"PK\x03\x04", "a zip archive"), (b"\x93NUMPY\x01", "a NumPy")]
+)
+def test_a_pickle_under_another_name_is_refused_by_its_content(copy: Path, head: bytes, kind: str) -> None:
+    replace(copy, "report.json", head + b"...")
+    with pytest.raises(ArtifactError, match=rf"report\.json: is {kind}"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("name", ["tokenizer.json", "manifest.json"])
+def test_a_pipe_in_the_place_of_a_file_is_refused_and_not_waited_for(copy: Path, name: str) -> None:
+    (copy / name).unlink()
+    os.mkfifo(copy / name)
+    with pytest.raises(ArtifactError, match="not a regular file"):
+        load_artifacts(copy)
+
+
+def test_a_manifest_that_is_a_symlink_is_refused(copy: Path, tmp_path: Path) -> None:
+    shutil.move(copy / "manifest.json", tmp_path / "manifest.json")
+    (copy / "manifest.json").symlink_to(tmp_path / "manifest.json")
+    with pytest.raises(ArtifactError, match=r"manifest\.json: cannot be read"):
+        load_artifacts(copy)
 
 
 @pytest.fixture(scope="module")
@@ -253,6 +292,74 @@ def test_a_data_file_that_was_replaced_after_its_hash_was_checked_is_refused(map
     other.replace(mapped_copy / DATA)
     with pytest.raises(ArtifactError, match=rf"{DATA}: changed while"):
         Graph(artifacts, "vision_encoder", threads=1)
+
+
+def test_a_data_file_with_a_second_name_is_refused(mapped_copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "second-name").hardlink_to(mapped_copy / DATA)
+    with pytest.raises(ArtifactError, match=rf"{DATA}: has 2 names"):
+        load_artifacts(mapped_copy)
+
+
+def test_a_data_file_that_is_a_symlink_is_refused(mapped_copy: Path, tmp_path: Path) -> None:
+    shutil.move(mapped_copy / DATA, tmp_path / "weights")
+    (mapped_copy / DATA).symlink_to(tmp_path / "weights")
+    with pytest.raises(ArtifactError, match=rf"{DATA}: missing or not a regular file"):
+        load_artifacts(mapped_copy)
+
+
+def external_weights(directory: Path, change: Callable[[Any], None]) -> None:
+    """Change the first reference to external data in the encoder, as somebody would who also fixes the hashes."""
+    model = onnx.load(str(directory / "vision_encoder.onnx"), load_external_data=False)
+    change(next(tensor for tensor in model.graph.initializer if tensor.external_data))
+    replace(directory, "vision_encoder.onnx", model.SerializeToString())
+
+
+def entry_set(key: str, value: str) -> Callable[[Any], None]:
+    """A change of one entry of a tensor's external data, added when it is not there."""
+
+    def change(tensor: Any) -> None:
+        for entry in tensor.external_data:
+            if entry.key == key:
+                entry.value = value
+                return
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("location", "../outside.bin", "does not list"),
+        ("location", "/etc/passwd", "does not list"),
+        ("location", "./vision_encoder.onnx.data", "does not list"),
+        ("location", "tokenizer.json", "does not list"),
+        ("location", "", "does not list"),
+        ("offset", "-8", "expected a number"),
+        ("offset", "99999999999", "beyond the"),
+        ("length", "99999999999", "beyond the"),
+        ("length", "1e3", "expected a number"),
+        ("basepath", "/etc", "with the key 'basepath'"),
+        ("__class__", "x", "with the key '__class__'"),
+    ],
+)
+def test_external_data_that_leaves_its_listed_file_is_refused(
+    mapped_copy: Path, key: str, value: str, said: str
+) -> None:
+    external_weights(mapped_copy, entry_set(key, value))
+    with pytest.raises(ArtifactError, match=rf"vision_encoder\.onnx: .*{said}"):
+        load_artifacts(mapped_copy)
+
+
+def test_external_data_given_twice_is_refused(mapped_copy: Path) -> None:
+    def change(tensor: Any) -> None:
+        entry = tensor.external_data.add()
+        entry.key, entry.value = "location", "../outside.bin"
+
+    external_weights(mapped_copy, change)
+    with pytest.raises(ArtifactError, match="once each"):
+        load_artifacts(mapped_copy)
 
 
 def test_a_data_file_that_the_manifest_does_not_list_is_refused(mapped_copy: Path) -> None:
