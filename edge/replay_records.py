@@ -1,0 +1,183 @@
+"""A flight log as replay needs it: checked records, in the order in which they happened."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.geometry import SE2
+from edge.recording import RecordingError, jpeg_bytes, read_messages
+from firmware_bridge.config import ConfigError, LimitsConfig
+
+_ORDER_WINDOW_NS = 5_000_000_000
+"""Threads record at their own pace: how far apart in time neighbouring records of the file may be."""
+_MISSHAPEN = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
+
+_Parsed = TypeVar("_Parsed")
+Rows = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """What the run was: the first record of every log."""
+
+    instruction: str
+    mode: str
+    manifest_sha256: str
+    limits: LimitsConfig | None
+    """None: a log that does not say, so that commands cannot be computed again."""
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A camera picture as it came."""
+
+    stamp_ns: int
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
+class RecordedGeneration:
+    """What a generation was given and what it said."""
+
+    number: int
+    ready_ns: int
+    frames_ns: tuple[int, ...]
+    poses: tuple[SE2, ...] | None
+    """`T_odom_base` of each frame; None: a log that does not say."""
+    anchor_pose: SE2
+    max_new_tokens: int
+    text: str
+
+
+@dataclass(frozen=True)
+class RecordedTick:
+    """What a tick was given and what came of it."""
+
+    number: int
+    now_ns: int
+    acted_ns: int
+    frame_ns: int | None
+    generation: int | None
+    delay_s: float
+    offset: SE2
+    pose: SE2 | None
+    state: tuple[float, float, float]
+    rows: Rows | None
+    """The plan at whole seconds, [seconds, 3]; NaN where the log has null."""
+    command: tuple[float, float, float]
+    reason: str
+    speed_scale: float
+
+
+Event = RecordedFrame | RecordedGeneration | RecordedTick
+
+
+def read_run(path: Path) -> RecordedRun:
+    """The `/run` record; raises RecordingError when there is none, OSError."""
+    for topic, _, payload in read_messages(path):
+        if topic == "/run":
+            return _read(path, "/run", _run, payload)
+    raise RecordingError(f"{path}: no /run record, so nothing says what was run; expected a log of edge-run --record")
+
+
+def read_events(path: Path) -> Iterator[Event]:
+    """Frames, generations and ticks in the order of their stamps; raises RecordingError for one that is misshapen."""
+    waiting: list[tuple[int, int, Event]] = []
+    newest_ns = count = 0
+    for topic, stamp_ns, payload in read_messages(path):
+        event: Event
+        if topic == "/tick":
+            event = tick = _read(path, topic, _tick, payload)
+            stamp_ns = tick.now_ns
+        elif topic == "/semantic":
+            event = generation = _read(path, topic, _generation, payload)
+            stamp_ns = generation.ready_ns
+        elif topic == "/camera":
+            event = RecordedFrame(stamp_ns, _read(path, topic, jpeg_bytes, payload))
+        else:
+            continue
+        count += 1
+        heapq.heappush(waiting, (stamp_ns, count, event))
+        newest_ns = max(newest_ns, stamp_ns)
+        while waiting[0][0] < newest_ns - _ORDER_WINDOW_NS:
+            yield heapq.heappop(waiting)[2]
+    while waiting:
+        yield heapq.heappop(waiting)[2]
+
+
+def _read(path: Path, topic: str, parse: Callable[[dict[str, Any]], _Parsed], payload: dict[str, Any]) -> _Parsed:
+    try:
+        return parse(payload)
+    except (*_MISSHAPEN, ConfigError) as error:
+        raise RecordingError(f"{path}: a {topic} record lacks or misshapes a field ({error!r})") from error
+
+
+def _run(payload: Mapping[str, Any]) -> RecordedRun:
+    limits = payload.get("limits")
+    return RecordedRun(
+        instruction=_text(payload["instruction"]),
+        mode=_text(payload["mode"]),
+        manifest_sha256=_text(payload["manifest_sha256"]),
+        limits=None if limits is None else LimitsConfig(**{key: float(value) for key, value in limits.items()}),
+    )
+
+
+def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
+    frames_ns = tuple(int(stamp_ns) for stamp_ns in payload["frames_ns"])
+    poses = payload.get("frame_poses")
+    if not frames_ns or (poses is not None and len(poses) != len(frames_ns)):
+        raise ValueError(f"{len(frames_ns)} frames, {poses and len(poses)} poses")
+    return RecordedGeneration(
+        number=int(payload["generation"]),
+        ready_ns=int(payload["ready_ns"]),
+        frames_ns=frames_ns,
+        poses=None if poses is None else tuple(_pose(pose) for pose in poses),
+        anchor_pose=_pose(payload["anchor_pose"]),
+        # Without the cap that was in force: as many as there were, which gives the same keys and values.
+        max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
+        text=_text(payload["text"]),
+    )
+
+
+def _tick(payload: Mapping[str, Any]) -> RecordedTick:
+    offset, pose, state, rows = (payload[key] for key in ("offset", "pose", "state", "trajectory"))
+    driven = payload["generation"] is not None and offset is not None and state is not None
+    now_ns = int(payload["now_ns"])
+    return RecordedTick(
+        number=int(payload["tick"]),
+        now_ns=now_ns,
+        acted_ns=now_ns + round(float(payload["act_ms"] or 0.0) * 1e6),
+        frame_ns=None if payload["frame_ns"] is None else int(payload["frame_ns"]),
+        generation=int(payload["generation"]) if driven else None,
+        delay_s=float(payload["delay_s"]) if driven else math.nan,
+        offset=_pose(offset) if driven else SE2(0.0, 0.0, 0.0),
+        pose=None if pose is None else _pose(pose),
+        state=_triple(state) if driven else (0.0, 0.0, 0.0),
+        rows=None if rows is None else np.array(rows, dtype=np.float64).reshape(-1, 3),
+        command=_triple(payload["command"]),
+        reason=_text(payload["reason"]),
+        speed_scale=float(payload.get("speed_scale", 1.0)),
+    )
+
+
+def _pose(values: Any) -> SE2:
+    return SE2(*_triple(values))
+
+
+def _triple(values: Any) -> tuple[float, float, float]:
+    a, b, c = (float(value) for value in values)
+    return a, b, c
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, found {type(value).__name__}")
+    return value
