@@ -12,6 +12,7 @@ integral of what is still above trims the aim. Pure: no clock, no thread, no I/O
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -38,7 +39,7 @@ _TRIM_PER_S: Final = 0.05
 _TRIM_MOST: Final = 0.05
 _TRIM_FORGET_S: Final = 60.0
 _LONGEST_PAUSE_S: Final = 60.0
-_SEARCH_S: Final = 0.1
+_COARSE_S, _FINE_S = 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,8 @@ class Governor:
     def _learn(self, inputs: GovernorInputs, now_ns: int) -> None:
         """Take the sample, or what it should have been, into the history; learn levels and lengths."""
         share, dt_s = float(inputs.reasoning), 0.0
+        if self._metered_ns is None:
+            self._metered_ns = now_ns  # a meter that has just been opened may take its time
         if self._last is not None:
             last_ns, last = self._last
             dt_s = max(0.0, (now_ns - last_ns) / 1e9)
@@ -232,18 +235,15 @@ class Governor:
         before_j = self._history.energy_since(now_ns)
         window_s = self._config.window_s
         ended_ns = now_ns if inputs.reasoning or self._ended_ns is None else self._ended_ns
-        wait_s = 0.0
-        while wait_s <= window_s:
+
+        def fits(wait_s: float) -> bool:
             end_ns = now_ns + round((wait_s + generation_s) * 1e9)
             rest_s = min(wait_s, max(0.0, window_s - generation_s))
-            energy = (
-                before_j(min(now_ns, end_ns - round(window_s * 1e9)))
-                + levels.base_w * rest_s
-                + levels.at(1.0) * min(generation_s, window_s)
-            )
-            if energy <= aim_w * window_s:
-                break
-            wait_s += _SEARCH_S
+            spent_j = before_j(min(now_ns, end_ns - round(window_s * 1e9)))
+            busy_j = levels.at(1.0) * min(generation_s, window_s)
+            return spent_j + levels.base_w * rest_s + busy_j <= aim_w * window_s
+
+        wait_s = _first(fits, window_s)
         return (now_ns - ended_ns) / 1e9 + wait_s if wait_s > 0 else 0.0
 
     def _longest_pause(self, level: int) -> float:
@@ -300,6 +300,16 @@ class Governor:
         if average_w is not None and budget_w is not None:
             parts.append(f"{average_w:.1f} W of {budget_w:.1f} W")
         return "; ".join(parts) or None
+
+
+def _first(fits: Callable[[float], bool], most_s: float) -> float:
+    """Shortest wait that fits, to a tenth of a second; `most_s` if none does."""
+    wait_s = 0.0
+    while wait_s < most_s and not fits(wait_s):
+        wait_s += _COARSE_S
+    while wait_s > 0 and wait_s <= most_s and fits(wait_s - _FINE_S):
+        wait_s -= _FINE_S
+    return min(max(wait_s, 0.0), most_s)
 
 
 _WORDS: Final = (

@@ -14,7 +14,7 @@ from typing import Final
 
 from edge.power.sysfs import SYSFS, read_int, read_text
 
-JUNCTION: Final = ("tj-thermal", "Tj-therm")
+JUNCTION: Final = ("tj-thermal", "tj-therm", "Tj-therm")
 """Jetson's hottest point, as its own zone; on some carrier boards it is there and reads as nothing."""
 LOWEST_C, HIGHEST_C = -40.0, 150.0
 """A disabled Jetson zone reads -256 °C."""

@@ -143,10 +143,10 @@ class Run:
     step_us: float = 0.0
 
 
-def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, budget_w: float | None = None) -> Run:
-    """Drive the governor on the modelled device for that long."""
+def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: bool = True) -> Run:
+    """Drive the governor on the modelled device for that long; `governed` off: nobody reads what it says."""
     stages, power = orin()
-    budget_w = budget_w or power.budget_w or math.nan
+    budget_w = power.budget_w or math.nan
     factor = load_factor(load, stages, budget_w)
     config = GovernorConfig(budget_w, power.max_new_tokens, power.max_delay_s, power.model)
     governor, rng = Governor(config), random.Random(seed)
@@ -165,7 +165,7 @@ def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, budget_w: f
         run.ticks += 1
         run.missed += free_s > end_s + 1e-9
         while free_s < end_s:
-            call_s = reasoning.next_call(free_s, outputs.budget)
+            call_s = reasoning.next_call(free_s, outputs.budget if governed else UNLIMITED)
             if call_s is None:
                 free_s = min(end_s, free_s + 0.02)
                 continue
