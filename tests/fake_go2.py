@@ -11,7 +11,7 @@ import numpy as np
 from firmware_bridge.config import DdsConfig
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus
-from firmware_bridge.unitree.idl import SportModeState_
+from firmware_bridge.unitree.idl import SportModeState_, WirelessController_
 from sim_hil.go2 import RobotTruth
 from sim_hil.sport import SportAction
 from sim_hil.unitree.service import ServiceServer
@@ -39,17 +39,17 @@ class Heard:
 class FakeGo2:
     """Serves in a thread of its own until `close`.
 
-    `reporting = False` makes it fall silent; `truth` changes what it reports (fields of RobotTruth).
+    `reporting = False` makes it fall silent; `truth` changes what it reports (fields of RobotTruth); `remote` is what
+    its remote sends: lx, ly, rx, ry, keys; requests in `unanswered` are heard and never answered.
     """
 
     def __init__(self, domain: int) -> None:
-        self.mode = ids.MODE_LIE_DOWN
-        self.reporting = True
-        self.truth: dict[str, object] = {}
         self.heard: list[Heard] = []
+        self.reset()
         self.bus = Bus(DdsConfig(domain, "lo", ("127.0.0.1",)))
         self._server = ServiceServer(self.bus, ids.SPORT_SERVICE)
         self._state = self.bus.writer(ids.SPORT_STATE_TOPIC, SportModeState_)
+        self._remote = self.bus.writer(ids.REMOTE_TOPIC, WirelessController_)
         self._waitset = self.bus.waitset(self._server.reader)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -61,6 +61,12 @@ class FakeGo2:
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
         pass
+
+    def reset(self) -> None:
+        """Lie down, behave, and forget what was heard."""
+        self.mode, self.reporting, self.truth, self.version = ids.MODE_LIE_DOWN, True, {}, ids.SERVICE_VERSION
+        self.remote, self.unanswered = (0.0, 0.0, 0.0, 0.0, 0), set()
+        self.heard.clear()
 
     def moves(self) -> list[Heard]:
         return [heard for heard in list(self.heard) if heard.api_id == ids.MOVE]
@@ -79,12 +85,17 @@ class FakeGo2:
         report_ns = 0
         while not self._closing.is_set():
             self._waitset.wait(5_000_000)
-            for request in self._server.serve(lambda api_id, text: handle_sport(self, api_id, text)):
+            for request in self._server.requests():
                 velocity = parse_move(request.parameter) if request.api_id == ids.MOVE else None
                 self.heard.append(Heard(request.received_ns, request.api_id, velocity))
+                if request.api_id == ids.API_VERSION:
+                    self._server.reply(request, ids.OK, self.version)
+                elif request.api_id not in self.unanswered:
+                    self._server.reply(request, *handle_sport(self, request.api_id, request.parameter))
             now_ns = time.monotonic_ns()
             if self.reporting and now_ns - report_ns >= 20_000_000:
                 report_ns = now_ns
+                self._remote.write(WirelessController_(*self.remote))
                 truth = standing(self.mode, time_s=now_ns / 1e9, **self.truth)
                 self._state.write(sport_mode_state(truth, OdometryFrame((0.0, 0.0, 0.0))))
 
