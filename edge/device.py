@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ _PACKAGES = {
     TENSORRT: ("tensorrt", "tensorrt-cu12", "tensorrt-cu13"),
     OPENVINO: ("openvino", "onnxruntime-ep-openvino", "onnxruntime-openvino"),
 }
+_ACCELERATED = (TENSORRT, CUDA)
 _LIBRARIES = {TENSORRT: "libnvinfer.so.*"}
 _LIBRARY_FOLDERS = ("usr/lib/aarch64-linux-gnu", "usr/lib/x86_64-linux-gnu", "usr/local/lib")
 
@@ -53,6 +54,11 @@ def package_version(name: str) -> str | None:
 def available_providers() -> list[str]:
     """Execution providers that this ONNX Runtime has."""
     return list(ort.get_available_providers())
+
+
+def shares_device(providers: Iterable[str], others: Iterable[str]) -> bool:
+    """Whether some of either list compute on one accelerator, where calls wait for each other whatever the cores."""
+    return any(p in _ACCELERATED for p in providers) and any(p in _ACCELERATED for p in others)
 
 
 def read_device(

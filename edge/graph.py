@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,26 @@ class GraphError(RuntimeError):
     """ONNX Runtime failed while running a graph."""
 
 
+class CancelledError(Exception):
+    """A generation was told to stop."""
+
+
+class Interrupt:
+    """Ends calls from another thread, also in the middle of one; it belongs to one generation and stays set.
+
+    ONNX Runtime looks at it between two nodes of a graph, so a compiled engine, which is one node, is finished first.
+    """
+
+    def __init__(self) -> None:
+        self.options = ort.RunOptions()
+        self.is_set = False
+
+    def set(self) -> None:
+        """End the call under way and every later one."""
+        self.is_set = True
+        self.options.terminate = True
+
+
 class Graph:
     """A session on the execution provider and with the threads that the manifest names, unless told otherwise.
 
@@ -37,11 +57,23 @@ class Graph:
     """
 
     def __init__(
-        self, artifacts: Artifacts, name: str, *, threads: int | None = None, provider: str | None = None
+        self,
+        artifacts: Artifacts,
+        name: str,
+        *,
+        threads: int | None = None,
+        provider: str | None = None,
+        cores: Collection[int] = (),
     ) -> None:
+        """`cores`: where the session's own worker threads may run; empty: where the opening thread may."""
         contract = artifacts.graphs[name]
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or contract.session.threads or 1
+        if cores and options.intra_op_num_threads > 1:
+            # The calling thread is the first of them; ONNX Runtime counts processors from 1.
+            worker = ",".join(str(core + 1) for core in sorted(cores))
+            affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
+            options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
         options.inter_op_num_threads = 1
         # A spinning worker would take the core that the other thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -91,24 +123,31 @@ class Graph:
         """Where the graph's large buffers belong, in ONNX Runtime's words: `cpu` or `cuda`."""
         return _DEVICES.get(self.provider, "cpu")
 
-    def run(self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None) -> list[Array]:
-        """Outputs (all, or those named) for named inputs; raises GraphError."""
+    def run(
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None, interrupt: Interrupt | None = None
+    ) -> list[Array]:
+        """Outputs (all, or those named) for named inputs; raises GraphError, or CancelledError when interrupted."""
         try:
-            result: list[Array] = self._session.run(outputs, feeds)
+            result: list[Array] = self._session.run(outputs, feeds, interrupt.options if interrupt else None)
         except Exception as error:
-            raise GraphError(f"{self.name}: {str(error).splitlines()[0]}") from error
+            raise self._failure(error, interrupt) from error
         return result
 
     def binding(self) -> ort.IOBinding:
         """A new set of bound buffers for `run_bound`."""
         return self._session.io_binding()
 
-    def run_bound(self, binding: ort.IOBinding) -> None:
-        """Run on bound buffers, in place where an input and an output share one; raises GraphError."""
+    def run_bound(self, binding: ort.IOBinding, interrupt: Interrupt | None = None) -> None:
+        """Run on bound buffers, in place where an input and an output share one; raises as `run` does."""
         try:
-            self._session.run_with_iobinding(binding)
+            self._session.run_with_iobinding(binding, interrupt.options if interrupt else None)
         except Exception as error:
-            raise GraphError(f"{self.name}: {str(error).splitlines()[0]}") from error
+            raise self._failure(error, interrupt) from error
+
+    def _failure(self, error: Exception, interrupt: Interrupt | None) -> Exception:
+        if interrupt is not None and interrupt.is_set:
+            return CancelledError(self.name)
+        return GraphError(f"{self.name}: {str(error).splitlines()[0]}")
 
 
 def zeros(contract: TensorContract, **axes: int) -> Array:

@@ -1,4 +1,4 @@
-"""The slow half of the model: prefill in chunks, then greedy decoding, stoppable between any two calls."""
+"""The slow half of the model: prefill in chunks, then greedy decoding, stoppable between any two calls and in one."""
 
 from __future__ import annotations
 
@@ -13,17 +13,14 @@ from tokenizers import Tokenizer
 
 from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
-from edge.graph import DTYPES, Graph, zeros
+from edge.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.manifest import Artifacts
 from edge.prompt import InstructionError, PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_TEXT_CHARS
 from edge.ring import EncodedFrame
+from edge.scheduling import Schedule, run_as
 
 Floats = npt.NDArray[np.float32]
-
-
-class CancelledError(Exception):
-    """The generation was told to stop."""
 
 
 class ContextOverflowError(ValueError):
@@ -80,7 +77,7 @@ def set_last_apart(prompt: Sequence[Chunk]) -> list[Chunk]:
     return [*head, *([Chunk(tail.ids[:-1], tail.tokens, tail.image_offset)] if tail.ids[:-1] else []), last]
 
 
-class _Call:
+class Call:
     """One language graph bound once to KV buffers that every call extends in place."""
 
     def __init__(self, graph: Graph, buffers: dict[str, ort.OrtValue]) -> None:
@@ -95,7 +92,7 @@ class _Call:
         visual = next((tensor for tensor in graph.contract.inputs if tensor.name == "visual_tokens"), None)
         self._no_frame = None if visual is None else zeros(visual, F=1)
 
-    def __call__(self, chunk: Chunk, past: int, kv: Floats) -> int:
+    def __call__(self, chunk: Chunk, past: int, kv: Floats, interrupt: Interrupt | None) -> int:
         """Feed a chunk after `past` tokens, fill its rows of `kv` [1, T, kv_dim], return the id after it (0: none)."""
         total = past + len(chunk.ids)
         feeds: dict[str, npt.NDArray[np.generic]] = {
@@ -110,21 +107,37 @@ class _Call:
             self._binding.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(value))
         rows = ort.OrtValue.ortvalue_from_numpy(kv[:, past:total])
         self._binding.bind_ortvalue_output("last_layer_kv", rows)
-        self._graph.run_bound(self._binding)
+        self._graph.run_bound(self._binding, interrupt)
         return int(self._next_token[0, 0])
 
 
 class LanguageModel:
     """Prefill and greedy decoding over KV buffers that are allocated once."""
 
-    def __init__(self, artifacts: Artifacts, *, threads: int | None = None, provider: str | None = None) -> None:
+    def __init__(
+        self,
+        artifacts: Artifacts,
+        *,
+        threads: int | None = None,
+        provider: str | None = None,
+        schedule: Schedule | None = None,
+    ) -> None:
+        """`schedule`: where the graphs' own threads run and how urgently."""
         runtime = artifacts.runtime
-        graphs = [Graph(artifacts, name, threads=threads, provider=provider) for name in artifacts.language_graphs]
+        role = schedule.reasoning if schedule else None
+        cores = role.cores if role else ()
+        graphs = run_as(
+            role,
+            lambda: [
+                Graph(artifacts, name, threads=threads, provider=provider, cores=cores)
+                for name in artifacts.language_graphs
+            ],
+        )
         try:
             self._tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
         except Exception as error:
             raise ArtifactError(f"tokenizer.json: not a tokenizer ({error})") from error
-        self._runtime = runtime
+        self.runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
         )
@@ -138,10 +151,11 @@ class LanguageModel:
             )
             for cache in graphs[0].contract.caches
         }
-        calls = [_Call(graph, buffers) for graph in graphs]
-        self._prefill, self._decode = calls[0], calls[-1]
+        calls = [Call(graph, buffers) for graph in graphs]
+        self.prefill_call, self.decode_call = calls[0], calls[-1]
         self._no_frame = zeros(graphs[0].contract.input("visual_tokens"), F=1).astype(np.float32)
         self._kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
+        self._took_ns: dict[int, int] = {}
 
     def check_instruction(self, instruction: str, frames: int) -> None:
         """Raise InstructionError unless a prompt with `frames` frames and a full answer fit the model's context."""
@@ -150,7 +164,7 @@ class LanguageModel:
             EncodedFrame(i, past if i + 1 < frames else SE2(0.0, 0.0, 0.0), self._no_frame) for i in range(frames)
         ]
         needed = sum(len(segment.ids) for segment in self.prompt.build(filler, instruction))
-        room = self._runtime.max_context - self._runtime.max_new_tokens
+        room = self.runtime.max_context - self.runtime.max_new_tokens
         if needed > room:
             raise InstructionError(
                 f"instruction makes a prompt of {needed} tokens, the model has room for {room}: shorten it"
@@ -159,41 +173,110 @@ class LanguageModel:
     def generate(
         self, segments: Sequence[Segment], *, max_new_tokens: int, cancelled: Callable[[], bool]
     ) -> Generation:
-        """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt.
+        """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt."""
+        return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens)
 
-        One caller at a time: the KV buffers are this object's.
+    def begin(
+        self,
+        cancelled: Callable[[], bool],
+        *,
+        interrupt: Interrupt | None = None,
+        before_call: Callable[[int], None] | None = None,
+    ) -> GenerationRun:
+        """A generation whose prompt is given piece by piece; the one before it must be over: they share buffers.
+
+        `cancelled` is asked before every call of a graph, `interrupt` can end one under way, and `before_call` is told
+        for how many ns the next call will take the processor.
         """
-        runtime = self._runtime
-        prompt_tokens = sum(len(segment.ids) for segment in segments)
-        room = runtime.max_context - prompt_tokens
-        if room < 0:
-            raise ContextOverflowError(f"prompt of {prompt_tokens} tokens, the model reads {runtime.max_context}")
-        prompt = chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
-        if self._prefill is not self._decode:
-            # A prefill graph of a pair has no vocabulary projection: the last token goes through the decode graph.
-            prompt = set_last_apart(prompt)
+        return GenerationRun(self, cancelled, interrupt, before_call)
+
+    def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> int:
+        """Feed a chunk after `past` tokens; the id after it (0 from a graph that chooses none)."""
         started_ns = time.monotonic_ns()
-        fed, next_id = 0, runtime.im_end_id
-        for index, chunk in enumerate(prompt):
-            call = self._decode if index + 1 == len(prompt) else self._prefill
-            next_id = self._feed(call, chunk, fed, cancelled)
-            fed += len(chunk.ids)
+        next_id = call(chunk, past, self._kv, interrupt)
+        self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
+        return next_id
+
+    def expected_ns(self, tokens: int) -> int:
+        """How long the last call of that many tokens took; 0 before there was one."""
+        return self._took_ns.get(tokens, 0)
+
+    def last_layer_kv(self, tokens: int) -> Floats:
+        """A copy of K‖V of the first tokens, [1, tokens, kv_dim]."""
+        return self._kv[:, :tokens].copy()
+
+    def text_of(self, ids: Sequence[int]) -> str:
+        """The text of new tokens, cut at the most that is read."""
+        return str(self._tokenizer.decode(list(ids), skip_special_tokens=True))[:MAX_TEXT_CHARS]
+
+
+class GenerationRun:
+    """One generation under way: `feed` parts of the prompt that are known, then `finish` with the rest.
+
+    The prompt is cut into the same calls however it is fed, so keys, values and text are the same bit for bit. Every
+    method raises CancelledError, ContextOverflowError or GraphError, after which this object is of no further use.
+    """
+
+    def __init__(
+        self,
+        model: LanguageModel,
+        cancelled: Callable[[], bool],
+        interrupt: Interrupt | None,
+        before_call: Callable[[int], None] | None,
+    ) -> None:
+        self._model = model
+        self._cancelled = cancelled
+        self._interrupt = interrupt
+        self._before_call = before_call
+        self._fed = 0
+        self._prefill_ns = 0
+
+    def feed(self, segments: Sequence[Segment]) -> None:
+        """Prefill the next part of the prompt; at least one segment has to be left for `finish`."""
+        started_ns = time.monotonic_ns()
+        for chunk in self._cut(segments):
+            self._run(self._model.prefill_call, chunk)
+        self._prefill_ns += time.monotonic_ns() - started_ns
+
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int) -> Generation:
+        """Prefill the rest of the prompt, whose last token is text, and decode greedily."""
+        model, runtime = self._model, self._model.runtime
+        started_ns = time.monotonic_ns()
+        *head, last = self._cut(segments)
+        if model.prefill_call is not model.decode_call:
+            # A prefill graph of a pair has no vocabulary projection: the last token goes through the decode graph.
+            *head, last = set_last_apart([*head, last])
+        for chunk in head:
+            self._run(model.prefill_call, chunk)
+        next_id = self._run(model.decode_call, last)
+        prompt_tokens = self._fed
         prefilled_ns = time.monotonic_ns()
         new_ids: list[int] = []
+        room = runtime.max_context - prompt_tokens
         while len(new_ids) < min(max_new_tokens, room) and next_id != runtime.im_end_id:
             new_ids.append(next_id)
-            next_id = self._feed(self._decode, Chunk((next_id,), None, 0), fed, cancelled)
-            fed += 1
+            next_id = self._run(model.decode_call, Chunk((next_id,), None, 0))
         return Generation(
-            text=self._tokenizer.decode(new_ids, skip_special_tokens=True)[:MAX_TEXT_CHARS],
-            last_layer_kv=self._kv[:, :fed].copy(),
+            text=model.text_of(new_ids),
+            last_layer_kv=model.last_layer_kv(self._fed),
             token_ids=tuple(new_ids),
             prompt_tokens=prompt_tokens,
-            prefill_ms=(prefilled_ns - started_ns) / 1e6,
+            prefill_ms=(self._prefill_ns + prefilled_ns - started_ns) / 1e6,
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
         )
 
-    def _feed(self, call: _Call, chunk: Chunk, past: int, cancelled: Callable[[], bool]) -> int:
-        if cancelled():
+    def _cut(self, segments: Sequence[Segment]) -> list[Chunk]:
+        runtime = self._model.runtime
+        tokens = self._fed + sum(len(segment.ids) for segment in segments)
+        if tokens > runtime.max_context:
+            raise ContextOverflowError(f"prompt of {tokens} tokens, the model reads {runtime.max_context}")
+        return chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
+
+    def _run(self, call: Call, chunk: Chunk) -> int:
+        if self._before_call is not None:
+            self._before_call(self._model.expected_ns(len(chunk.ids)))
+        if self._cancelled():
             raise CancelledError
-        return call(chunk, past, self._kv)
+        next_id = self._model.run(call, chunk, self._fed, self._interrupt)
+        self._fed += len(chunk.ids)
+        return next_id

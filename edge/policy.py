@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from typing import cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import onnxruntime as ort
 
 from edge.geometry import SE2
-from edge.graph import Graph
+from edge.graph import Graph, Interrupt, zeros
 from edge.manifest import Artifacts
+from edge.scheduling import Schedule, TickActivity, run_as
 from edge.semantic import Context, SemanticState
 
 FloatArray = npt.NDArray[np.float32]
@@ -26,23 +30,64 @@ def fit_frame(rgb: npt.NDArray[np.uint8], image_px: int) -> npt.NDArray[np.uint8
 
 
 class Policy:
-    """π of equation 1, in the three calls that run at different rates."""
+    """π of equation 1, in the three calls that run at different rates.
 
-    def __init__(self, artifacts: Artifacts, *, threads: int | None = None, provider: str | None = None) -> None:
-        def graph(name: str) -> Graph:
-            return Graph(artifacts, name, threads=threads, provider=provider)
+    `encode` and `act` belong to one thread: their buffers are bound once and written in place.
+    """
 
-        self._vision, self._action, self._context = (
-            graph(name) for name in ("vision_encoder", "action_expert", "semantic_context")
+    def __init__(
+        self,
+        artifacts: Artifacts,
+        *,
+        threads: int | None = None,
+        provider: str | None = None,
+        schedule: Schedule | None = None,
+        activity: TickActivity | None = None,
+    ) -> None:
+        """`schedule`: where the graphs' own threads run and how urgently; `activity` hears of every call of a tick."""
+        control, reasoning = (schedule.control, schedule.reasoning) if schedule else (None, None)
+
+        def graph(name: str, cores: Sequence[int]) -> Graph:
+            return Graph(artifacts, name, threads=threads, provider=provider, cores=cores)
+
+        cores = control.cores if control else ()
+        self._vision, self._action = run_as(
+            control, lambda: (graph("vision_encoder", cores), graph("action_expert", cores))
         )
+        self._context = run_as(reasoning, lambda: graph("semantic_context", reasoning.cores if reasoning else ()))
+        self._activity = activity or TickActivity(artifacts.runtime.tick_period_ms * 1_000_000)
+        self.tokens_shape = zeros(self._vision.contract.output("visual_tokens")).shape
+        """Of one frame's visual tokens, (1, N, D)."""
+        self._encoding, self._acting = self._vision.binding(), self._action.binding()
+        self._state, self._latency = (
+            cast(FloatArray, zeros(self._action.contract.input(name))) for name in ("state", "latency")
+        )
+        self._trajectory = cast(FloatArray, zeros(self._action.contract.output("trajectory")))
+        self._small = {
+            name: ort.OrtValue.ortvalue_from_numpy(buffer)
+            for name, buffer in (("state", self._state), ("latency", self._latency))
+        }
+        self._acting.bind_ortvalue_output("trajectory", ort.OrtValue.ortvalue_from_numpy(self._trajectory))
+        self._bound: Context | None = None
 
-    def encode(self, frame: npt.NDArray[np.uint8]) -> FloatArray:
-        """Frame [1, px, px, 3] → visual tokens [1, N, D] (every new frame, control thread)."""
-        return cast(FloatArray, self._vision.run({"frame": frame})[0])
+    def encode(self, frame: npt.NDArray[np.uint8], out: FloatArray | None = None) -> FloatArray:
+        """Frame [1, px, px, 3] → visual tokens [1, N, D] (every new frame, control thread).
 
-    def semantic_context(self, last_layer_kv: FloatArray) -> Context:
+        They are written into `out` if it is given, such as a token ring's next buffer, else into an array of their own.
+        """
+        tokens = np.empty(self.tokens_shape, dtype=np.float32) if out is None else out
+        if tokens.shape != self.tokens_shape or tokens.dtype != np.float32 or not tokens.flags.c_contiguous:
+            raise ValueError(f"out must be a contiguous float32{list(self.tokens_shape)}")
+        # Neither copies anything: they say where the graph reads and writes.
+        self._encoding.bind_ortvalue_input("frame", ort.OrtValue.ortvalue_from_numpy(frame))
+        self._encoding.bind_ortvalue_output("visual_tokens", ort.OrtValue.ortvalue_from_numpy(tokens))
+        self._run(self._vision, self._encoding)
+        return tokens
+
+    def semantic_context(self, last_layer_kv: FloatArray, interrupt: Interrupt | None = None) -> Context:
         """K‖V [1, T, kv_dim] → keys and values for every layer (once a generation, reasoning thread)."""
-        return dict(zip(self._context.output_names, self._context.run({"last_layer_kv": last_layer_kv}), strict=True))
+        outputs = self._context.run({"last_layer_kv": last_layer_kv}, interrupt=interrupt)
+        return dict(zip(self._context.output_names, outputs, strict=True))
 
     def act(
         self,
@@ -53,10 +98,22 @@ class Policy:
         semantic: SemanticState,
     ) -> FloatArray:
         """Planned trajectory [steps, 3] in the current robot frame (every tick, control thread)."""
-        feeds = {
-            "visual_tokens": visual_tokens,
-            "state": np.array([state], dtype=np.float32),
-            "latency": np.array([[delay_s, offset.x_m, offset.y_m, offset.theta_rad]], dtype=np.float32),
-            **semantic.context,
-        }
-        return cast(FloatArray, self._action.run(feeds)[0][0])
+        if semantic.context is not self._bound:
+            for name, tensor in semantic.context.items():
+                self._acting.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(tensor))
+            self._bound = semantic.context
+        self._state[0] = state
+        self._latency[0] = delay_s, offset.x_m, offset.y_m, offset.theta_rad
+        # Bound anew in every call: an accelerator's provider copies an input at the moment it is bound.
+        self._acting.bind_ortvalue_input("visual_tokens", ort.OrtValue.ortvalue_from_numpy(visual_tokens))
+        for name, value in self._small.items():
+            self._acting.bind_ortvalue_input(name, value)
+        self._run(self._action, self._acting)
+        return cast(FloatArray, self._trajectory[0].copy())
+
+    def _run(self, graph: Graph, binding: ort.IOBinding) -> None:
+        self._activity.begin(time.monotonic_ns())
+        try:
+            graph.run_bound(binding)
+        finally:
+            self._activity.end(time.monotonic_ns())

@@ -64,20 +64,27 @@ class PromptBuilder:
         return list(self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def build(self, frames: Sequence[EncodedFrame], instruction: str) -> list[Segment]:
-        """One segment a frame (oldest first), then the instruction, past motion and the assistant's turn."""
+        """One segment a frame, oldest first, then what depends on the newest frame."""
+        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(frames)]
+
+    def frame(self, number: int, frame: EncodedFrame, instruction: str) -> Segment:
+        """Frame `number` (from 1, oldest first); the first one carries the prompt's start with the instruction.
+
+        Nothing in it depends on later frames, so it can be prefilled before they have been captured.
+        """
         ids = self._ids
-        head = [ids.im_start, *self._text("system\n" + SYSTEM), ids.im_end, *self._text("\n")]
-        head += [ids.im_start, *self._text("user\n")]
-        segments: list[Segment] = []
-        for number, frame in enumerate(frames, 1):
-            image = [ids.img_start, *[ids.img_context] * self._frame_tokens, ids.img_end]
-            text = [*self._text(f"Frame {number}: "), *image, *self._text("\n")]
-            segments.append(Segment(tuple(head + text), frame.tokens))
-            head = []
-        tail = self._text(f"Instruction: {check_instruction(instruction)}\nPast motion: {past_motion(frames)}")
-        tail += [ids.im_end, *self._text("\n"), ids.im_start, *self._text("assistant\n")]
-        segments.append(Segment(tuple(head + tail), None))
-        return segments
+        head: list[int] = []
+        if number == 1:
+            head += [ids.im_start, *self._text("system\n" + SYSTEM), ids.im_end, *self._text("\n")]
+            head += [ids.im_start, *self._text(f"user\nInstruction: {check_instruction(instruction)}\n")]
+        image = [ids.img_start, *[ids.img_context] * self._frame_tokens, ids.img_end]
+        return Segment((*head, *self._text(f"Frame {number}: "), *image, *self._text("\n")), frame.tokens)
+
+    def tail(self, frames: Sequence[EncodedFrame]) -> Segment:
+        """What follows the frames: the robot's past motion, told from the newest of them, and the assistant's turn."""
+        ids = self._ids
+        text = [*self._text(f"Past motion: {past_motion(frames)}"), ids.im_end, *self._text("\n")]
+        return Segment((*text, ids.im_start, *self._text("assistant\n")), None)
 
 
 def past_motion(frames: Sequence[EncodedFrame]) -> str:

@@ -2,33 +2,81 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
 
-from edge.graph import GraphError
-from edge.language import CancelledError, ContextOverflowError, LanguageModel
+import numpy as np
+
+from edge.anchor import Anchor
+from edge.graph import CancelledError, GraphError, Interrupt
+from edge.language import ContextOverflowError, Generation, GenerationRun, LanguageModel
 from edge.policy import Policy
+from edge.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.reasoning_text import parse_waypoints
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
-from edge.semantic import SemanticState
+from edge.scheduling import REASONING_NICENESS, GiveWay, Role, enter
+from edge.semantic import Context, SemanticState
 
 IDLE_S = 0.02
-NICENESS = 10
+FRAME_POLL_S = 0.002
+"""How often a generation whose older frames are prefilled looks for its newest."""
+SYNC_DRIVE_S = 0.5
+"""Paper, appendix D, synchronous inference: how long one generation is driven by."""
+RETRY_S = 0.5
+FAILURES = 5
+FAILURE_WINDOW_S = 60.0
+"""Fault matrix row 18: so many failures within this time end reasoning until the next start."""
+SAMPLES = 4096
+"""Newest samples that statistics are made of."""
+
+
+class Mode(Enum):
+    """How reasoning and driving take turns (paper, Algorithms 3 and 4, appendix D)."""
+
+    ASYNC = "async"
+    """Both at once."""
+    SYNC = "sync"
+    """The robot halts while the VLM thinks, then drives 0.5 s on the result."""
+    NO_REASONING = "no-reasoning"
+    """Prefill only: a semantic state without a text."""
+
+
+class NotFiniteError(RuntimeError):
+    """Keys and values of a generation that hold a NaN or an infinity."""
+
+
+class MissedFrameError(RuntimeError):
+    """There was no frame at the planned instant, so the older ones are of no use."""
 
 
 class SemanticSlot:
-    """Where the reasoning thread leaves its newest result; reading and replacing `state` are single operations."""
+    """Where the reasoning thread leaves its newest result; reading and replacing a field are single operations."""
 
     def __init__(self) -> None:
         self.state: SemanticState | None = None
+        self.drive_until_ns: int | None = None
+        """Until when there may be driving; None: no such limit."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be thought about."""
+
+    number: int
+    instruction: str
 
 
 class ReasoningLoop:
-    """Generates without pause; each result is held back by `release_delay_s()` before the control thread sees it."""
+    """Generates without pause; each result is held back by `release_delay_s()` before the control thread sees it.
+
+    The queue of jobs has room for one, and the newest wins: a generation always begins with the newest frames, and
+    `submit` replaces the job that waits as well as the one under way.
+    """
 
     def __init__(
         self,
@@ -43,59 +91,214 @@ class ReasoningLoop:
         release_delay_s: Callable[[], float],
         recorder: Recorder | None,
         stop: threading.Event,
+        mode: Mode = Mode.ASYNC,
+        budget: Callable[[], ReasoningBudget] = lambda: UNLIMITED,
+        late_anchor: bool = True,
+        give_way: GiveWay | None = None,
+        role: Role | None = None,
+        say: Callable[[str], None] | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        """`budget` is asked before every call and must not wait; `give_way` where reasoning competes with the tick."""
         self._language = language
         self._policy = policy
         self._ring = ring
         self._slot = slot
-        self._instruction = instruction
-        self._offsets_s = frame_offsets_s
-        self._max_new_tokens = max_new_tokens
+        self._offsets_s = sorted({offset_s for offset_s in frame_offsets_s if offset_s > 0}, reverse=True)
+        self._max_new_tokens = 0 if mode is Mode.NO_REASONING else max_new_tokens
         self._release_delay_s = release_delay_s
         self._recorder = recorder
         self._stop = stop
+        self._sync = mode is Mode.SYNC
+        self._budget = budget
+        # A robot that stands gains nothing from a later frame.
+        self._late_anchor = late_anchor and not self._sync
+        self._give_way = give_way
+        self._role = role or Role("reasoning", niceness=REASONING_NICENESS)
+        self._say = say or (lambda _line: None)
+        self._clock = clock
+        self._job = Job(0, instruction)
+        self._under_way: tuple[Job, Interrupt] | None = None
         self._last_anchor_ns = -1
+        self._finished_ns: int | None = None
+        self._retry_ns = 0
+        self._prefix_ns = 0
+        self._context_ns = 0
+        self._failures: deque[int] = deque(maxlen=FAILURES)
+        if self._sync:
+            slot.drive_until_ns = 0
+        self.last_progress_ns = clock()
+        """When this thread was last between two calls; it stands still while a call hangs and after its death."""
+        self.failure: str | None = None
+        """Why reasoning has ended for good (latched); None while it goes on."""
         self.generations = 0
         self.failed = 0
+        self.cancelled = 0
+        self.missed_frames = 0
+        """Generations given up because there was no frame at the planned instant."""
         self.invalid_texts = 0
-        self.generation_ms: list[float] = []
+        """Complete texts that were not of the grammar; one that the budget or the mode cuts short is not counted."""
+        self.invalid_in_a_row = 0
+        self.generation_ms: deque[float] = deque(maxlen=SAMPLES)
+        self.anchor_to_ready_ms: deque[float] = deque(maxlen=SAMPLES)
+        """Δt at release: from the newest frame's capture until its semantic state may be driven by."""
+        self.late_anchor_ms: deque[float] = deque(maxlen=SAMPLES)
+        """How much longer that would have been with the frame that was newest when the generation began."""
+
+    def submit(self, instruction: str) -> None:
+        """Follow another (checked) instruction from now on; the generation under way is ended. Never waits."""
+        self._job = Job(self._job.number + 1, instruction)
+        under_way = self._under_way
+        if under_way is not None and under_way[0] is not self._job:
+            under_way[1].set()
+
+    def cancel(self) -> None:
+        """End the generation under way, also within a call; the next one begins with the newest frames."""
+        self.submit(self._job.instruction)
 
     def run(self) -> None:
-        """Loop until `stop`; a failed generation is counted and the next one is tried."""
-        with contextlib.suppress(OSError):
-            # Linux niceness is per thread: when both threads want the core, control gets it.
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        """Loop until `stop`; a failed generation is counted and another one tried."""
+        for line in enter(self._role):
+            self._say(line)
         while not self._stop.is_set():
-            frames = self._ring.select(self._offsets_s)
-            if not frames or frames[-1].stamp_ns == self._last_anchor_ns:
-                self._stop.wait(IDLE_S)
-                continue
-            try:
-                self._generate(frames)
-            except CancelledError:
-                return
-            except (GraphError, ContextOverflowError):
-                self.failed += 1
+            if not self.step():
                 self._stop.wait(IDLE_S)
 
-    def _generate(self, frames: list[EncodedFrame]) -> None:
-        anchor = frames[-1]
+    def step(self) -> bool:
+        """One generation, if there is something to think about; returns whether a semantic state was published."""
+        now_ns = self.last_progress_ns = self._clock()
+        budget = self._budget()
+        if self.failure is not None or not budget.allowed or not self._is_due(now_ns, budget):
+            return False
+        job, interrupt = self._job, Interrupt()
+        self._under_way = job, interrupt
+        try:
+            self._generate(job, interrupt, budget)
+            return True
+        except CancelledError:
+            self.cancelled += not self._stop.is_set()
+        except MissedFrameError:
+            self.missed_frames += 1
+        except (GraphError, ContextOverflowError, NotFiniteError) as error:
+            self._fail(str(error))
+        finally:
+            self._under_way = None
+        return False
+
+    def _is_due(self, now_ns: int, budget: ReasoningBudget) -> bool:
+        """Whether every pause is over and there is a frame that has not been thought about."""
+        newest_ns, halted_ns = self._ring.newest_ns, self._slot.drive_until_ns
+        if newest_ns is None or newest_ns <= self._last_anchor_ns or now_ns < self._retry_ns:
+            return False
+        if halted_ns is not None and newest_ns < halted_ns:
+            return False  # it still drives, or nothing has been seen since it was told to halt
+        return self._finished_ns is None or now_ns - self._finished_ns >= budget.pause_s * 1e9
+
+    def _fail(self, why: str) -> None:
+        now_ns = self._clock()
+        self.failed += 1
+        self._retry_ns = now_ns + round(RETRY_S * 1e9)
+        self._failures.append(now_ns)
+        if len(self._failures) == FAILURES and now_ns - self._failures[0] <= FAILURE_WINDOW_S * 1e9:
+            self.failure = f"{FAILURES} generations failed within {FAILURE_WINDOW_S:g} s, the last one: {why}"
+            self._say(f"reasoning has ended: {self.failure}")
+
+    def _is_cancelled(self, job: Job) -> bool:
+        self.last_progress_ns = self._clock()
+        return self._stop.is_set() or self._job is not job
+
+    def _generate(self, job: Job, interrupt: Interrupt, budget: ReasoningBudget) -> None:
+        def cancelled() -> bool:
+            return self._is_cancelled(job) or not self._budget().allowed
+
+        def before_call(needs_ns: int) -> None:
+            if self._give_way is not None:
+                self._give_way.wait(needs_ns, cancelled)
+
+        started_ns = self._clock()
+        run = self._language.begin(cancelled, interrupt=interrupt, before_call=before_call)
+        frames = self._prefill_older(run, job, cancelled)
+        anchor, prompt = frames[-1], self._language.prompt
+        # Whatever comes of it, this frame has been thought about.
         self._last_anchor_ns = anchor.stamp_ns
-        started_ns = time.monotonic_ns()
-        generation = self._language.generate(
-            self._language.prompt.build(frames, self._instruction),
-            max_new_tokens=self._max_new_tokens,
-            cancelled=self._stop.is_set,
+        cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
+        generation = run.finish(
+            [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(frames)],
+            max_new_tokens=min(self._max_new_tokens, cap),
         )
-        context_started_ns = time.monotonic_ns()
-        context = self._policy.semantic_context(generation.last_layer_kv)
-        finished_ns = time.monotonic_ns()
+        if not np.isfinite(generation.last_layer_kv).all():
+            raise NotFiniteError("keys and values of the last layer are not finite")
+        before_call(self._context_ns)
+        context_started_ns = self._clock()
+        context = self._policy.semantic_context(generation.last_layer_kv, interrupt)
+        finished_ns = self._finished_ns = self._clock()
+        self._context_ns = finished_ns - context_started_ns
         delay_s = self._release_delay_s()
-        if self._stop.wait(delay_s):
-            raise CancelledError
+        self._hold_back(finished_ns + round(delay_s * 1e9), job)
+        complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
+        state = self._publish(anchor, generation, context, complete)
+        self.generation_ms.append((finished_ns - started_ns) / 1e6)
+        self.anchor_to_ready_ms.append((state.ready_ns - anchor.stamp_ns) / 1e6)
+        if self._recorder is not None:
+            record = {
+                "generation": state.generation,
+                "anchor_ns": anchor.stamp_ns,
+                "anchor_pose": anchor.T_odom_base.as_tuple(),
+                "started_ns": started_ns,
+                "finished_ns": finished_ns,
+                "ready_ns": state.ready_ns,
+                "release_delay_s": delay_s,
+                "frames_ns": [frame.stamp_ns for frame in frames],
+                "prompt_tokens": generation.prompt_tokens,
+                "new_tokens": generation.new_tokens,
+                "text": generation.text,
+                "waypoints": state.waypoints,
+                "prefill_ms": generation.prefill_ms,
+                "decode_ms": generation.decode_ms,
+                "context_ms": self._context_ns / 1e6,
+            }
+            self._recorder.put("/semantic", state.ready_ns, record)
+
+    def _prefill_older(self, run: GenerationRun, job: Job, cancelled: Callable[[], bool]) -> list[EncodedFrame]:
+        """Feed the frames before the newest, then wait for that one; returns all, oldest first."""
+        begun_ns = self._ring.newest_ns
+        if begun_ns is None:
+            raise MissedFrameError
+        plan = Anchor.after(begun_ns, self._prefix_ns) if self._late_anchor else Anchor.now(begun_ns)
+        frames: list[EncodedFrame] = []
+        started_ns = self._clock()
+        for offset_s in self._offsets_s:
+            # Looked up when its turn comes: with a slow model it may not have been captured earlier.
+            frame = self._ring.nearest(plan.older_ns(offset_s))
+            if frame is None or not plan.is_older(frame.stamp_ns):
+                continue
+            if frames and frame.stamp_ns <= frames[-1].stamp_ns:
+                continue
+            frames.append(frame)
+            run.feed([self._language.prompt.frame(len(frames), frame, job.instruction)])
+        self._prefix_ns = self._clock() - started_ns
+        while True:
+            newest_ns = self._ring.newest_ns
+            stamp_ns = None if newest_ns is None else plan.choose(newest_ns)
+            if stamp_ns is not None:
+                anchor = self._ring.nearest(stamp_ns)
+                if anchor is None or (frames and anchor.stamp_ns <= frames[-1].stamp_ns):
+                    raise MissedFrameError
+                self.late_anchor_ms.append((anchor.stamp_ns - begun_ns) / 1e6)
+                return [*frames, anchor]
+            if cancelled():
+                raise CancelledError
+            self._stop.wait(FRAME_POLL_S)
+
+    def _hold_back(self, until_ns: int, job: Job) -> None:
+        while (left_ns := until_ns - self._clock()) > 0:
+            if self._is_cancelled(job) or self._stop.wait(min(left_ns / 1e9, IDLE_S)):
+                raise CancelledError
+
+    def _publish(self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool) -> SemanticState:
         waypoints = parse_waypoints(generation.text)
-        ready_ns = time.monotonic_ns()
-        self._slot.state = SemanticState(
+        ready_ns = self._clock()
+        state = SemanticState(
             generation=self.generations,
             anchor_ns=anchor.stamp_ns,
             T_odom_anchor=anchor.T_odom_base,
@@ -104,27 +307,14 @@ class ReasoningLoop:
             context=context,
             text=generation.text,
             waypoints=waypoints,
+            text_complete=complete,
         )
-        self.generation_ms.append((finished_ns - started_ns) / 1e6)
-        if waypoints is None:
-            self.invalid_texts += 1
-        if self._recorder is not None:
-            record = {
-                "generation": self.generations,
-                "anchor_ns": anchor.stamp_ns,
-                "anchor_pose": anchor.T_odom_base.as_tuple(),
-                "started_ns": started_ns,
-                "finished_ns": finished_ns,
-                "ready_ns": ready_ns,
-                "release_delay_s": delay_s,
-                "frames_ns": [frame.stamp_ns for frame in frames],
-                "prompt_tokens": generation.prompt_tokens,
-                "new_tokens": generation.new_tokens,
-                "text": generation.text,
-                "waypoints": waypoints,
-                "prefill_ms": generation.prefill_ms,
-                "decode_ms": generation.decode_ms,
-                "context_ms": (finished_ns - context_started_ns) / 1e6,
-            }
-            self._recorder.put("/semantic", ready_ns, record)
+        # First the state, then the leave to drive: between the two, the old one has run out.
+        self._slot.state = state
+        if self._sync:
+            self._slot.drive_until_ns = ready_ns + round(SYNC_DRIVE_S * 1e9)
+        if complete:
+            self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
+            self.invalid_texts += waypoints is None
         self.generations += 1
+        return state

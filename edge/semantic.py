@@ -31,6 +31,8 @@ class SemanticState:
     context: Context
     text: str
     waypoints: Waypoints | None
+    text_complete: bool = True
+    """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
 
     def delay_s(self, now_ns: int) -> float:
         """Δt: now − anchor (inference time plus time since it finished)."""

@@ -27,7 +27,7 @@ from export.verify import first_difference
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
-OLDER_SCHEMAS = (1,)
+OLDER_SCHEMAS = (1, 2)
 """Schemas whose directories an export replaces."""
 
 
@@ -50,6 +50,9 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "img_start_id": language.img_start_id,
         "img_end_id": language.img_end_id,
         "img_context_id": language.img_context_id,
+        "control_cores": list(policy.control_cores),
+        "reasoning_cores": list(policy.reasoning_cores),
+        "control_priority": policy.control_priority,
     }
 
 

@@ -18,6 +18,7 @@ SHARING = ("one-device", "own-cores")
 RUNTIME_MOST = {"tick_period_ms": 60_000, "max_new_tokens": 8192, "prefill_chunk_tokens": 8192}
 """Largest values of [runtime] that still make sense; a larger one is a slip of the keyboard."""
 MAX_FRAMES = 16
+MAX_CORES = 1024
 
 
 class TargetError(ValueError):
@@ -302,6 +303,11 @@ class RuntimePolicy:
     """Ceiling on Δt, the age of the semantic state in use."""
     enforce_plan: bool
     """Whether a plan that does not fit stops the export."""
+    control_cores: tuple[int, ...] = ()
+    """Processor cores of the control thread; empty: the runner decides by those it finds."""
+    reasoning_cores: tuple[int, ...] = ()
+    control_priority: int = 50
+    """Real-time priority of the control thread, 1 to 99; 0: none. The bridge's is above it."""
 
     def __post_init__(self) -> None:
         for name, most in RUNTIME_MOST.items():
@@ -311,6 +317,12 @@ class RuntimePolicy:
         _require(1 <= count <= MAX_FRAMES, f"frame_offsets_s names {count} frames, expected 1 to {MAX_FRAMES}")
         _require(all(0 <= offset <= 60 for offset in self.frame_offsets_s), "frame_offsets_s must be 0 to 60 s")
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
+        for name in ("control_cores", "reasoning_cores"):
+            cores = getattr(self, name)
+            _require(all(0 <= core < MAX_CORES for core in cores), f"{name} {list(cores)} must be 0 to {MAX_CORES - 1}")
+        both = sorted(set(self.control_cores) & set(self.reasoning_cores))
+        _require(not both, f"cores {both} are in control_cores and in reasoning_cores")
+        _require(0 <= self.control_priority <= 99, f"control_priority {self.control_priority} must be 0 to 99")
         _require(0 < self.max_delay_s <= 600, f"max_delay_s {self.max_delay_s} must be 0 to 600 s")
 
 

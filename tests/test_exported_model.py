@@ -9,8 +9,8 @@ import torch
 
 from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
-from edge.graph import Graph
-from edge.language import CancelledError, LanguageModel
+from edge.graph import CancelledError, Graph
+from edge.language import LanguageModel
 from edge.manifest import Artifacts
 from edge.policy import Policy
 from edge.ring import EncodedFrame

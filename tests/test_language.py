@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.geometry import SE2
-from edge.language import CancelledError, Chunk, ContextOverflowError, LanguageModel, chunks, set_last_apart
+from edge.graph import CancelledError, Interrupt
+from edge.language import Chunk, ContextOverflowError, LanguageModel, chunks, set_last_apart
 from edge.manifest import Artifacts, load_artifacts
 from edge.prompt import Segment
 from edge.ring import EncodedFrame
@@ -121,6 +122,70 @@ def test_a_generation_stops_between_two_chunks(artifacts: Artifacts) -> None:
     with pytest.raises(CancelledError):
         language.generate(segments, max_new_tokens=5, cancelled=lambda: next(calls) >= 3)
     assert next(calls) == 4
+
+
+def test_a_prompt_fed_in_parts_gives_the_same_bits(artifacts: Artifacts, pair: Artifacts) -> None:
+    """Late anchor: older frames first, then the newest with the tail; against an ordinary prefill."""
+    for directory in (artifacts, pair):
+        language = model(directory, 16)
+        segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
+        whole = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
+        run = language.begin(lambda: False)
+        for segment in segments[:3]:
+            run.feed([segment])
+        parts = run.finish(segments[3:], max_new_tokens=12)
+        np.testing.assert_array_equal(parts.last_layer_kv, whole.last_layer_kv)
+        assert (parts.token_ids, parts.text) == (whole.token_ids, whole.text)
+        assert parts.prompt_tokens == whole.prompt_tokens
+
+
+def test_a_part_that_does_not_fit_is_refused_before_it_is_fed(artifacts: Artifacts) -> None:
+    language = model(artifacts, 64)
+    segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
+    run = language.begin(lambda: False)
+    with pytest.raises(ContextOverflowError):
+        run.feed(segments * 8)
+    assert run.finish(segments, max_new_tokens=2).prompt_tokens == sum(len(s.ids) for s in segments)
+
+
+def test_every_call_is_announced_with_what_it_took_the_last_time(artifacts: Artifacts) -> None:
+    language = model(artifacts, 64)
+    segments = language.prompt.build(frames(1, 64, 256), "stop")
+    announced: list[list[int]] = []
+    for _ in range(2):
+        announced.append([])
+        language.begin(lambda: False, before_call=announced[-1].append).finish(segments, max_new_tokens=2)
+    assert announced[0][0] == 0
+    assert len(announced[1]) == len(announced[0]) > 2 and min(announced[1]) > 0
+
+
+def test_an_interrupt_from_another_thread_ends_a_call_that_is_under_way(artifacts: Artifacts) -> None:
+    """ONNX Runtime looks at it between two nodes: here it is set after the last question whether to go on."""
+    language = model(artifacts, 64)
+    segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
+    interrupt = Interrupt()
+
+    def cancelled() -> bool:
+        interrupt.set()
+        return False
+
+    with pytest.raises(CancelledError):
+        language.begin(cancelled, interrupt=interrupt).finish(segments, max_new_tokens=5)
+
+
+def test_what_was_interrupted_leaves_no_trace_in_the_next_generation(artifacts: Artifacts, expected: tuple) -> None:
+    language = model(artifacts, 64)
+    interrupt = Interrupt()
+    other = language.prompt.build(frames(4, 64, 256, seed=9), SENTENCE)
+    run = language.begin(lambda: False, interrupt=interrupt)
+    run.feed(other[:2])
+    interrupt.set()
+    with pytest.raises(CancelledError):
+        run.finish(other[2:], max_new_tokens=5)
+    segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
+    generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
+    np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
+    assert generation.token_ids == expected[1]
 
 
 def test_a_prompt_longer_than_the_context_is_refused(artifacts: Artifacts) -> None:

@@ -1,61 +1,99 @@
-"""The reasoning loop: one generation at a time, held back as told, published whole with its own anchor."""
+"""The reasoning loop: one generation at a time, from the newest frames, published whole with its own anchor."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from edge.geometry import SE2
-from edge.graph import GraphError
-from edge.language import CancelledError, Generation
-from edge.reasoning_loop import ReasoningLoop, SemanticSlot
+from edge.graph import CancelledError, GraphError, Interrupt
+from edge.language import Generation
+from edge.reasoning_budget import ReasoningBudget
+from edge.reasoning_loop import FAILURES, Mode, ReasoningLoop, SemanticSlot
 from edge.ring import EncodedFrame, TokenRing
+from edge.scheduling import Role
 
 KV = np.zeros((1, 5, 8), dtype=np.float32)
 TEXT = "Clear.\nwaypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)"
 
 
 class FakePrompt:
-    def build(self, frames: list[EncodedFrame], instruction: str) -> list[EncodedFrame]:
-        return list(frames)
+    """Parts of a prompt are what they are made of: (frame stamp in s, instruction), or "tail"."""
+
+    def frame(self, number: int, frame: EncodedFrame, instruction: str) -> tuple[float, str]:
+        return (frame.stamp_ns / 1e9, instruction)
+
+    def tail(self, frames: list[EncodedFrame]) -> str:
+        return "tail"
+
+
+class FakeRun:
+    def __init__(self, language: FakeLanguage, cancelled: Callable[[], bool], interrupt: Interrupt) -> None:
+        self.language, self.cancelled, self.interrupt = language, cancelled, interrupt
+        self.parts: list[object] = []
+
+    def feed(self, segments: list[object]) -> None:
+        self.parts += segments
+        self.language.during_feed()
+        if self.cancelled():
+            raise CancelledError
+
+    def finish(self, segments: list[object], *, max_new_tokens: int) -> Generation:
+        if self.cancelled():
+            raise CancelledError
+        if self.language.broken:
+            self.language.broken -= 1
+            raise GraphError("language_model: broken")
+        self.language.during_finish(self)
+        if self.cancelled():
+            raise CancelledError
+        stamps = [part[0] for part in (*self.parts, *segments) if isinstance(part, tuple)]
+        self.language.prompts.append(stamps)
+        self.language.instructions.append(segments[0][1])
+        self.language.caps.append(max_new_tokens)
+        new = min(max_new_tokens, self.language.new_tokens)
+        return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0)
 
 
 class FakeLanguage:
-    """Answers at once, except while `broken` says otherwise."""
+    """Answers at once; what else a test wants of it happens during its calls."""
 
     def __init__(self) -> None:
         self.prompt = FakePrompt()
-        self.prompts: list[list[int]] = []
-        self.broken = 0
+        self.prompts: list[list[float]] = []
+        self.instructions: list[str] = []
+        self.caps: list[int] = []
+        self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
+        self.during_feed: Callable[[], None] = lambda: None
+        self.during_finish: Callable[[FakeRun], None] = lambda run: None
 
-    def generate(
-        self, segments: list[EncodedFrame], *, max_new_tokens: int, cancelled: Callable[[], bool]
-    ) -> Generation:
-        if cancelled():
-            raise CancelledError
-        if self.broken:
-            self.broken -= 1
-            raise GraphError("language_model: broken")
-        self.prompts.append([frame.stamp_ns for frame in segments])
-        return Generation(TEXT, KV, (7,), 4, 1.0, 1.0)
+    def begin(
+        self, cancelled: Callable[[], bool], *, interrupt: Interrupt, before_call: Callable[[int], None]
+    ) -> FakeRun:
+        return FakeRun(self, cancelled, interrupt)
 
 
 class FakePolicy:
-    def semantic_context(self, last_layer_kv: np.ndarray) -> dict[str, np.ndarray]:
+    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: Interrupt) -> dict[str, np.ndarray]:
         return {"context.0.key": last_layer_kv + 1, "context.0.value": last_layer_kv + 2}
 
 
 class Bench:
-    """A reasoning loop in a thread of its own, with frames that the test provides."""
+    """A reasoning loop with frames and a clock that the test provides; a thread only inside `with`."""
 
-    def __init__(self, delay_s: float = 0.0) -> None:
+    def __init__(self, delay_s: float = 0.0, **more: object) -> None:
         self.language = FakeLanguage()
-        self.ring = TokenRing(64)
+        self.ring = TokenRing(256)
         self.slot = SemanticSlot()
         self.stop = threading.Event()
+        self.budget = ReasoningBudget()
+        self.said: list[str] = []
+        self.records: list[dict[str, object]] = []
         self.loop = ReasoningLoop(
             language=self.language,  # type: ignore[arg-type]
             policy=FakePolicy(),  # type: ignore[arg-type]
@@ -65,8 +103,12 @@ class Bench:
             frame_offsets_s=(0.0, 3.0),
             max_new_tokens=4,
             release_delay_s=lambda: delay_s,
-            recorder=None,
+            recorder=SimpleNamespace(put=lambda topic, stamp, record: self.records.append(record)),  # type: ignore[arg-type]
             stop=self.stop,
+            budget=lambda: self.budget,
+            role=Role("reasoning"),
+            say=self.said.append,
+            **more,  # type: ignore[arg-type]
         )
         self.thread = threading.Thread(target=self.loop.run)
 
@@ -82,18 +124,40 @@ class Bench:
     def frame(self, second: float) -> None:
         self.ring.put(EncodedFrame(round(second * 1e9), SE2(second, 0, 0), KV))
 
-    def wait_for(self, generations: int) -> None:
+    def wait_for(self, what: Callable[[], bool]) -> None:
         deadline = time.monotonic() + 5
-        while self.loop.generations < generations and time.monotonic() < deadline:
+        while not what() and time.monotonic() < deadline:
             time.sleep(0.005)
-        assert self.loop.generations >= generations
+        assert what()
 
 
-def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame() -> None:
-    with Bench() as bench:
-        bench.frame(2.0)
-        bench.wait_for(1)
-        state = bench.slot.state
+class Clock:
+    """Seconds that pass when the test says so."""
+
+    def __init__(self) -> None:
+        self.s = 100.0
+
+    def __call__(self) -> int:
+        return round(self.s * 1e9)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def bench(clock: Clock) -> Bench:
+    return Bench(clock=clock)
+
+
+# A semantic state
+
+
+def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame(bench: Bench) -> None:
+    bench.frame(2.0)
+    assert bench.loop.step()
+    state = bench.slot.state
     assert state is not None
     assert state.anchor_ns == 2_000_000_000
     assert state.T_odom_anchor == SE2(2.0, 0.0, 0.0)
@@ -101,50 +165,361 @@ def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame() -> None:
     assert [part[0, 0, 0] for part in state.context.values()] == [1.0, 2.0]
 
 
-def test_the_same_frame_is_not_thought_about_twice() -> None:
-    with Bench() as bench:
-        bench.frame(2.0)
-        bench.wait_for(1)
-        time.sleep(0.1)
-        assert bench.loop.generations == 1
-        bench.frame(5.0)
-        bench.wait_for(2)
-    assert bench.language.prompts == [[2_000_000_000], [2_000_000_000, 5_000_000_000]]
+def test_the_same_frame_is_not_thought_about_twice(bench: Bench) -> None:
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert not bench.loop.step()
+    bench.frame(5.0)
+    assert bench.loop.step()
+    assert bench.language.prompts == [[2.0], [2.0, 5.0]]
+
+
+def test_without_a_frame_there_is_nothing_to_think_about(bench: Bench) -> None:
+    assert not bench.loop.step()
+
+
+def test_delay_at_release_counts_from_the_capture_of_the_newest_frame(bench: Bench, clock: Clock) -> None:
+    def think(_run: FakeRun) -> None:
+        clock.s += 1.5
+
+    bench.language.during_finish = think
+    bench.frame(99.8)
+    bench.loop.step()
+    assert list(bench.loop.anchor_to_ready_ms) == pytest.approx([1700.0])
+    assert bench.slot.state is not None and bench.slot.state.ready_ns == clock()
+
+
+def test_what_is_recorded_is_what_was_published(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    [record] = bench.records
+    assert (record["anchor_ns"], record["frames_ns"], record["new_tokens"]) == (2_000_000_000, [2_000_000_000], 3)
+
+
+# Release delay
 
 
 def test_a_finished_generation_is_held_back_by_the_release_delay() -> None:
     with Bench(delay_s=0.3) as bench:
         started = time.monotonic()
         bench.frame(2.0)
-        bench.wait_for(1)
-        held = time.monotonic() - started
-    assert held >= 0.3
+        bench.wait_for(lambda: bench.loop.generations == 1)
+        assert time.monotonic() - started >= 0.3
 
 
 def test_until_the_new_state_is_released_the_old_one_stays() -> None:
-    with Bench(delay_s=0.3) as bench:
+    with Bench(delay_s=0.2) as bench:
         bench.frame(2.0)
-        bench.wait_for(1)
+        bench.wait_for(lambda: bench.loop.generations == 1)
         first = bench.slot.state
         bench.frame(3.0)
-        time.sleep(0.1)
+        bench.wait_for(lambda: len(bench.language.prompts) == 2)
         assert bench.slot.state is first
-        bench.wait_for(2)
-        assert bench.slot.state is not first
-
-
-def test_a_failed_generation_is_counted_and_the_next_frame_is_tried() -> None:
-    with Bench() as bench:
-        bench.language.broken = 1
-        bench.frame(2.0)
-        time.sleep(0.1)
-        assert (bench.loop.failed, bench.loop.generations) == (1, 0)
-        bench.frame(3.0)
-        bench.wait_for(1)
+        bench.wait_for(lambda: bench.slot.state is not first)
 
 
 def test_a_stop_ends_a_generation_that_is_held_back() -> None:
     with Bench(delay_s=30.0) as bench:
         bench.frame(2.0)
-        time.sleep(0.1)
+        bench.wait_for(lambda: len(bench.language.prompts) == 1)
     assert bench.slot.state is None
+    assert bench.loop.cancelled == 0
+
+
+# The queue of one
+
+
+def test_a_new_instruction_ends_the_generation_under_way_and_is_followed_next(bench: Bench) -> None:
+    def change(run: FakeRun) -> None:
+        bench.language.during_finish = lambda _run: None
+        bench.loop.submit("left")
+        bench.loop.submit("right")
+        assert run.interrupt.is_set
+
+    bench.language.during_finish = change
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    bench.frame(2.1)
+    assert bench.loop.step()
+    assert (bench.loop.cancelled, bench.language.instructions) == (1, ["right"])
+
+
+def test_a_cancelled_generation_begins_again_with_the_newest_frames(bench: Bench) -> None:
+    def cancel(_run: FakeRun) -> None:
+        bench.language.during_finish = lambda _run: None
+        bench.frame(9.0)
+        bench.loop.cancel()
+
+    bench.language.during_finish = cancel
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    assert bench.loop.step()
+    assert (bench.language.prompts, bench.language.instructions) == ([[9.0]], ["go"])
+
+
+def test_an_instruction_given_between_two_generations_interrupts_neither(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    bench.loop.submit("left")
+    bench.frame(3.0)
+    assert bench.loop.step()
+    assert (bench.loop.cancelled, bench.language.instructions) == (0, ["go", "left"])
+
+
+# Late anchor
+
+
+def test_older_frames_are_prefilled_before_the_newest_is_captured(bench: Bench, clock: Clock) -> None:
+    """The second generation knows from the first how long that takes, and plans the spacing of 3 s for it."""
+
+    def prefill() -> None:
+        clock.s += 0.4
+        bench.frame(clock.s)
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    for tenth in range(1005, 1010):
+        bench.frame(tenth / 10)
+    clock.s = 100.9
+    bench.loop.step()
+    assert bench.language.prompts[1] == pytest.approx([98.3, 101.3])
+    assert bench.loop.late_anchor_ms[1] == pytest.approx(400.0)
+
+
+def test_without_late_anchor_the_newest_frame_is_that_of_the_beginning(clock: Clock) -> None:
+    bench = Bench(clock=clock, late_anchor=False)
+    bench.language.during_feed = lambda: bench.frame(100.4)
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    assert bench.language.prompts == [[97.0, 100.0]]
+    assert list(bench.loop.late_anchor_ms) == [0.0]
+
+
+def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
+    with Bench() as bench:
+        for tenth in range(70, 101):
+            bench.frame(tenth / 10)
+        bench.language.during_feed = lambda: time.sleep(0.3)
+        bench.wait_for(lambda: bench.loop.generations == 1)
+        bench.language.during_feed = lambda: None
+        bench.frame(10.1)
+        time.sleep(0.1)
+        assert bench.loop.generations == 1
+        bench.frame(10.4)
+        bench.wait_for(lambda: bench.loop.generations == 2)
+        assert bench.language.prompts[1][-1] == pytest.approx(10.4)
+
+
+def test_when_prefill_takes_far_longer_than_planned_the_spacing_is_kept(bench: Bench, clock: Clock) -> None:
+    def prefill() -> None:
+        for tenth in range(1, 21):
+            bench.frame(100.0 + tenth / 10)
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    assert bench.language.prompts == [pytest.approx([97.0, 100.5])]
+
+
+def test_a_generation_is_given_up_when_no_frame_was_captured_around_the_planned_instant(
+    bench: Bench, clock: Clock
+) -> None:
+    def prefill() -> None:
+        clock.s += 2.0
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1021):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    bench.frame(102.1)
+    bench.language.during_feed = lambda: bench.frame(120.0)
+    assert not bench.loop.step()
+    assert (len(bench.language.prompts), bench.loop.missed_frames) == (1, 1)
+    assert bench.loop.failed == 0
+
+
+# Budget
+
+
+def test_no_generation_begins_while_the_budget_forbids_it(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.budget = ReasoningBudget(allowed=False)
+    assert not bench.loop.step()
+    bench.budget = ReasoningBudget()
+    assert bench.loop.step()
+
+
+def test_a_generation_under_way_ends_when_the_budget_is_withdrawn(bench: Bench) -> None:
+    def withdraw(_run: FakeRun) -> None:
+        bench.budget = ReasoningBudget(allowed=False)
+
+    bench.language.during_finish = withdraw
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    assert (bench.slot.state, bench.loop.cancelled) == (None, 1)
+
+
+def test_the_budgets_pause_lies_between_two_generations(bench: Bench, clock: Clock) -> None:
+    bench.budget = ReasoningBudget(pause_s=2.0)
+    bench.frame(2.0)
+    assert bench.loop.step()
+    bench.frame(3.0)
+    clock.s += 1.9
+    assert not bench.loop.step()
+    clock.s += 0.1
+    assert bench.loop.step()
+
+
+@pytest.mark.parametrize(("cap", "expected"), [(None, 4), (9, 4), (2, 2), (0, 0)])
+def test_the_budget_caps_the_new_tokens(bench: Bench, cap: int | None, expected: int) -> None:
+    bench.budget = ReasoningBudget(max_new_tokens=cap)
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert bench.language.caps == [expected]
+
+
+def test_a_text_that_the_budget_cut_short_is_not_held_against_the_model(bench: Bench) -> None:
+    bench.language.text = "Cle"
+    bench.budget = ReasoningBudget(max_new_tokens=2)
+    bench.frame(2.0)
+    bench.loop.step()
+    assert bench.loop.invalid_texts == 0
+    assert bench.slot.state is not None and not bench.slot.state.text_complete
+    bench.budget = ReasoningBudget()
+    bench.frame(3.0)
+    bench.loop.step()
+    assert (bench.loop.invalid_texts, bench.loop.invalid_in_a_row) == (1, 1)
+
+
+# Modes
+
+
+def test_without_reasoning_nothing_is_decoded_and_no_text_is_expected(clock: Clock) -> None:
+    bench = Bench(clock=clock, mode=Mode.NO_REASONING)
+    bench.language.text = ""
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert bench.language.caps == [0]
+    assert bench.loop.invalid_texts == 0
+    assert bench.slot.state is not None
+
+
+def test_in_sync_mode_the_robot_stands_until_there_is_a_state(clock: Clock) -> None:
+    bench = Bench(clock=clock, mode=Mode.SYNC)
+    assert bench.slot.drive_until_ns is not None and bench.slot.drive_until_ns < clock()
+
+
+def test_in_sync_mode_a_generation_is_driven_by_for_half_a_second(clock: Clock) -> None:
+    bench = Bench(clock=clock, mode=Mode.SYNC)
+    bench.frame(100.0)
+    assert bench.loop.step()
+    assert bench.slot.drive_until_ns == clock() + 500_000_000
+
+
+def test_in_sync_mode_the_next_generation_sees_only_what_was_captured_after_the_halt(clock: Clock) -> None:
+    bench = Bench(clock=clock, mode=Mode.SYNC)
+    bench.frame(100.0)
+    assert bench.loop.step()
+    bench.frame(100.4)
+    assert not bench.loop.step()
+    bench.frame(100.5)
+    assert bench.loop.step()
+    assert bench.language.prompts[1][-1] == 100.5
+
+
+def test_async_mode_sets_no_limit_to_driving(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    assert bench.slot.drive_until_ns is None
+
+
+# Failures
+
+
+def test_a_failed_generation_is_counted_and_a_later_frame_is_tried(bench: Bench, clock: Clock) -> None:
+    bench.language.broken = 1
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    assert (bench.loop.failed, bench.loop.generations) == (1, 0)
+    clock.s += 1.0
+    assert not bench.loop.step()
+    bench.frame(3.0)
+    assert bench.loop.step()
+
+
+def test_failures_are_not_repeated_in_a_storm(bench: Bench) -> None:
+    bench.language.broken = 2
+    bench.frame(2.0)
+    bench.loop.step()
+    bench.frame(3.0)
+    bench.loop.step()
+    assert bench.loop.failed == 1
+
+
+def test_failures_in_quick_succession_end_reasoning_for_good(bench: Bench, clock: Clock) -> None:
+    bench.language.broken = FAILURES
+    for second in range(FAILURES):
+        assert bench.loop.failure is None
+        clock.s += 10.0
+        bench.frame(float(second))
+        bench.loop.step()
+    assert bench.loop.failure is not None and "language_model: broken" in bench.loop.failure
+    assert len(bench.said) == 1
+    clock.s += 1000.0
+    bench.frame(99.0)
+    assert not bench.loop.step()
+
+
+def test_failures_now_and_then_do_not(bench: Bench, clock: Clock) -> None:
+    for second in range(3 * FAILURES):
+        bench.language.broken = 1
+        clock.s += 16.0
+        bench.frame(float(second))
+        bench.loop.step()
+    assert (bench.loop.failed, bench.loop.failure) == (3 * FAILURES, None)
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_keys_and_values_that_are_not_finite_are_refused(bench: Bench, clock: Clock, poison: float) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    good = bench.slot.state
+    bench.language.kv = KV.copy()
+    bench.language.kv[0, 4, 7] = poison
+    bench.frame(3.0)
+    assert not bench.loop.step()
+    assert bench.slot.state is good
+    assert bench.loop.failed == 1
+
+
+# What a supervisor sees
+
+
+def test_progress_is_seen_while_there_is_nothing_to_do(bench: Bench, clock: Clock) -> None:
+    clock.s += 5.0
+    bench.loop.step()
+    assert bench.loop.last_progress_ns == clock()
+
+
+def test_a_call_that_hangs_makes_no_progress(bench: Bench, clock: Clock) -> None:
+    seen: list[int] = []
+
+    def hang(_run: FakeRun) -> None:
+        before = clock()
+        clock.s += 60.0
+        seen.append(bench.loop.last_progress_ns - before)
+
+    bench.language.during_finish = hang
+    bench.frame(2.0)
+    bench.loop.step()
+    assert seen == [0]
+
+
+def test_statistics_do_not_grow_for_ever(bench: Bench) -> None:
+    for samples in (bench.loop.generation_ms, bench.loop.anchor_to_ready_ms, bench.loop.late_anchor_ms):
+        samples.extend([1.0] * 10_000)
+        assert len(samples) < 10_000

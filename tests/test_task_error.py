@@ -124,9 +124,8 @@ def test_the_motion_offset_is_how_far_the_robot_has_moved(calibration: Calibrati
 def test_past_motion_and_instruction_are_in_the_prompt(calibration: CalibrationSet, samples: SampleSet) -> None:
     from tokenizers import Tokenizer
 
-    tail = samples.samples[0].prompt[-1].ids
-    text = Tokenizer.from_file(str(NANO_TOKENIZER)).decode(list(tail))
-    assert calibration.clips[0].instruction in text and "(-4." in text
+    text = Tokenizer.from_file(str(NANO_TOKENIZER)).decode([i for part in samples.samples[0].prompt for i in part.ids])
+    assert f"Instruction: {calibration.clips[0].instruction}" in text and "Past motion: (-4." in text
 
 
 def test_the_large_model_gets_one_sample_a_clip(calibration: CalibrationSet) -> None:
