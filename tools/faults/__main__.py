@@ -1,0 +1,176 @@
+"""Inject every fault into real processes on loopback and measure, on the robot's side, how soon the robot is stopped.
+
+edge-hil, edge-bridge and edge-run run as a user would start them (edge-run with a plan that keeps the robot moving, and
+with switches for faults inside it). The judge is a sniffer, a process of its own that stamps what reaches the robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import random
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from rich.console import Console
+
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_target,
+    write_result,
+)
+from tools.children import StepError, uninterrupted
+from tools.demo import free_domain, socket_dir
+from tools.faults.client import FaultError
+from tools.faults.measure import Sample, injection
+from tools.faults.report import RowResult, result, show
+from tools.faults.rig import Rig
+from tools.faults.rows import Row, rows
+from tools.host_stall import HostStall
+from tools.report.machine import machine_facts
+
+EXAMPLES = """examples:
+  python -m tools.faults --artifacts out/nano --out out/faults
+  python -m tools.faults --artifacts out/nano --out out/faults --rows "camera*" --rows "runner SIG*" --per-row 20
+  python -m tools.faults --list
+exit codes: 0 every bound held, 1 one did not or an injection failed, 2 bad arguments, 130 interrupted"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "python -m tools.faults",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--artifacts", type=Path, metavar="DIR", help="directory made by edge-export")
+    p.add_argument("--out", type=Path, default=Path("out/faults"), metavar="DIR", help="default: out/faults")
+    p.add_argument("--rows", action="append", metavar="GLOB", help="only rows whose name matches (may be repeated)")
+    p.add_argument(
+        "--per-row", type=int, default=6, metavar="N", help="injections a row; slow rows get fewer (default: 6)"
+    )
+    p.add_argument("--seed", type=int, default=0, help="of the moments of injection (default: 0)")
+    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
+    p.add_argument("--list", action="store_true", help="print the rows and what they are judged by, then end")
+    p.add_argument("--json", metavar="FILE|-", help="also write the result here; - is stdout")
+    return p
+
+
+def chosen(globs: Sequence[str] | None) -> list[Row]:
+    """Rows whose names match; ValueError when a pattern matches none."""
+    everything = rows()
+    for glob in globs or ():
+        if not any(fnmatch.fnmatch(row.name, glob) for row in everything):
+            raise ValueError(f"--rows {glob!r}: no such row; --list shows them")
+    return [row for row in everything if not globs or any(fnmatch.fnmatch(row.name, glob) for glob in globs)]
+
+
+def count(row: Row, per_row: int) -> int:
+    """Injections of a row."""
+    return max(1, round(row.share * per_row))
+
+
+def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
+    """All injections of one row. Raises StepError or FaultError when the rig does not work."""
+    samples: list[Sample] = []
+    for index in range(times):
+        begun_ns = time.monotonic_ns()
+        try:
+            sample = injection(rig, row, rng, host)
+        except FaultError as error:
+            # It may be that the product no longer does what the fault replaces: a row that fails, not a rig.
+            sample = Sample(None, 0.0, [str(error)])
+            rig.kill_runner()
+            rig.clear()
+        samples.append(sample)
+        shown = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
+        wrong = f" ({'; '.join(sample.wrong)})" if sample.wrong else ""
+        say(f"{row.name} {index + 1}/{times}: {shown} of {row.bound_ms:.0f} ms{wrong}")
+        left_s = row.spacing_s - (time.monotonic_ns() - begun_ns) / 1e9
+        if left_s > 0:
+            time.sleep(left_s)
+    return RowResult(row, samples)
+
+
+def say(line: str) -> None:
+    """Progress."""
+    sys.stderr.write(f"faults: {line}\n")
+    sys.stderr.flush()
+
+
+def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
+    """Everything; what was measured until an interrupt or a failure of the rig is kept and shown."""
+    results: list[RowResult] = []
+    domain = free_domain() if args.domain is None else args.domain
+    with ExitStack() as stack:
+        folder = stack.enter_context(socket_dir())
+        stack.callback(keep_logs, folder, args.out)
+        host = stack.enter_context(HostStall())
+        rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), domain, say))
+        say(f"starting the robot's side in domain {domain}")
+        rig.start()
+        rng = random.Random(args.seed)
+        for row in wanted:
+            results.append(run_row(rig, row, count(row, args.per_row), rng, host))
+            write_result(str(args.out / "faults.json"), result(results, machine_facts()))
+    return results
+
+
+def keep_logs(folder: Path, out: Path) -> None:
+    """Copy the processes' logs beside the result."""
+    with uninterrupted():
+        kept = out / "log"
+        kept.mkdir(parents=True, exist_ok=True)
+        for old in kept.glob("*.log"):
+            old.unlink()
+        for log in folder.glob("*.log"):
+            (kept / log.name).write_bytes(log.read_bytes())
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        wanted = chosen(args.rows)
+        check_result_target(args.json)
+        if args.per_row < 1:
+            raise ValueError(f"--per-row {args.per_row}: expected at least 1")
+        if not args.list and (args.artifacts is None or not args.artifacts.is_dir()):
+            raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
+        args.out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        say(str(error))
+        return EXIT_BAD_INPUT
+    if args.list:
+        for row in wanted:
+            print(f"{row.name}: {row.fault or '-'}, {row.judged_by.value} within {row.bound_ms:.0f} ms")
+        return EXIT_DONE
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        results = run(args, wanted)
+    except KeyboardInterrupt:
+        say(f"interrupted, all processes ended; what was measured is in {args.out}")
+        return EXIT_INTERRUPTED
+    except (StepError, FaultError, OSError) as error:
+        say(str(error))
+        return EXIT_CHECK_FAILED
+    summary = result(results, machine_facts())
+    write_result(args.json, summary)
+    show(results, Console(stderr=args.json == "-", width=150))
+    return EXIT_DONE if summary["pass"] else EXIT_CHECK_FAILED
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

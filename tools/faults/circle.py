@@ -1,0 +1,44 @@
+"""The plan that the fault harness drives by: a circle around where the robot's odometry began. Pure.
+
+Untrained weights walk a robot into a wall, where it can show nothing; on a circle it moves for ever in a small place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.geometry import SE2, wrap_angle
+
+SPEED_MPS = 0.7
+"""Above half of the robot file's limit, so that a halved limit shows."""
+RADIUS_M = 1.0
+MAX_TURN_RADPS = 0.95
+_STEER_PER_S = 1.5
+_APPROACH_PER_M = 1.5
+_RIPPLE = 0.03
+
+
+def turn_radps(T_odom_base: SE2) -> float:
+    """Yaw rate that leads onto the circle, counter-clockwise, from anywhere."""
+    radius_m = math.hypot(T_odom_base.x_m, T_odom_base.y_m)
+    tangent_rad = math.atan2(T_odom_base.y_m, T_odom_base.x_m) + math.pi / 2
+    wanted_rad = tangent_rad + math.atan(_APPROACH_PER_M * (radius_m - RADIUS_M))
+    turn = SPEED_MPS / RADIUS_M + _STEER_PER_S * wrap_angle(wanted_rad - T_odom_base.theta_rad)
+    return min(max(turn, -MAX_TURN_RADPS), MAX_TURN_RADPS)
+
+
+def plan(T_odom_base: SE2, steps: int, step_s: float, phase_rad: float) -> npt.NDArray[np.float32]:
+    """Trajectory [steps, 3] in the robot frame: an arc at constant speed, which ripples a little with `phase_rad`.
+
+    Without the ripple a robot that has found its circle would plan the same for ever, as a dead network does.
+    """
+    turn = turn_radps(T_odom_base)
+    speed = SPEED_MPS * (1.0 + _RIPPLE * math.sin(phase_rad))
+    theta = turn * step_s * np.arange(1, steps + 1)
+    reach = speed * step_s * np.arange(1, steps + 1)
+    half = theta / 2
+    chord = reach * np.sinc(half / math.pi)
+    return np.stack((chord * np.cos(half), chord * np.sin(half), theta), axis=1).astype(np.float32)

@@ -1,0 +1,185 @@
+"""edge-run with a plan that keeps the robot moving, and with faults that can be switched on inside it.
+
+    python -m tools.faults.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
+
+The product has no hook for faults: this program replaces methods of its classes in its own process and then calls the
+unchanged `edge.runner.main` with the arguments after SOCKET. Besides, the plan that `Policy.act` returns (`circle.py`)
+and the language model's text are exchanged for what a trained model would give; both networks run all the same.
+"""
+
+from __future__ import annotations
+
+import errno
+import inspect
+import itertools
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge import runner
+from edge.geometry import SE2
+from edge.graph import GraphError
+from edge.language import LanguageModel
+from edge.log_part import PartFile
+from edge.policy import Policy
+from edge.reasoning_text import format_waypoints
+from tools.faults import circle
+from tools.faults.switches import Switches
+
+STEP_S = 0.1
+# Untrained weights write no waypoints, and answers without any are a fault of their own.
+VALID_TEXT = format_waypoints(((1.0, 0.0), (2.0, 0.0), (3.0, 0.0)))
+_RIPPLE_RAD_PER_CALL = 0.7
+_HANG_POLL_S = 0.02
+
+FAULTS: Mapping[str, str] = {
+    "control-death": "the next call of the action expert raises what nobody expects",
+    "control-hang": "the action expert does not come back for seconds_s",
+    "tick-slow": "the action expert takes seconds_s more, each time",
+    "act-error": "the action expert's graph fails",
+    "encoder-error": "the encoder's graph fails",
+    "nan-output": "the plan is not a number",
+    "scaled-output": "the plan is `factor` times as long",
+    "constant-output": "the plan stays what it is",
+    "oscillating-output": "the plan turns hard to the other side at every tick",
+    "reasoning-death": "the language model raises what nobody expects",
+    "reasoning-hang": "the language model does not come back",
+    "reasoning-error": "the language model's graph fails",
+    "garbage-text": "the language model's answer is the parameter text",
+    "disk-full": "the flight log's disk takes no more",
+    "disk-stall": "the flight log's disk takes seconds_s for each write",
+    "wall-clock": "the date jumps by seconds_s",
+}
+
+
+class UnexpectedError(Exception):
+    """A defect that no code of the runner knows."""
+
+
+def _seconds(values: Mapping[str, Any], default: float) -> float:
+    return float(values.get("seconds_s", default))
+
+
+class Faults:
+    """Wraps the runner's methods; `Switches` says which fault is on."""
+
+    def __init__(self, switches: Switches) -> None:
+        self._on = switches.hit
+        self._calls = itertools.count()
+        self._held: np.ndarray[Any, Any] | None = None
+        self._moved_s = 0.0
+
+    def install(self) -> None:
+        """Replace the methods, for this process only."""
+        Policy.act = self._act(Policy.act)  # type: ignore[method-assign]
+        Policy.encode = self._encode(Policy.encode)  # type: ignore[method-assign]
+        LanguageModel.run = self._language(LanguageModel.run)  # type: ignore[method-assign]
+        LanguageModel.text_of = self._text(LanguageModel.text_of)  # type: ignore[method-assign]
+        PartFile.write = self._disk(PartFile.write)  # type: ignore[method-assign]
+        PartFile.sync = self._disk(PartFile.sync)  # type: ignore[method-assign]
+        time.time = self._clock(time.time)  # noqa: TID251 - the very thing that must not matter
+
+    def _act(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        signature = inspect.signature(original)
+
+        def act(*args: Any, **kwargs: Any) -> Any:
+            if self._on("control-death") is not None:
+                raise UnexpectedError("injected: the control thread dies")
+            for fault, default in (("control-hang", 3600.0), ("tick-slow", 0.3)):
+                values = self._on(fault)
+                if values is not None:
+                    time.sleep(_seconds(values, default))
+            if self._on("act-error") is not None:
+                raise GraphError("injected: the action expert's graph fails")
+            real = original(*args, **kwargs)
+            given = signature.bind(*args, **kwargs).arguments
+            pose: SE2 = given["semantic"].T_odom_anchor @ given["offset"]
+            return self._spoiled(circle.plan(pose, len(real), STEP_S, _RIPPLE_RAD_PER_CALL * next(self._calls)))
+
+        return act
+
+    def _spoiled(self, plan: Any) -> Any:
+        if self._on("constant-output") is not None:
+            if self._held is None:
+                self._held = plan
+            plan = self._held
+        else:
+            self._held = None
+        if self._on("oscillating-output") is not None:
+            side = 1.0 if next(self._calls) % 2 else -1.0
+            plan = plan * np.array([1.0, 0.0, 0.0], dtype=np.float32)
+            plan[:, 1] = side * plan[:, 0]
+            plan[:, 2] = side * np.linspace(0.0, 1.5, len(plan), dtype=np.float32)
+        values = self._on("scaled-output")
+        if values is not None:
+            plan = plan * np.float32(values.get("factor", 10.0))
+        if self._on("nan-output") is not None:
+            plan = np.full_like(plan, np.nan)
+        return plan
+
+    def _encode(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def encode(*args: Any, **kwargs: Any) -> Any:
+            if self._on("encoder-error") is not None:
+                raise GraphError("injected: the encoder's graph fails")
+            return original(*args, **kwargs)
+
+        return encode
+
+    def _language(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            if self._on("reasoning-death") is not None:
+                raise UnexpectedError("injected: the reasoning thread dies")
+            while self._on("reasoning-hang") is not None:
+                time.sleep(_HANG_POLL_S)
+            if self._on("reasoning-error") is not None:
+                raise GraphError("injected: the language model's graph fails")
+            return original(*args, **kwargs)
+
+        return run
+
+    def _text(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def text_of(*args: Any, **kwargs: Any) -> Any:
+            original(*args, **kwargs)
+            values = self._on("garbage-text")
+            return VALID_TEXT if values is None else str(values.get("text", "__import__('os').system('true')"))
+
+        return text_of
+
+    def _disk(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def touch(*args: Any, **kwargs: Any) -> Any:
+            if self._on("disk-full") is not None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            values = self._on("disk-stall")
+            if values is not None:
+                time.sleep(_seconds(values, 5.0))
+            return original(*args, **kwargs)
+
+        return touch
+
+    def _clock(self, original: Callable[[], float]) -> Callable[[], float]:
+        def now() -> float:
+            values = self._on("wall-clock")
+            return original() + (0.0 if values is None else _seconds(values, 3600.0))
+
+        return now
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Install the faults and run."""
+    arguments = sys.argv[1:] if argv is None else argv
+    if not arguments or arguments[0].startswith("-"):
+        sys.stderr.write("faulty_runner: expected a path for the fault socket, then the arguments of edge-run\n")
+        return 2
+    threading.current_thread().name = "main"
+    Faults(Switches(Path(arguments[0]), FAULTS)).install()
+    return runner.main(arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""One injection: drive, inject, listen, judge, make it good again."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from dataclasses import asdict, dataclass, field
+
+from tools.faults.client import FaultError
+from tools.faults.heard import Heard, first_lasting, longest_gap_ms, moves
+from tools.faults.rig import Rig
+from tools.faults.rows import Judge, Row
+from tools.host_stall import HostStall
+
+PHASE_S = 0.1
+"""An injection falls anywhere in a tick."""
+HOLD_S = 0.4
+"""A zero has lasted when nothing but zero came for so long."""
+WATCH_S = 2.0
+"""How long nothing may change."""
+STAY_S = 0.5
+"""How long a latched stop is watched after its fault has gone."""
+RESUME_S = 8.0
+LIMIT_TOLERANCE = 1.02
+_RECENT_NS = 1_000_000_000
+_POLL_S = 0.02
+_ZERO = (0.0, 0.0, 0.0)
+_ANY = float("inf")
+
+
+@dataclass
+class Sample:
+    """One injection's figure; None: what had to come did not come in time. `wrong` says what else was not right."""
+
+    latency_ms: float | None
+    stall_ms: float
+    """For how much of that time the machine itself stood still."""
+    wrong: list[str] = field(default_factory=list)
+
+    def as_json(self) -> dict[str, object]:
+        """For the result."""
+        return asdict(self)
+
+
+def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
+    """Do one. Raises StepError or FaultError when the rig itself does not work."""
+    rig.ensure_moving()
+    time.sleep(rng.uniform(0.0, PHASE_S))
+    before_ns = time.monotonic_ns()
+    strangers = rig.hearing.sources() - {one.source for one in rig.hearing.since(before_ns - _RECENT_NS)}
+    known = rig.hearing.sources() - strangers
+    effect_ns = row.inject(rig)
+    if row.judged_by is Judge.UNCHANGED:
+        sample = _unchanged(rig, effect_ns, host)
+    else:
+        sample = _awaited(rig, row, effect_ns, known, host)
+    _aftermath(rig, row, sample)
+    return sample
+
+
+def _awaited(rig: Rig, row: Row, effect_ns: int, known: frozenset[int], host: HostStall) -> Sample:
+    """Wait for what has to come and to last, at most twice the bound and a second more."""
+    end_ns = effect_ns + round((2 * row.bound_ms + 1000 + 1000 * HOLD_S) * 1e6)
+    first: int | None = None
+    while time.monotonic_ns() < end_ns:
+        first = _first(rig, row, effect_ns, known)
+        if first is not None and time.monotonic_ns() - first > HOLD_S * 1e9:
+            break
+        time.sleep(_POLL_S)
+    if first is None:
+        return Sample(None, host.between_ns(effect_ns, end_ns) / 1e6)
+    # The very command under way when the fault struck may already be what was to come.
+    return Sample(max(first - effect_ns, 0) / 1e6, host.between_ns(effect_ns, first) / 1e6)
+
+
+def _first(rig: Rig, row: Row, effect_ns: int, known: frozenset[int]) -> int | None:
+    if row.judged_by is Judge.ROBOT:
+        changes = [change for change in rig.robot_obeys_motion() if change[0] >= effect_ns]
+        return changes[-1][0] if changes and not changes[-1][1] else None
+    heard = moves(one for one in rig.hearing.since(effect_ns) if one.source in known)
+    if row.judged_by is Judge.LIMIT:
+        limits, scale = rig.config.limits, row.speed_scale * LIMIT_TOLERANCE
+        return first_lasting(heard, (limits.vx_max_mps * scale, _ANY, _ANY))
+    return first_lasting(heard, _ZERO)
+
+
+def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
+    """Nothing may change: the commands go on, none is zero or slowed down."""
+    before_mps = rig.speed_mps()
+    time.sleep(max(0.0, WATCH_S - (time.monotonic_ns() - effect_ns) / 1e9))
+    end_ns = effect_ns + round(WATCH_S * 1e9)
+    heard: list[Heard] = rig.hearing.since(effect_ns)
+    moving = moves(one for one in heard if one.moving)
+    sample = Sample(longest_gap_ms(moving, effect_ns, end_ns), host.between_ns(effect_ns, end_ns) / 1e6)
+    if any(not one.moving for one in heard if one.velocity is not None):
+        sample.wrong.append("a zero was sent")
+    if min((velocity[0] for _, velocity in moving), default=0.0) < 0.8 * before_mps:
+        sample.wrong.append("the speed fell")
+    return sample
+
+
+def _aftermath(rig: Rig, row: Row, sample: Sample) -> None:
+    """Make it good again and see that the robot does what it should then."""
+    if row.thaw:
+        thawed_ns = rig.send(rig.runner, signal.SIGCONT)
+        time.sleep(STAY_S)
+        if any(one.moving for one in rig.hearing.since(thawed_ns)):
+            sample.wrong.append("moved after SIGCONT")
+    if row.undo is not None:
+        row.undo(rig)
+    if row.latches:
+        if not row.thaw:
+            _stays(rig, sample)
+        rig.kill_runner()
+        if row.kills_bridge:
+            rig.kill_bridge()
+        rig.clear()
+    elif not rig.drives_on(RESUME_S):
+        sample.wrong.append(f"did not drive on within {RESUME_S:g} s")
+        rig.kill_runner()
+        rig.clear()
+
+
+def _stays(rig: Rig, sample: Sample) -> None:
+    """A latched stop stays one when its fault has gone; a runner that has ended cannot show it."""
+    since_ns = time.monotonic_ns()
+    time.sleep(STAY_S)
+    if any(one.moving for one in rig.hearing.since(since_ns)):
+        sample.wrong.append("moved although the stop latches")
+
+
+__all__ = ["FaultError", "Sample", "injection"]

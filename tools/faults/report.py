@@ -1,0 +1,110 @@
+"""What the injections have shown: per row n, p50, p99.9, max, bound and verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from tools.faults.measure import Sample
+from tools.faults.rows import Judge, Row
+
+_WHAT = {
+    Judge.ZERO: "zero",
+    Judge.LIMIT: "limit",
+    Judge.ROBOT: "robot stands",
+    Judge.UNCHANGED: "unchanged",
+}
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """One row's samples and what they are worth.
+
+    A bound holds when the 99.9th percentile is within it, no sample is above twice it, every sample came at all and
+    nothing else was wrong. A sample during which the machine itself stood still is granted that time, and counted.
+    """
+
+    row: Row
+    samples: Sequence[Sample]
+
+    @property
+    def latencies_ms(self) -> list[float]:
+        """As measured, what never came left out."""
+        return [sample.latency_ms for sample in self.samples if sample.latency_ms is not None]
+
+    @property
+    def granted(self) -> int:
+        """Samples that are above the bound by no more than the machine stood still."""
+        bound = self.row.bound_ms
+        return sum(1 for s in self.samples if s.latency_ms is not None and bound < s.latency_ms <= bound + s.stall_ms)
+
+    @property
+    def problems(self) -> list[str]:
+        """Why the row has failed; empty: it has passed."""
+        bound = self.row.bound_ms
+        found = [f"{sum(s.latency_ms is None for s in self.samples)} never came"]
+        found = [] if found[0].startswith("0 ") else found
+        judged = [s.latency_ms - s.stall_ms if s.latency_ms > bound else s.latency_ms
+                  for s in self.samples if s.latency_ms is not None]  # fmt: skip
+        if judged and percentile(judged, 99.9) > bound:
+            found.append(f"p99.9 above {bound:.0f} ms")
+        if judged and max(judged) > 2 * bound:
+            found.append(f"max above {2 * bound:.0f} ms")
+        return found + sorted({wrong for sample in self.samples for wrong in sample.wrong})
+
+    def as_json(self) -> dict[str, Any]:
+        """For the result file, raw samples included."""
+        values = self.latencies_ms
+        return {
+            "fault": self.row.fault,
+            "judged_by": self.row.judged_by.value,
+            "n": len(self.samples),
+            "p50_ms": percentile(values, 50) if values else None,
+            "p999_ms": percentile(values, 99.9) if values else None,
+            "max_ms": max(values) if values else None,
+            "bound_ms": self.row.bound_ms,
+            "granted": self.granted,
+            "problems": self.problems,
+            "pass": not self.problems,
+            "samples": [sample.as_json() for sample in self.samples],
+        }
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """Percentile of at least one value, no interpolation upwards of what was seen."""
+    return float(np.percentile(np.array(values), share, method="higher"))
+
+
+def result(rows: Sequence[RowResult], machine: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON result."""
+    return {
+        "injections": sum(len(row.samples) for row in rows),
+        "pass": all(not row.problems for row in rows),
+        "tagged": "measured",
+        "machine": dict(machine),
+        "rows": {row.row.name: row.as_json() for row in rows},
+    }
+
+
+def show(rows: Sequence[RowResult], console: Console) -> None:
+    """Print the table: times in ms from the fault's effect to what is named, as the sniffer heard it."""
+    table = Table(title="Faults: from effect to what is judged, ms, heard on the robot's side", title_justify="left")
+    table.add_column("injected")
+    table.add_column("fault of the table")
+    table.add_column("judged")
+    for name in ("n", "p50", "p99.9", "max", "bound"):
+        table.add_column(name, justify="right")
+    table.add_column("verdict")
+    for row in rows:
+        values = row.latencies_ms
+        figures = [f"{percentile(values, share):.0f}" for share in (50, 99.9, 100)] if values else ["–"] * 3
+        verdict = "; ".join(row.problems) or ("pass" if not row.granted else f"pass, {row.granted} granted")
+        what, count = _WHAT[row.row.judged_by], str(len(row.samples))
+        bound = f"{row.row.bound_ms:.0f}"
+        table.add_row(row.row.name, row.row.fault or "–", what, count, *figures, bound, verdict)
+    console.print(table)

@@ -1,0 +1,212 @@
+"""The rig: robot's side, sniffer, bridge and runner as real processes on loopback, and what a fault needs of them."""
+
+from __future__ import annotations
+
+import signal
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from firmware_bridge.config import RobotConfig, load_robot_config
+from tools.children import Child, Children, StepError
+from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE
+from tools.faults.circle import SPEED_MPS
+from tools.faults.client import FaultClient, FaultError
+from tools.faults.heard import Hearing, Tail
+
+READY_TIMEOUT_S = 90.0
+MOVING_TIMEOUT_S = 60.0
+_POLL_S = 0.01
+_STEADY_MOVES = 10  # 0.2 s of the bridge's commands
+_STEADY_SHARE = 0.9
+
+
+class Rig:
+    """One domain's worth of processes; a context manager that ends exactly those it started."""
+
+    def __init__(self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None]) -> None:
+        """`folder` takes sockets and logs; a short path, since a socket's may have 107 bytes."""
+        self.folder = folder
+        self.domain = domain
+        self.hearing = Hearing(folder / "heard.jsonl")
+        self.config: RobotConfig = load_robot_config(ROBOT_FILE, socket=folder / "b.sock", domain=domain)
+        self.runner_starts = 0
+        self.jump_m = 1.0
+        self._artifacts = artifacts
+        self._say = say
+        self._children = Children(folder, grace_s=5.0)
+        self._trace = Tail(folder / "trace.jsonl")
+        self._commanded: list[tuple[int, bool]] = []
+        self._runs = 0
+        self._rogues: list[Child] = []
+        self.hil: Child | None = None
+        self.bridge: Child | None = None
+        self.runner: Child | None = None
+        self.robot = FaultClient(folder / "hil.faults", folder / "a")
+        self._inside: FaultClient | None = None
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for rogue in self._rogues:
+            rogue.process.kill()
+            rogue.process.wait()
+        self._children.__exit__(None, None, None)
+        self.robot.close()
+        if self._inside is not None:
+            self._inside.close()
+
+    @property
+    def inside(self) -> FaultClient:
+        """Where the faults inside the runner are asked for."""
+        assert self._inside is not None
+        return self._inside
+
+    def start(self) -> None:
+        """Start the robot's side and the sniffer, and wait for both. Raises StepError."""
+        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
+        where = ["--domain", str(self.domain), "--trace", str(self.folder / "trace.jsonl")]
+        faults = ["--faults", str(self.folder / "hil.faults")]
+        sniffer = [sys.executable, "-m", "tools.faults.sniffer", "--domain", str(self.domain)]
+        self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where, *faults])
+        heard = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "heard.jsonl")])
+        for child, line in ((heard, "sniffer: ready"), (self.hil, READY_LINE)):
+            self._wait(lambda child=child, line=line: line in child.log.read_text(), READY_TIMEOUT_S, child, line)
+
+    def start_bridge(self) -> None:
+        """Start edge-bridge and wait for its socket."""
+        self.bridge = self._children.start("edge-bridge", [*COMMANDS["edge-bridge"], *self._link()])
+        self._wait(lambda: "ready" in self.bridge.log.read_text(), 30.0, self.bridge, "ready line")
+
+    def start_runner(self) -> None:
+        """Start edge-run with switchable faults; it arms and drives by itself."""
+        if self._inside is not None:
+            self._inside.close()
+        self._runs += 1
+        self.runner_starts += 1
+        socket = self.folder / f"r{self._runs}.faults"
+        command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
+        command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
+        command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
+        self.runner = self._children.start(f"edge-run-{self._runs}", command)
+        self._inside = FaultClient(socket, self.folder / f"i{self._runs}")
+
+    def ensure_moving(self) -> None:
+        """Have the robot driven, steadily and at full speed; starts what is not running. Raises StepError."""
+        if self.bridge is None or not self.bridge.running:
+            self.forget_runner()
+            self._forget(self.bridge)
+            self.start_bridge()
+        if self.runner is None or not self.runner.running:
+            self.forget_runner()
+            self.start_runner()
+        assert self.runner is not None
+        runner = self.runner
+        self._wait(lambda: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
+        if not runner.running:
+            raise runner.failure(f"it ended with exit code {runner.process.returncode} before the robot moved")
+
+    def moving(self) -> bool:
+        """Whether the newest commands are all near full speed, and fresh."""
+        last = self.hearing.last_moves(_STEADY_MOVES)
+        fresh = bool(last) and time.monotonic_ns() - last[-1].t_ns < 200_000_000
+        fast = [one.velocity is not None and one.velocity[0] >= _STEADY_SHARE * SPEED_MPS for one in last]
+        return fresh and len(last) == _STEADY_MOVES and all(fast)
+
+    def drives_on(self, timeout_s: float) -> bool:
+        """Wait for motion at any speed without starting anything; False when it did not come."""
+        deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        while not all(one.moving for one in self.hearing.last_moves(_STEADY_MOVES)):
+            gone = self.runner is None or not self.runner.running
+            if gone or time.monotonic_ns() > deadline_ns:
+                return False
+            time.sleep(_POLL_S)
+        return True
+
+    def speed_mps(self) -> float:
+        """Median forward speed commanded lately."""
+        return statistics.median(abs(one.velocity[0]) for one in self.hearing.last_moves(25) if one.velocity)
+
+    def send(self, child: Child | None, number: signal.Signals) -> int:
+        """Send a signal; returns when, monotonic ns."""
+        assert child is not None
+        now_ns = time.monotonic_ns()
+        child.process.send_signal(number)
+        return now_ns
+
+    def kill_runner(self) -> None:
+        """End the runner at once."""
+        if self.runner is not None:
+            self.runner.process.kill()
+            self.runner.process.wait()
+        self.forget_runner()
+
+    def kill_bridge(self) -> None:
+        """End the bridge at once."""
+        if self.bridge is not None:
+            self.bridge.process.kill()
+            self.bridge.process.wait()
+        self._forget(self.bridge)
+        self.bridge = None
+
+    def forget_runner(self) -> None:
+        """Stop watching a runner that has ended."""
+        self._forget(self.runner)
+        self.runner = None
+        for log in self.folder.glob("flight*.mcap"):
+            log.unlink(missing_ok=True)
+
+    def rogue(self, duration_s: float) -> int:
+        """Let a second commander drive for `duration_s`, or a little longer; returns when it began, ns."""
+        command = [sys.executable, "-m", "tools.faults.rogue", "--domain", str(self.domain)]
+        rogue = self._children.start("rogue", [*command, "--duration", str(duration_s)])
+        try:
+            self._wait(lambda: "ready" in rogue.log.read_text(), 30.0, rogue, "robot to command")
+            rogue.process.send_signal(signal.SIGUSR1)
+            self._wait(lambda: "first" in rogue.log.read_text(), 5.0, rogue, "first command")
+            return int(rogue.log.read_text().split("first ")[1].split()[0])
+        finally:
+            self._forget(rogue)  # it ends by itself
+            self._rogues.append(rogue)
+
+    def robot_obeys_motion(self) -> list[tuple[int, bool]]:
+        """(ns, whether) of each change of the robot's own commanded velocity from or to zero, from its trace."""
+        for line in self._trace.lines():
+            if line["kind"] == "commanded":
+                velocity = line["velocity"]
+                assert isinstance(velocity, list)
+                self._commanded.append((int(str(line["t_ns"])), any(velocity)))
+        return self._commanded
+
+    def clear(self) -> None:
+        """Switch every fault off, on both sides, as far as somebody is there to hear it."""
+        self.robot.inject("clear")
+        if self._inside is not None and self.runner is not None and self.runner.running:
+            with suppress(FaultError):
+                self._inside.inject("clear", timeout_s=1.0)
+
+    def _link(self) -> list[str]:
+        return ["--robot", str(ROBOT_FILE), "--socket", str(self.folder / "b.sock"), "--domain", str(self.domain)]
+
+    def _forget(self, child: Child | None) -> None:
+        if child is not None:
+            with suppress(ValueError):
+                self._children.forget(child)
+
+    def _wait(self, ready: Callable[[], bool], timeout_s: float, child: Child, what: str) -> None:
+        deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        while not ready():
+            if self.hil is not None and not self.hil.running:
+                raise self.hil.failure("the robot's side has ended")
+            if not child.running and child is not self.runner:
+                raise child.failure(f"ended with exit code {child.process.returncode}")
+            if time.monotonic_ns() > deadline_ns:
+                raise child.failure(f"no {what} within {timeout_s:g} s")
+            time.sleep(_POLL_S)
+
+
+__all__ = ["FaultError", "Rig", "StepError"]

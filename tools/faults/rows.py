@@ -1,0 +1,227 @@
+"""What `make faults` injects: each row names its fault of the table, how it is made, and what must come of it."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from edge.faults import FAULTS, Action
+from tools.faults.rig import Rig
+
+BRIDGE_STOP_MS = 300
+"""A bridge that is told to end, or whose runner is, stops the robot as soon as after a dead runner."""
+
+
+class Judge(Enum):
+    """What a row is judged by."""
+
+    ZERO = "zero"
+    """Time to the zero velocity that lasts."""
+    LIMIT = "limit"
+    """Time to commands that stay within the limit's share of the speed limit."""
+    ROBOT = "robot"
+    """Time until the robot itself obeys no velocity any more."""
+    UNCHANGED = "unchanged"
+    """The longest time without a moving command, while nothing else may change."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of injection. `inject` returns the ns of the effect; `undo` makes it good again."""
+
+    name: str
+    fault: str | None
+    inject: Callable[[Rig], int]
+    undo: Callable[[Rig], None] | None = None
+    judge: Judge | None = None
+    """None: what the fault's action says."""
+    bound: float | None = None
+    """None: the fault's own, ms."""
+    share: float = 1.0
+    """Of --per-row: slow injections are made less often."""
+    ends_run: bool = False
+    """Beyond a latching fault's own end of the run: a new runner is started after it."""
+    spacing_s: float = 0.0
+    """Time between two injections, for faults that escalate when they come again."""
+    thaw: bool = False
+    """Afterwards SIGCONT to the runner, which must not move the robot."""
+
+    def __post_init__(self) -> None:
+        if self.fault is None and self.judge is None:
+            raise ValueError(f"row {self.name}: expected a fault of the table or a judge")
+        if self.fault is not None and self.fault not in FAULTS:
+            raise ValueError(f"row {self.name}: {self.fault!r} is not in the fault table")
+
+    @property
+    def judged_by(self) -> Judge:
+        """The judge given, or the one that fits the fault's action."""
+        if self.judge is not None:
+            return self.judge
+        assert self.fault is not None
+        fault = FAULTS[self.fault]
+        if fault.action is Action.LIMIT:
+            return Judge.LIMIT
+        if fault.action is Action.NOTHING:
+            return Judge.UNCHANGED
+        return Judge.ROBOT if fault.where == "robot" else Judge.ZERO
+
+    @property
+    def bound_ms(self) -> float:
+        """From effect to what is judged; for UNCHANGED the longest gap between two commands."""
+        if self.bound is not None:
+            return self.bound
+        if self.judged_by is Judge.UNCHANGED:
+            return UNCHANGED_GAP_MS
+        return FAULTS[self.fault].bound_ms if self.fault is not None else BRIDGE_STOP_MS
+
+    @property
+    def speed_scale(self) -> float:
+        """Share of the speed limit that a limiting fault leaves."""
+        return FAULTS[self.fault].speed_scale if self.fault is not None else 1.0
+
+    @property
+    def kills_bridge(self) -> bool:
+        """Whether the bridge is gone or hangs after it."""
+        return self.name.startswith("bridge ")
+
+    @property
+    def latches(self) -> bool:
+        """Whether the run is over after it."""
+        return self.ends_run or (self.fault is not None and FAULTS[self.fault].latch)
+
+
+UNCHANGED_GAP_MS = 100.0
+"""Five of the bridge's periods, and one tick."""
+_INSIDE_S = 30.0
+"""A fault of the reasoning strikes in its next run."""
+
+
+def _robot(name: str, fault: str, injected: str, **values: float | str) -> Row:
+    return Row(name, fault, lambda rig: rig.robot.inject(injected, **values), lambda rig: _off(rig, injected))
+
+
+def _harmless(name: str, injected: str, **values: float | str) -> Row:
+    """Something of the robot's side that must change nothing."""
+    row = _robot(name, "message-reordered", injected, **values)
+    return _with(row, fault=None, judge=Judge.UNCHANGED, share=0.4)
+
+
+def _clear(rig: Rig) -> None:
+    rig.clear()
+
+
+def _off(rig: Rig, injected: str) -> None:
+    rig.robot.inject(injected, on=False)
+
+
+def _inside(name: str, fault: str, injected: str, **values: float | str) -> Row:
+    return Row(name, fault, lambda rig: rig.inside.inject(injected, timeout_s=_INSIDE_S, **values), _clear)
+
+
+def _with(row: Row, **changes: object) -> Row:
+    return Row(**{**row.__dict__, **changes})  # type: ignore[arg-type]
+
+
+def _jump(rig: Rig) -> int:
+    """There, and back the next time: the circle must not wander into a wall."""
+    effect_ns = rig.robot.inject("odometry-jump", dx_m=rig.jump_m)
+    rig.jump_m = -rig.jump_m
+    return effect_ns
+
+
+def _two_jumps(rig: Rig) -> int:
+    _jump(rig)
+    time.sleep(0.5)
+    return _jump(rig)
+
+
+def _wall_clock(rig: Rig) -> int:
+    # Nobody may ever ask for the date, so there is no effect to wait for.
+    rig.inside.ask("wall-clock", seconds_s=3600.0)
+    return time.monotonic_ns()
+
+
+def _late_move(rig: Rig) -> int:
+    rig.robot.ask("late-move", delay_s=0.2)
+    time.sleep(0.1)  # for one Move to be held back
+    rig.send(rig.runner, signal.SIGTERM)
+    return rig.robot.effect_ns("late-move", 10.0)
+
+
+def _stop_unanswered(rig: Rig) -> int:
+    rig.robot.inject("stop-unanswered", delay_s=10.0)
+    return rig.send(rig.runner, signal.SIGTERM)
+
+
+def _dead_link(rig: Rig) -> int:
+    rig.robot.ask("deaf")
+    rig.robot.ask("state-silent")
+    return min(rig.robot.effect_ns("deaf"), rig.robot.effect_ns("state-silent"))
+
+
+def rows() -> tuple[Row, ...]:
+    """All of them; those that leave the run alive come first, so that one run serves many."""
+    live = (
+        _robot("camera stops", "camera-stopped", "camera-stop"),
+        _robot("camera freezes", "camera-frozen", "camera-freeze"),
+        _robot("camera answers 1 s late", "camera-stale", "camera-slow", delay_s=1.0),
+        _robot("camera at half rate", "camera-slow", "camera-half-rate", rate_hz=5.0),
+        _robot("camera at a third of its rate", "camera-too-slow", "camera-half-rate", rate_hz=3.0),
+        _robot("camera covered", "frames-refused", "camera-black"),
+        _robot("camera blinded", "frames-refused", "camera-saturated"),
+        _robot("camera pictures torn", "frames-refused", "camera-torn"),
+        _with(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=10.5, share=0.4),
+        _robot("odometry freezes", "odometry-frozen", "odometry-freeze"),
+        _robot("odometry is NaN", "odometry-not-finite", "odometry-nan"),
+        _robot("orientation is not one", "odometry-not-finite", "odometry-nan", field="rpy"),
+        _robot("odometry 120 ms late", "odometry-late", "odometry-lag", delay_s=0.12),
+        _robot("odometry 300 ms late", "odometry-stale", "odometry-lag", delay_s=0.3),
+        _robot("robot's state silent", "odometry-stale", "state-silent"),
+        _robot("half of the states lost", "link-lossy", "state-loss", percent=50.0),
+        _harmless("every tenth state lost", "state-loss", percent=10.0),
+        _harmless("states change places", "state-reorder"),
+        _harmless("states come twice", "state-duplicate"),
+        _with(_robot("battery at 15 %", "battery-low", "low-battery", soc_percent=15.0), share=0.4),
+        _inside("plan is NaN", "output-not-finite", "nan-output"),
+        _inside("action expert fails", "output-not-finite", "act-error"),
+        _inside("plan never changes", "output-constant", "constant-output"),
+        _inside("plan swings at every tick", "output-oscillating", "oscillating-output"),
+        _inside("encoder fails", "camera-stopped", "encoder-error"),
+        _inside("action expert takes 0.35 s", "tick-overrun", "tick-slow", seconds_s=0.35),
+        _with(_inside("reasoning hangs", "semantic-expired", "reasoning-hang"), share=0.25),
+        _with(_inside("reasoning's third bad text", "semantic-text-invalid", "garbage-text", after=3.0), share=0.4),
+        _with(_inside("flight log's disk full", "log-disk-full", "disk-full"), share=0.4),
+        _with(_inside("flight log's disk stalls", "log-disk-stalled", "disk-stall", seconds_s=3.0), share=0.4),
+        _with(Row("date jumps by an hour", "wall-clock-moved", _wall_clock, _clear), share=0.4),
+    )  # fmt: skip
+    over = (
+        Row("runner SIGKILL", "runner-killed", lambda rig: rig.send(rig.runner, signal.SIGKILL)),
+        Row("runner SIGSTOP, SIGCONT", "runner-frozen", lambda rig: rig.send(rig.runner, signal.SIGSTOP), thaw=True),
+        Row("runner SIGTERM", None, lambda rig: rig.send(rig.runner, signal.SIGTERM), judge=Judge.ZERO, ends_run=True),
+        _inside("control thread dies", "control-thread-dead", "control-death"),
+        _inside("graph does not come back", "graph-hung", "control-hang"),
+        _with(_inside("reasoning thread dies", "semantic-expired", "reasoning-death"), ends_run=True, share=0.5),
+        _inside("reasoning fails five times", "reasoning-failing", "reasoning-error", after=5.0),
+        _inside("plan ten times too long", "output-out-of-range-often", "scaled-output"),
+        _robot("camera has another size", "camera-swapped", "camera-wrong-size"),
+        _with(Row("odometry jumps 1 m twice", "odometry-jumps", _two_jumps), share=0.5),
+        _robot("speed reads 1 m/s too high", "odometry-speed-mismatch", "odometry-bias"),
+        _robot("robot tips over", "tipped-over", "tip-over"),
+        _with(_robot("battery at 3 %", "battery-empty", "low-battery", soc_percent=3.0), share=0.4),
+        _robot("remote: L2+B", "emergency-stop", "remote-keys"),
+        _robot("remote: stick pushed", "emergency-stop", "remote-stick"),
+        Row("second commander", "second-commander", lambda rig: rig.rogue(1.0)),
+        Row("late Move overtakes StopMove", "late-motion", _late_move),
+        _with(
+            Row("StopMove unanswered for 10 s", "stop-call-blocked", _stop_unanswered, _clear),
+            judge=Judge.ZERO, bound=BRIDGE_STOP_MS, ends_run=True, share=0.5,
+        ),
+        _with(Row("link dead both ways", "link-lost", _dead_link, _clear), judge=Judge.ROBOT, share=0.5),
+        Row("bridge SIGTERM", None, lambda rig: rig.send(rig.bridge, signal.SIGTERM), judge=Judge.ZERO, ends_run=True),
+        Row("bridge SIGKILL", "bridge-killed", lambda rig: rig.send(rig.bridge, signal.SIGKILL)),
+        _with(Row("bridge SIGSTOP", "bridge-hung", lambda rig: rig.send(rig.bridge, signal.SIGSTOP)), share=0.5),
+    )  # fmt: skip
+    return (*live, *over)

@@ -1,0 +1,66 @@
+"""The judge: a process on the robot's side that stamps every request of the sport service as it arrives.
+
+    python -m tools.faults.sniffer --domain 7 --out heard.jsonl
+
+One JSON object a line: {"t_ns": monotonic, "source": writer's number, "api_id": 1008, "velocity": [x, y, wz] or null}.
+It shares no code path with what it judges but the DDS reader and the parser of a Move.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+
+from firmware_bridge.config import DdsConfig
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.unitree.idl import Request_
+from sim_hil.unitree.sport import parse_move
+
+_WAIT_NS = 50_000_000
+_DEPTH = 256
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Listen until SIGTERM or SIGINT."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--domain", type=int, required=True)
+    parser.add_argument("--interface", default="lo")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.jsonl")
+    args = parser.parse_args(argv)
+    ended: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _frame: ended.append(number))
+    bus = Bus(DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ()))
+    reader = bus.reader(ids.request_topic(ids.SPORT_SERVICE), Request_, depth=_DEPTH, reliable=True)
+    waitset = bus.waitset(reader)
+    sources: dict[int, int] = {}
+    with args.out.open("w", encoding="utf-8") as file:
+        sys.stderr.write("sniffer: ready\n")
+        sys.stderr.flush()
+        while not ended:
+            waitset.wait(_WAIT_NS)
+            for sample in take_each(reader, _DEPTH):
+                t_ns = time.monotonic_ns()
+                if sample is None:
+                    continue
+                handle = sample.sample_info.publication_handle
+                api_id = sample.header.identity.api_id
+                line = {
+                    "t_ns": t_ns,
+                    "source": sources.setdefault(handle, len(sources)),
+                    "api_id": api_id,
+                    "velocity": parse_move(sample.parameter) if api_id == ids.MOVE else None,
+                }
+                file.write(json.dumps(line) + "\n")
+            file.flush()
+    bus.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
