@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pwd
+import shlex
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -258,7 +259,7 @@ def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
 
 def _commands(contents: Mapping[Path, str], *, system: bool) -> list[str]:
     """Commands that make the services run, for the operator to give."""
-    prepare = [] if system else [f"sudo cp {path} {_home_of(path)}" for path in contents]
+    prepare = [] if system else [f"sudo cp {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
     prepare += ["sudo systemd-sysusers"] if any(path.suffix == ".conf" for path in contents) else []
     return [
         *prepare,
