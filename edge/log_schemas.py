@@ -59,7 +59,7 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/tick": _record(
         "tic_vla.Tick",
-        ("supervisor", "speed_scale", "active"),
+        ("delay_given_s", "offset_sd", "supervisor", "speed_scale", "active"),
         tick=_INT,
         now_ns=_INT,
         start_ns=_INT,
@@ -72,7 +72,9 @@ SCHEMAS: Mapping[str, Schema] = {
         generation=_INT_OR_NULL,
         anchor_ns=_INT_OR_NULL,
         delay_s=_NUMBER_OR_NULL,
+        delay_given_s=_NUMBER_OR_NULL,  # what the policy was told: within what it was trained for
         offset=_VECTOR_OR_NULL,
+        offset_sd=_VECTOR_OR_NULL,  # standard deviations of the offset, m, m, rad
         pose=_VECTOR_OR_NULL,
         state=_VECTOR_OR_NULL,  # vx m/s, vy m/s, ωz rad/s
         trajectory=_ROWS_OR_NULL,  # (x m, y m, θ rad) at whole seconds
@@ -85,8 +87,9 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/semantic": _record(
         "tic_vla.Semantic",
-        ("frame_poses", "max_new_tokens"),
+        ("instruction", "frame_poses", "max_new_tokens"),
         generation=_INT,
+        instruction=_TEXT,  # the run's, or another that was given later
         anchor_ns=_INT,
         anchor_pose=_VECTOR_OR_NULL,
         started_ns=_INT,
@@ -117,11 +120,13 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/power": _record(
         "tic_vla.Power",
+        ("stamp_ns",),
+        stamp_ns=_INT,
         total_w=_NUMBER_OR_NULL,
         rails=_NUMBERS_BY_NAME,  # W by label
         average_w=_NUMBER_OR_NULL,
         budget_w=_NUMBER_OR_NULL,
-        level=_ANY,  # of the governor
+        level=_TEXT,  # of the governor
         pause_s=_NUMBER,
         token_cap=_INT_OR_NULL,
         tagged=_TEXT,  # measured, modelled
@@ -130,11 +135,15 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/odometry": _record(
         "tic_vla.Odometry",
+        ("roll_rad", "pitch_rad", "foot_forces"),
         raw_pose=_VECTOR,  # x m, y m, θ rad, as the robot says
         velocity=_VECTOR,  # vx m/s, vy m/s, ωz rad/s
         gyro_wz_radps=_NUMBER_OR_NULL,
+        roll_rad=_NUMBER_OR_NULL,
+        pitch_rad=_NUMBER_OR_NULL,
+        foot_forces=_VECTOR,  # FR, FL, RR, RL, as the robot counts
         pose=_VECTOR_OR_NULL,  # fused
-        covariance=_ROWS_OR_NULL,  # 3×3 of the fused pose, m² and rad²
+        covariance=_ROWS_OR_NULL,  # 3×3 of the motion since the anchor that is driven by, m² and rad²
         drift_m_per_m=_NUMBER_OR_NULL,
         drift_deg_per_m=_NUMBER_OR_NULL,
         command=_VECTOR_OR_NULL,

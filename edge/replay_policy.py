@@ -146,7 +146,7 @@ class Replayer:
             for stamp_ns, pose in zip(record.frames_ns, self._frame_poses(record), strict=True)
         ]
         generation = self._language.generate(
-            self._language.prompt.build(frames, self._run.instruction),
+            self._language.prompt.build(frames, record.instruction or self._run.instruction),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
         )

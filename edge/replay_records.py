@@ -49,6 +49,8 @@ class RecordedGeneration:
 
     number: int
     ready_ns: int
+    instruction: str | None
+    """None: the run's."""
     frames_ns: tuple[int, ...]
     poses: tuple[SE2, ...] | None
     """`T_odom_base` of each frame; None: a log that does not say."""
@@ -67,6 +69,7 @@ class RecordedTick:
     frame_ns: int | None
     generation: int | None
     delay_s: float
+    """As the policy was told."""
     offset: SE2
     pose: SE2 | None
     state: tuple[float, float, float]
@@ -138,6 +141,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
     return RecordedGeneration(
         number=int(payload["generation"]),
         ready_ns=int(payload["ready_ns"]),
+        instruction=None if "instruction" not in payload else _text(payload["instruction"]),
         frames_ns=frames_ns,
         poses=None if poses is None else tuple(_pose(pose) for pose in poses),
         anchor_pose=_pose(payload["anchor_pose"]),
@@ -157,7 +161,7 @@ def _tick(payload: Mapping[str, Any]) -> RecordedTick:
         acted_ns=now_ns + round(float(payload["act_ms"] or 0.0) * 1e6),
         frame_ns=None if payload["frame_ns"] is None else int(payload["frame_ns"]),
         generation=int(payload["generation"]) if driven else None,
-        delay_s=float(payload["delay_s"]) if driven else math.nan,
+        delay_s=float(payload.get("delay_given_s", payload["delay_s"])) if driven else math.nan,
         offset=_pose(offset) if driven else SE2(0.0, 0.0, 0.0),
         pose=None if pose is None else _pose(pose),
         state=_triple(state) if driven else (0.0, 0.0, 0.0),

@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from edge.drift_rate import DriftRate
+from edge.geometry import SE2
 from edge.log_part import encode
+from edge.log_records import Throttle, battery_record, odometry_record
 from edge.log_schemas import SCHEMAS, Schema
 from edge.recorder import Recorder
+from firmware_bridge.unitree.state import BatteryState, RobotState
 from tests import synthetic_run
 
 _TYPES: dict[str, tuple[type, ...]] = {
@@ -25,6 +29,23 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "number": (int, float),
     "null": (type(None),),
 }
+
+STATE = RobotState(
+    received_ns=1,
+    T_odom_base=(1.0, 0.0, 0.1),
+    vx_mps=0.4,
+    vy_mps=0.0,
+    wz_radps=0.0,
+    mode=3,
+    error_code=0,
+    robot_stamp_ns=0,
+    position_z_m=0.31,
+    roll_rad=0.0,
+    pitch_rad=0.02,
+    gyro_wz_radps=0.01,
+    foot_forces=(20, 21, 19, 22),
+)
+DRIFT = DriftRate(0.02, 0.001, 0.01, math.inf, 20.0)
 
 SAMPLES: dict[str, dict[str, Any]] = {
     "/fault": {
@@ -41,24 +62,15 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "rails": {"VDD_IN": 14.2, "VDD_CPU_GPU_CV": math.nan},
         "average_w": 13.9,
         "budget_w": 25.0,
-        "level": 0,
+        "level": "full",
         "pause_s": 0.0,
         "token_cap": None,
         "tagged": "measured",
         "source": "ina3221",
         "temperature_c": None,
     },
-    "/odometry": {
-        "raw_pose": (1.0, 0.0, 0.1),
-        "velocity": (0.4, 0.0, 0.0),
-        "gyro_wz_radps": 0.01,
-        "pose": np.array([1.0, 0.0, 0.1]),
-        "covariance": np.eye(3),
-        "drift_m_per_m": 0.02,
-        "drift_deg_per_m": math.inf,
-        "command": None,
-    },
-    "/battery": {"soc_percent": 81.0, "voltage_v": 28.9, "current_a": None},
+    "/odometry": odometry_record(STATE, SE2(1.0, 0.0, 0.1), np.eye(3), DRIFT, (0.4, 0.0, 0.0)),
+    "/battery": battery_record(BatteryState(1, 81, 28.9, -3.2)),
     "/run": {
         "instruction": "go",
         "mode": "async",
@@ -130,3 +142,23 @@ def test_schemas_travel_in_the_file(tmp_path: Path) -> None:
     for topic, (schema, payload) in found.items():
         assert schema == SCHEMAS[topic]
         assert complaints(payload, schema) == []
+
+
+def test_before_anything_was_fused_the_odometry_record_conforms_too() -> None:
+    record = odometry_record(STATE, None, None, None, None)
+    assert complaints(json.loads(encode(record, 7)), SCHEMAS["/odometry"]) == []
+
+
+@pytest.mark.parametrize(("source_hz", "passed"), [(500, 50), (51, 50), (50, 50), (20, 20)])
+def test_a_throttle_lets_the_rate_pass_and_no_more(source_hz: int, passed: int) -> None:
+    throttle = Throttle(50.0)
+    seconds = 20
+    count = sum(throttle.due(round(index * 1e9 / source_hz)) for index in range(source_hz * seconds))
+    assert count == pytest.approx(passed * seconds, rel=0.02)
+
+
+def test_after_a_gap_a_throttle_does_not_make_up_for_it() -> None:
+    throttle = Throttle(50.0)
+    assert throttle.due(0)
+    after_ns = 10_000_000_000
+    assert sum(throttle.due(after_ns + index * 1_000_000) for index in range(100)) <= 6
