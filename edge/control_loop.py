@@ -180,11 +180,13 @@ class ControlLoop:
             self.statistics.delay_error_ms.add(error_ms)
             self.statistics.delay_s.add(delay_s)
         acted_ns = self._clock()
-        self._supervise(self._watch.tick(trajectory, semantic, pose, self._last_tick_ns, acted_ns), acted_ns)
+        driven_ns = None if encoded is None else encoded.stamp_ns
+        found = self._watch.tick(trajectory, semantic, pose, driven_ns, self._last_tick_ns, acted_ns)
+        self._supervise(found, acted_ns)
         inputs = ControllerInputs(
             trajectory=trajectory,
             # Of the frame that was encoded and driven by, which is not the camera's newest when the encoder fails.
-            frame_age_ms=None if encoded is None else (acted_ns - encoded.stamp_ns) / 1e6,
+            frame_age_ms=None if driven_ns is None else (acted_ns - driven_ns) / 1e6,
             odometry_age_ms=None if pose is None else (acted_ns - pose.stamp_ns) / 1e6,
             speed_scale=self.supervision.speed_scale,
             hold=self._hold(acted_ns),
@@ -207,7 +209,7 @@ class ControlLoop:
                 "late_ms": (start_ns - deadline_ns) / 1e6,
                 "encode_ms": (encoded_ns - start_ns) / 1e6,
                 "act_ms": (acted_ns - now_ns) / 1e6,
-                "frame_ns": None if encoded is None else encoded.stamp_ns,
+                "frame_ns": driven_ns,
                 "frame_age_ms": inputs.frame_age_ms,
                 "generation": None if used is None else used.generation,
                 "anchor_ns": None if used is None else used.anchor_ns,

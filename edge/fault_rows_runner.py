@@ -10,7 +10,7 @@ _LOOP = "tests/test_control_loop_faults.py::test_"
 INPUTS: tuple[Fault, ...] = (
     Fault(
         "camera-stopped", 1, Action.ZERO, 500, _HERE,
-        "The camera has stopped sending pictures.",
+        "There is no new picture to drive by.",
         "Check the camera's cable and service; driving goes on 1 s after pictures are back.",
         _LOOP + "a_camera_that_stops",
     ),
@@ -84,7 +84,7 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "odometry-not-finite", 10, Action.ZERO, 60, _HERE,
-        "The robot's pose or velocity is not a number.",
+        "The robot reports a pose or velocity that is no number or cannot be.",
         "If it stays, restart the robot.",
         _LOOP + "odometry_that_is_not_finite",
     ),

@@ -101,6 +101,7 @@ class Bench:
         self.jpeg = b""
         self.walked_m = 0.0
         self.states = 0
+        self.malformed = 0
         self.failed = 0
         self.asleep_ns = 0
         self.attitude = Attitude()
@@ -118,6 +119,7 @@ class Bench:
             findings=self.findings,
             attitude=lambda: self.attitude,
             states=lambda: self.states,
+            malformed=lambda: self.malformed,
             failed_generations=lambda: self.failed,
             asleep_ns=lambda: self.asleep_ns,
         )

@@ -93,6 +93,13 @@ def test_a_camera_that_stops(bench: Bench) -> None:
     assert drives_again(bench)
 
 
+def test_an_encoder_that_fails_is_a_camera_that_stops(bench: Bench) -> None:
+    bench.policy.blind = True
+    zero_in_time(bench, "camera-stopped", bench.see)
+    bench.policy.blind = False
+    assert drives_again(bench)
+
+
 def test_driving_goes_on_a_second_after_pictures_are_back(bench: Bench) -> None:
     until(bench, "camera-stopped", bench.feel)
     speeds = []
@@ -246,7 +253,11 @@ def test_odometry_that_does_not_move(bench: Bench) -> None:
 
 
 def test_odometry_that_is_not_finite(bench: Bench) -> None:
-    zero_in_time(bench, "odometry-not-finite", reported(bench, "odometry-not-finite"), glances=True)
+    def poison() -> None:
+        bench.malformed += 1
+
+    zero_in_time(bench, "odometry-not-finite", poison, glances=True)
+    assert drives_again(bench)
 
 
 def test_odometry_that_is_late(bench: Bench) -> None:

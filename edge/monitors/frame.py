@@ -50,7 +50,7 @@ class FrameConfig:
     rate_hz: float
     """Pictures a second that the control thread can see: the camera's rate, the tick's at most."""
     stopped_ms: float = 300.0
-    """Zero when the newest good picture is older."""
+    """Zero when the picture that is driven by is older."""
     stale_ms: float = 300.0
     """A picture that is older when it is first seen is refused."""
     frozen_ms: float = 300.0
@@ -78,7 +78,6 @@ class FrameMonitor:
     def __init__(self, config: FrameConfig) -> None:
         self._config = config
         self._seen_ns: int | None = None
-        self._good_ns: int | None = None
         self._usable = False
         self._content = 0
         self._content_ns = 0
@@ -108,12 +107,16 @@ class FrameMonitor:
             findings.append(Finding("camera-frozen"))
         if self._other_size >= BAD_IN_A_ROW:
             findings.append(Finding("camera-swapped", self._why))
-        age_ms = None if self._good_ns is None else (now_ns - self._good_ns) / 1e6
-        if age_ms is None or age_ms > self._config.stopped_ms:
-            detail = "no good picture yet" if age_ms is None else f"the last good picture is {age_ms:.0f} ms old"
-            findings.append(Finding("camera-stopped", detail))
         self._judge_rate(now_ns, findings)
         return FrameOutputs(self._usable, self._content, tuple(findings))
+
+    def age(self, driven_ns: int | None, now_ns: int) -> tuple[Finding, ...]:
+        """Judge the age of the picture that is driven by (its capture), whoever is to blame: camera or encoder."""
+        age_ms = None if driven_ns is None else (now_ns - driven_ns) / 1e6
+        if age_ms is not None and age_ms <= self._config.stopped_ms:
+            return ()
+        detail = "none yet" if age_ms is None else f"the one that is driven by is {age_ms:.0f} ms old"
+        return (Finding("camera-stopped", detail),)
 
     def _judge(self, picture: Picture, T_odom_base: SE2 | None, now_ns: int, findings: list[Finding]) -> None:
         late = self._seen_ns is not None and picture.stamp_ns < self._seen_ns
@@ -129,7 +132,6 @@ class FrameMonitor:
         self._usable = not self._why
         self._refused = 0 if self._usable else self._refused + 1
         if self._usable:
-            self._good_ns = picture.stamp_ns
             self._judge_content(picture, T_odom_base)
 
     def _defect(self, picture: Picture) -> str:

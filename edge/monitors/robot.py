@@ -46,19 +46,24 @@ class RobotWatchConfig:
 
 
 class RobotMonitor:
-    """Remembers how many state messages came."""
+    """Remembers how many state messages came, and how many were dropped."""
 
     def __init__(self, config: RobotWatchConfig) -> None:
         self._config = config
+        self._malformed = 0
         self._counts: deque[tuple[int, int]] = deque(maxlen=64)
         self._expected: float | None = None
 
-    def tilt(self, attitude: Attitude | None) -> tuple[Finding, ...]:
-        """Tipped over or not; cheap enough to be asked between ticks."""
+    def urgent(self, attitude: Attitude | None, malformed: int) -> tuple[Finding, ...]:
+        """What does not wait for a tick: a robot that tipped over, a report that had to be dropped (counted so far)."""
+        findings: tuple[Finding, ...] = ()
+        if malformed > self._malformed:
+            self._malformed = malformed
+            findings = (Finding("odometry-not-finite", f"{malformed} reports dropped so far"),)
         if attitude is None or max(abs(attitude.roll_rad), abs(attitude.pitch_rad)) <= TIPPED_RAD:
-            return ()
+            return findings
         roll, pitch = math.degrees(attitude.roll_rad), math.degrees(attitude.pitch_rad)
-        return (Finding("tipped-over", f"roll {roll:.0f}°, pitch {pitch:.0f}°"),)
+        return (*findings, Finding("tipped-over", f"roll {roll:.0f}°, pitch {pitch:.0f}°"))
 
     def step(self, pose: StampedPose | None, states: int | None, now_ns: int) -> tuple[Finding, ...]:
         """Judge the newest pose and the count of state messages so far; None: not known."""

@@ -39,6 +39,8 @@ class Sources:
     attitude: Callable[[], Attitude | None] = lambda: None
     states: Callable[[], int | None] = lambda: None
     """State messages of the robot so far."""
+    malformed: Callable[[], int] = lambda: 0
+    """Of them, those that were dropped because something in them cannot be."""
     failed_generations: Callable[[], int] = lambda: 0
     asleep_ns: Callable[[], int] = asleep_ns
 
@@ -93,22 +95,28 @@ class Watch:
         return self._pictures.usable
 
     def urgent(self) -> tuple[Finding, ...]:
-        """What must not wait for the next tick: other threads' findings, and a robot that has tipped over."""
-        return (*self._sources.findings.take(), *self._robot.tilt(self._sources.attitude()))
+        """What must not wait for the next tick: other threads' findings, a tipped robot, a report that cannot be."""
+        sources = self._sources
+        return (*sources.findings.take(), *self._robot.urgent(sources.attitude(), sources.malformed()))
 
     def tick(
         self,
         trajectory: npt.NDArray[np.float32] | None,
         semantic: SemanticState | None,
         pose: StampedPose | None,
+        driven_ns: int | None,
         last_tick_ns: int | None,
         now_ns: int,
     ) -> tuple[Finding, ...]:
-        """After the action expert: what was found of the picture and of everything else, the urgent included."""
+        """After the action expert: what was found of the picture and of everything else, the urgent included.
+
+        `driven_ns`: when the picture that is driven by was captured; `last_tick_ns`: how long the last tick took.
+        """
         sources = self._sources
         return (
             *self.urgent(),
             *self._pictures.findings,
+            *self._frame.age(driven_ns, now_ns),
             *self._output.step(trajectory, self._pictures.content, now_ns),
             *self._semantic.step(semantic, sources.failed_generations(), now_ns),
             *self._robot.step(pose, sources.states(), now_ns),
