@@ -17,16 +17,19 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CameraGeometry:
-    """Pinhole with square pixels, principal point in the middle; mounted `forward_m` ahead of the base origin.
+    """Pinhole with square pixels, mounted `forward_m` ahead of the base origin.
 
     `height_m`: camera above the floor while the robot stands level. `pitch_rad`: how far it looks down from the body's
-    x axis. Raises ValueError for what no front camera has.
+    x axis. `centre_right`, `centre_down`: where the optical axis meets the picture, from its middle, in picture widths.
+    Raises ValueError for what no front camera has.
     """
 
     hfov_rad: float
     height_m: float
     pitch_rad: float
     forward_m: float
+    centre_right: float = 0.0
+    centre_down: float = 0.0
 
     def __post_init__(self) -> None:
         checks = (
@@ -37,6 +40,8 @@ class CameraGeometry:
                 f"pitch_rad: expected -0.8..1.4, down positive; found {self.pitch_rad}",
             ),
             (-2.0 <= self.forward_m <= 2.0, f"forward_m: expected -2..2, found {self.forward_m}"),
+            (abs(self.centre_right) <= 0.2, f"centre_right: expected -0.2..0.2, found {self.centre_right}"),
+            (abs(self.centre_down) <= 0.2, f"centre_down: expected -0.2..0.2, found {self.centre_down}"),
         )
         for good, message in checks:
             if not good:
@@ -61,7 +66,8 @@ class FloorProjector:
 
     def __init__(self, geometry: CameraGeometry, width_px: int, height_px: int) -> None:
         self.focal_px = width_px / 2 / math.tan(geometry.hfov_rad / 2)
-        self._cx, self._cy = (width_px - 1) / 2, (height_px - 1) / 2
+        self._cx = (width_px - 1) / 2 + geometry.centre_right * width_px
+        self._cy = (height_px - 1) / 2 + geometry.centre_down * width_px
         self._geometry = geometry
 
     def camera_height_m(self, attitude: Attitude) -> float:
@@ -103,3 +109,10 @@ class FloorProjector:
         y, z = cr * left - sr * bz, sr * left + cr * bz
         cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
         return np.stack((cp * bx + sp * z, y, cp * z - sp * bx), axis=1)
+
+
+def seen_from(points: Array, motion: Array) -> Array:
+    """Floor points [..., 2] of an earlier level base frame in a later one, which is at `motion` [..., 3] in it."""
+    c, s = np.cos(motion[..., 2]), np.sin(motion[..., 2])
+    x, y = points[..., 0] - motion[..., 0], points[..., 1] - motion[..., 1]
+    return np.stack((c * x + s * y, c * y - s * x), axis=-1)

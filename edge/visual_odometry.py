@@ -8,13 +8,14 @@ blur or a crowd, there is no answer instead of a bad one. A few milliseconds a f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.camera_geometry import Array, Attitude, CameraGeometry, FloorProjector
+from edge.camera_geometry import Array, Attitude, CameraGeometry, FloorProjector, seen_from
+from edge.floor_alignment import AlignmentConfig, Picture, Solution, align_pictures, fit_corners, smooth
 from edge.geometry import SE2
 
 Grey = npt.NDArray[np.uint8]
@@ -26,8 +27,10 @@ Covariance = tuple[float, float, float, float, float, float, float, float, float
 class VisualConfig:
     """How corners are chosen, when an answer is given, and how far the attitude is trusted between two frames."""
 
-    max_corners: int = 120
-    min_corners: int = 14
+    max_corners: int = 80
+    min_corners: int = 12
+    renew_corners: int = 18
+    """With fewer left, an answer is given while it can be."""
     min_depression_rad: float = math.radians(7.0)
     """Floor nearer to the horizon than this moves too little to tell anything."""
     keyframe_distance_m: float = 0.25
@@ -35,15 +38,11 @@ class VisualConfig:
     keyframe_age_ns: int = 1_000_000_000
     max_gap_ns: int = 500_000_000
     """Corners are not followed across a longer pause between frames."""
-    inlier_px: float = 1.5
-    min_inlier_share: float = 0.5
-    min_pixel_sigma: float = 0.15
-    attitude_sigma_rad: float = math.radians(0.15)
-    height_sigma: float = 0.01
-    """Relative error of the height between two frames."""
+    min_inlier_share: float = 0.4
     min_brightness: float = 12.0
     """Mean grey value, 0..255."""
     hypotheses: int = 64
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
 
     def __post_init__(self) -> None:
         if not 6 <= self.min_corners <= self.max_corners <= 1000:
@@ -51,8 +50,7 @@ class VisualConfig:
                              f"{self.min_corners} and {self.max_corners}")  # fmt: skip
         positive = (
             self.min_depression_rad, self.keyframe_distance_m, self.keyframe_turn_rad, self.keyframe_age_ns,
-            self.max_gap_ns, self.inlier_px, self.min_pixel_sigma, self.attitude_sigma_rad, self.height_sigma,
-            self.hypotheses,
+            self.max_gap_ns, self.hypotheses,
         )  # fmt: skip
         if not all(math.isfinite(v) and v > 0 for v in positive) or not 0 < self.min_inlier_share <= 1:
             raise ValueError(f"visual odometry: expected positive settings, found {self}")
@@ -75,6 +73,8 @@ class _Keyframe:
     stamp_ns: int
     attitude: Attitude
     corners: Array
+    picture: Picture
+    floor: Grey
 
 
 def grey_frame(jpeg: bytes, width_px: int = 320) -> Grey | None:
@@ -141,11 +141,13 @@ class VisualOdometry:
         motion: VisualMotion | None = None
         restart = True
         if self._key is not None and stamp_ns - self._previous_ns <= self._config.max_gap_ns and self._follow(grey):
-            motion = self._solve(self._projector, self._key, stamp_ns, attitude)
-            if motion is None:
+            solved = self._solve(self._projector, self._key, attitude)
+            if solved is None:
                 self.refused += 1
-            elif not self._due(motion, self._key):
-                motion, restart = None, False
+            elif self._due(solved, self._key, stamp_ns):
+                motion = self._answer(self._projector, self._key, grey, stamp_ns, attitude, solved)
+            else:
+                restart = False
         elif self._key is not None:
             self.refused += 1
         if restart:
@@ -153,27 +155,46 @@ class VisualOdometry:
         self._previous, self._previous_ns = grey, stamp_ns
         return motion
 
-    def _due(self, motion: VisualMotion, key: _Keyframe) -> bool:
+    def _due(self, solved: Solution, key: _Keyframe, stamp_ns: int) -> bool:
         config = self._config
-        moved = motion.T_start_end
         return (
-            math.hypot(moved.x_m, moved.y_m) >= config.keyframe_distance_m
-            or abs(moved.theta_rad) >= config.keyframe_turn_rad
-            or motion.end_ns - motion.start_ns >= config.keyframe_age_ns
-            or motion.corners < max(2 * config.min_corners, 0.4 * len(key.corners))
+            math.hypot(solved.unknowns[0], solved.unknowns[1]) >= config.keyframe_distance_m
+            or abs(solved.unknowns[2]) >= config.keyframe_turn_rad
+            or stamp_ns - key.stamp_ns >= config.keyframe_age_ns
+            or solved.inliers < config.renew_corners
         )
+
+    def _answer(
+        self, projector: FloorProjector, key: _Keyframe, grey: Grey, stamp_ns: int, attitude: Attitude, solved: Solution
+    ) -> VisualMotion:
+        """The motion by the whole picture; by its corners where that does not settle near them."""
+        config = self._config.alignment
+        now = smooth(grey, config)
+        aligned = align_pictures(
+            projector, key.picture, key.attitude, now, attitude, solved.unknowns, key.floor, config
+        )
+        if aligned is not None and aligned.share >= config.min_share:
+            apart = np.abs(aligned.unknowns[:3] - solved.unknowns[:3])
+            if apart[:2].max() < config.settle_m and apart[2] < config.settle_rad:
+                solved = aligned
+        x, y, theta = (float(v) for v in solved.unknowns[:3])
+        c = [float(v) for v in solved.covariance.ravel()]
+        covariance: Covariance = (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+        return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
 
     def _set_keyframe(self, projector: FloorProjector, grey: Grey, stamp_ns: int, attitude: Attitude) -> None:
         self._key, self._tracked = None, np.zeros((0, 2))
         if grey[::4, ::4].mean() < self._config.min_brightness:
             return
-        found = cv2.goodFeaturesToTrack(
-            grey, self._config.max_corners, 0.02, 6, mask=self._floor_mask(projector, attitude), blockSize=5
-        )
+        floor = self._floor_mask(projector, attitude)
+        found = cv2.goodFeaturesToTrack(grey, self._config.max_corners, 0.005, 5, mask=floor, blockSize=5)
         if found is None or len(found) < self._config.min_corners:
             return
         corners = found.reshape(-1, 2).astype(np.float64)
-        self._key, self._tracked = _Keyframe(stamp_ns, attitude, corners), corners
+        self._key, self._tracked = (
+            _Keyframe(stamp_ns, attitude, corners, smooth(grey, self._config.alignment), floor),
+            corners,
+        )
 
     def _floor_mask(self, projector: FloorProjector, attitude: Attitude) -> Grey:
         """255 where a pixel would show floor that is near enough; columns are sampled, the edge between is straight."""
@@ -211,9 +232,8 @@ class VisualOdometry:
         self._key = replace(self._key, corners=self._key.corners[good])
         return True
 
-    def _solve(
-        self, projector: FloorProjector, key: _Keyframe, stamp_ns: int, attitude: Attitude
-    ) -> VisualMotion | None:
+    def _solve(self, projector: FloorProjector, key: _Keyframe, attitude: Attitude) -> Solution | None:
+        """The motion since the key frame by its corners."""
         config = self._config
         before, _ = projector.floor_points(key.corners, key.attitude)
         after, depression = projector.floor_points(self._tracked, attitude)
@@ -223,13 +243,10 @@ class VisualOdometry:
         start = self._vote(projector, before, after, usable, attitude)
         if start is None:
             return None
-        solved = _refine(projector, before, self._tracked, attitude, start, config)
-        if solved is None:
+        solved = fit_corners(projector, before, self._tracked, attitude, start, config.alignment)
+        if solved is None or solved.inliers < config.min_corners or solved.share < config.min_inlier_share:
             return None
-        motion, covariance, inliers = solved
-        if inliers < max(config.min_corners, config.min_inlier_share * len(before)):
-            return None
-        return VisualMotion(key.stamp_ns, stamp_ns, motion, covariance, inliers)
+        return solved
 
     def _vote(
         self, projector: FloorProjector, before: Array, after: Array, usable: npt.NDArray[np.bool_], attitude: Attitude
@@ -250,9 +267,9 @@ class VisualOdometry:
             (c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]), axis=1
         )
         motions = np.concatenate((shift, turn[:, None]), axis=1)
-        moved = _seen_from(before[None], motions[:, None, :])
+        moved = seen_from(before[None], motions[:, None, :])
         errors = np.abs(projector.pixels(moved, attitude) - self._tracked[None]).max(axis=2)
-        votes = np.count_nonzero(errors < 2 * self._config.inlier_px, axis=1)
+        votes = np.count_nonzero(errors < 2 * self._config.alignment.inlier_px, axis=1)
         best = int(votes.argmax())
         if votes[best] < max(self._config.min_corners, self._config.min_inlier_share * len(before)):
             return None
@@ -265,68 +282,3 @@ def _track(
     """Corners [n, 1, 2] of one picture in the next, and which of them were found."""
     at, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(13, 13), maxLevel=3)
     return np.asarray(at, np.float32), np.asarray(found, np.uint8)
-
-
-def _seen_from(points: Array, motion: Array) -> Array:
-    """Floor points [..., 2] of the earlier level base frame in the later one, which is at `motion` [..., 3] in it."""
-    c, s = np.cos(motion[..., 2]), np.sin(motion[..., 2])
-    x, y = points[..., 0] - motion[..., 0], points[..., 1] - motion[..., 1]
-    return np.stack((c * x + s * y, c * y - s * x), axis=-1)
-
-
-_STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4))
-
-
-def _refine(
-    projector: FloorProjector, before: Array, seen: Array, attitude: Attitude, start: Array, config: VisualConfig
-) -> tuple[SE2, Covariance, int] | None:
-    """Least squares in pixels over x, y, θ and the errors of height, pitch and roll between the frames.
-
-    Robust by Tukey's weights. The three nuisance terms carry the attitude's own uncertainty as a prior; the trot moves
-    the camera by centimetres and degrees, which would otherwise pass for motion. None when it does not settle.
-    """
-    q = np.concatenate((start, np.zeros(3)))
-    prior = 1 / np.array((np.inf, np.inf, np.inf, config.height_sigma, *[config.attitude_sigma_rad] * 2)) ** 2
-    height_m = projector.camera_height_m(attitude)
-
-    def residuals(parameters: Array) -> Array:
-        tilted = Attitude(
-            attitude.roll_rad + parameters[5],
-            attitude.pitch_rad + parameters[4],
-            attitude.lift_m + height_m * parameters[3],
-        )
-        return projector.pixels(_seen_from(before, parameters[:3]), tilted) - seen
-
-    sigma = config.inlier_px
-    for iteration in range(8):
-        r = residuals(q)
-        jacobian = np.stack([(residuals(q + step) - r) / step.sum() for step in np.diag(_STEPS)], axis=-1)
-        size = np.abs(r).max(axis=1)
-        close = size[size < 2 * config.inlier_px]
-        if len(close) < config.min_corners:
-            return None
-        sigma = max(config.min_pixel_sigma, 1.4826 * float(np.median(np.abs(r[size < 2 * config.inlier_px]))))
-        weight = np.clip(1 - (size / min(2 * config.inlier_px, 4.7 * sigma)) ** 2, 0, None) ** 2
-        weighted = jacobian * (weight / sigma**2)[:, None, None]
-        normal = np.einsum("nki,nkj->ij", weighted, jacobian) + np.diag(prior)
-        gradient = np.einsum("nki,nk->i", weighted, r) + prior * q
-        try:
-            step = np.linalg.solve(normal, -gradient)
-            inverse = np.linalg.inv(normal)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(step)) or np.abs(step[:3]).max() > 1.0:
-            return None
-        q = q + step
-        if iteration >= 2 and np.abs(step[:3]).max() < 1e-5:
-            break
-    inliers = int(np.count_nonzero(weight > 0.05))
-    # The axes of one corner err together, and neighbouring corners share texture: count half of them as independent.
-    block = 2.0 * inverse[:3, :3]
-    if not np.all(np.isfinite(q)):
-        return None
-    values = [float(v) for v in block.ravel()]
-    covariance: Covariance = (
-        values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7], values[8],
-    )  # fmt: skip
-    return SE2(float(q[0]), float(q[1]), float(q[2])), covariance, inliers
