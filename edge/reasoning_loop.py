@@ -21,6 +21,7 @@ from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.semantic import Context, SemanticState
+from edge.stats import Samples
 
 IDLE_S = 0.02
 FRAME_POLL_S = 0.002
@@ -31,8 +32,8 @@ RETRY_S = 0.5
 FAILURES = 5
 FAILURE_WINDOW_S = 60.0
 """Fault matrix row 18: so many failures within this time end reasoning until the next start."""
-SAMPLES = 4096
-"""Newest samples that statistics are made of."""
+SAMPLES = 8192
+"""Generations whose times are kept exactly: hours of them."""
 
 
 class Mode(Enum):
@@ -139,10 +140,10 @@ class ReasoningLoop:
         self.invalid_texts = 0
         """Complete texts that were not of the grammar; one that the budget or the mode cuts short is not counted."""
         self.invalid_in_a_row = 0
-        self.generation_ms: deque[float] = deque(maxlen=SAMPLES)
-        self.anchor_to_ready_ms: deque[float] = deque(maxlen=SAMPLES)
+        self.generation_ms = Samples(SAMPLES)
+        self.anchor_to_ready_ms = Samples(SAMPLES)
         """Δt at release: from the newest frame's capture until its semantic state may be driven by."""
-        self.late_anchor_ms: deque[float] = deque(maxlen=SAMPLES)
+        self.late_anchor_ms = Samples(SAMPLES)
         """How much longer that would have been with the frame that was newest when the generation began."""
 
     def submit(self, instruction: str) -> None:
@@ -237,8 +238,8 @@ class ReasoningLoop:
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
-        self.generation_ms.append((finished_ns - started_ns) / 1e6)
-        self.anchor_to_ready_ms.append((state.ready_ns - anchor.stamp_ns) / 1e6)
+        self.generation_ms.add((finished_ns - started_ns) / 1e6)
+        self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
             record = {
                 "generation": state.generation,
@@ -284,7 +285,7 @@ class ReasoningLoop:
                 anchor = self._ring.nearest(stamp_ns)
                 if anchor is None or (frames and anchor.stamp_ns <= frames[-1].stamp_ns):
                     raise MissedFrameError
-                self.late_anchor_ms.append((anchor.stamp_ns - begun_ns) / 1e6)
+                self.late_anchor_ms.add((anchor.stamp_ns - begun_ns) / 1e6)
                 return [*frames, anchor]
             if cancelled():
                 raise CancelledError
