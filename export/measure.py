@@ -12,7 +12,7 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ def measure_points(directory: Path, *, machine: str, date: str, repeats: int = 7
     target = parse_target(manifest["provenance"]["target"], f"{directory.name}: the target in its manifest")
     samples = _samples(artifacts, repeats)
     return [
-        _point(target, manifest, artifacts, stage, samples, machine=machine, date=date)
+        measured_point(target, manifest, artifacts, stage, samples, machine=machine, date=date)
         for stage in STAGES
         if samples[stage]
     ]
@@ -89,16 +89,21 @@ def _timed(call: Callable[[], object], repeats: int) -> list[float]:
     return times_ms
 
 
-def _point(
+def measured_point(
     target: Target,
-    manifest: dict[str, Any],
+    manifest: Mapping[str, Any],
     artifacts: Artifacts,
     stage: str,
-    samples: dict[str, Any],
+    samples: Mapping[str, Any],
     *,
     machine: str,
     date: str,
+    energy_j: float | None = None,
 ) -> Measured:
+    """The point of one stage: `samples` has its times in ms (decode: of a token), and `prompt` and `new` tokens.
+
+    `energy_j` is the energy above idle of one such time. Raises TargetError for a time that is no time.
+    """
     graph = stage_graph(target, stage)
     policy, times_ms = target.graphs[graph], samples[stage]
     precision = Precision.from_dict(manifest["graphs"][graph]["precision"])
@@ -123,6 +128,7 @@ def _point(
         mode=target.power.mode,
         # Half the spread of the samples: what a repetition may differ by, not what another machine does.
         error=round(min(0.99, (max(times_ms) - min(times_ms)) / 2 / median_ms), 3),
+        energy_j=None if energy_j is None else round(energy_j, 6),
     )
 
 

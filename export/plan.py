@@ -127,7 +127,8 @@ class Plan:
             "ms": _rounded(stage.whole.ms),
             "call_ms": _rounded(stage.each.ms),
             "error": _rounded(stage.whole.error),
-            "energy_j": _rounded(None if self.rise_w is None else self.rise_w * stage.whole.ms / 1e3),
+            "energy_j": self._energy_j(stage),
+            "energy_tagged": MODELLED if stage.energy_j is None else stage.whole.tag,
             "gflop": _rounded(stage.flops / 1e9),
             "moved_bytes": stage.moved_bytes,
             "weight_bytes": self.weight_bytes[stage.graph],
@@ -135,6 +136,12 @@ class Plan:
             "tagged": stage.whole.tag,
             "source": stage.whole.source,
         }
+
+    def _energy_j(self, stage: StageTime) -> float | None:
+        """Energy of a stage as metered, else what a full load would add in its time; None: the target has no power."""
+        if stage.energy_j is not None:
+            return round(stage.energy_j, 4)
+        return None if self.rise_w is None else round(self.rise_w * stage.whole.ms / 1e3, 4)
 
 
 def _rounded(value: float | None) -> float | None:

@@ -348,10 +348,13 @@ class Measured:
     mode: str | None = None
     """Power mode it was taken in."""
     error: float | None = None
+    energy_j: float | None = None
+    """Energy above idle of what `ms` times, or of one token (edge-calib power); the governor starts from it."""
 
     def __post_init__(self) -> None:
         _require((self.ms is None) != (self.tokens_per_s is None), "give either ms or tokens_per_s")
         given = self.ms if self.ms is not None else self.tokens_per_s
         _require(given is not None and given > 0, "ms or tokens_per_s must be positive")
+        _require(self.energy_j is None or 0 <= self.energy_j < 1e6, f"energy_j {self.energy_j} must be 0 to 1e6 J")
         _require(bool(self.machine.strip()), "machine is empty: expected where it was measured")
         _require(self.error is None or 0 <= self.error < 1, f"error {self.error} must be between 0 and 1")

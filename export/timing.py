@@ -64,6 +64,8 @@ class StageTime:
     moved_bytes: int
     bound: str
     """What limits it: `compute`, `memory` or `measured`."""
+    energy_j: float | None = None
+    """Energy above idle of all its calls as metered, at other lengths in proportion to time; None: not metered."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,8 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
         whole = Estimate(measured_ms * per, point.error, MEASURED, where)
         # Only the whole was measured: its longest call is the model's share of it.
         share = modelled.each.ms / modelled.whole.ms if modelled.whole.ms else 1.0
-        return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED)
+        energy_j = None if point.energy_j is None else point.energy_j * per
+        return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED, energy_j=energy_j)
     reference = _modelled(target, config, stage, precision, _at(stage, work, point))
     reference_ms = reference.whole.ms / (reference.calls if stage == "decode" else 1)
     factor = measured_ms / reference_ms
@@ -138,7 +141,8 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
         replace(e.times(factor), error=point.error, tag=MODELLED, source=source)
         for e in (modelled.whole, modelled.each)
     ]
-    return replace(modelled, whole=scaled[0], each=scaled[1])
+    energy_j = None if point.energy_j is None else point.energy_j * scaled[0].ms / measured_ms
+    return replace(modelled, whole=scaled[0], each=scaled[1], energy_j=energy_j)
 
 
 def _length(stage: str, work: Work) -> int:
