@@ -140,11 +140,26 @@ class ReasoningLoop:
         self.invalid_texts = 0
         """Complete texts that were not of the grammar; one that the budget or the mode cuts short is not counted."""
         self.invalid_in_a_row = 0
+        self.new_tokens = 0
+        """Tokens written so far."""
+        self._computed_ns = 0
+        self._computing_since_ns: int | None = None
         self.generation_ms = Samples(SAMPLES)
         self.anchor_to_ready_ms = Samples(SAMPLES)
         """Δt at release: from the newest frame's capture until its semantic state may be driven by."""
         self.late_anchor_ms = Samples(SAMPLES)
         """How much longer that would have been with the frame that was newest when the generation began."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a generation is being computed; one that is finished and held back is not."""
+        return self._computing_since_ns is not None
+
+    @property
+    def busy_ns(self) -> int:
+        """Time for which generations have been computed so far; any thread."""
+        since_ns, done_ns = self._computing_since_ns, self._computed_ns
+        return done_ns if since_ns is None else done_ns + max(0, self._clock() - since_ns)
 
     def submit(self, instruction: str) -> None:
         """Follow another (checked) instruction from now on; the generation under way is ended. Never waits."""
@@ -184,6 +199,7 @@ class ReasoningLoop:
             self._fail(str(error))
         finally:
             self._under_way = None
+            self._rest()
         return False
 
     def _is_due(self, now_ns: int, budget: ReasoningBudget) -> bool:
@@ -216,16 +232,16 @@ class ReasoningLoop:
             if self._give_way is not None:
                 self._give_way.wait(needs_ns, cancelled)
 
-        started_ns = self._clock()
+        started_ns = self._computing_since_ns = self._clock()
         run = self._language.begin(cancelled, interrupt=interrupt, before_call=before_call)
         frames = self._prefill_older(run, job, cancelled)
         anchor, prompt = frames[-1], self._language.prompt
         # Whatever comes of it, this frame has been thought about.
         self._last_anchor_ns = anchor.stamp_ns
         cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
+        most = min(self._max_new_tokens, cap)
         generation = run.finish(
-            [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(frames)],
-            max_new_tokens=min(self._max_new_tokens, cap),
+            [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(frames)], max_new_tokens=most
         )
         if not np.isfinite(generation.last_layer_kv).all():
             raise NotFiniteError("keys and values of the last layer are not finite")
@@ -234,10 +250,12 @@ class ReasoningLoop:
         context = self._policy.semantic_context(generation.last_layer_kv, interrupt)
         finished_ns = self._finished_ns = self._clock()
         self._context_ns = finished_ns - context_started_ns
+        self._rest()
         delay_s = self._release_delay_s()
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
+        self.new_tokens += generation.new_tokens
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -249,7 +267,10 @@ class ReasoningLoop:
                 "finished_ns": finished_ns,
                 "ready_ns": state.ready_ns,
                 "release_delay_s": delay_s,
+                "instruction": job.instruction,
                 "frames_ns": [frame.stamp_ns for frame in frames],
+                "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
+                "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
@@ -259,6 +280,12 @@ class ReasoningLoop:
                 "context_ms": self._context_ns / 1e6,
             }
             self._recorder.put("/semantic", state.ready_ns, record)
+
+    def _rest(self) -> None:
+        """What is being computed, if anything, has ended."""
+        since_ns, self._computing_since_ns = self._computing_since_ns, None
+        if since_ns is not None:
+            self._computed_ns += self._clock() - since_ns
 
     def _prefill_older(self, run: GenerationRun, job: Job, cancelled: Callable[[], bool]) -> list[EncodedFrame]:
         """Feed the frames before the newest, then wait for that one; returns all, oldest first."""
