@@ -48,7 +48,7 @@ BRIDGE: tuple[Fault, ...] = (
         "bridge-killed", 30, Action.STOP, 1200, "robot",
         "The bridge was killed: the robot itself drops a command after 1 s (simulated Go2; measure a real one).",
         "systemd starts the bridge again, disarmed; look at its journal.",
-        "tests/test_sim_go2.py::test_a_move_is_held_one_second_and_then_the_robot_stands_still",
+        "tests/test_bridge_process.py::test_a_killed_bridges_successor_stops_the_moving_robot_first",
     ),
     Fault(
         "bridge-hung", 31, Action.STOP, 1200, "robot",
@@ -90,13 +90,13 @@ BRIDGE: tuple[Fault, ...] = (
         "second-commander", 40, Action.STOP, 500, "bridge",
         "Somebody else commands the robot.",
         "Close the other program or app; only one may command the robot.",
-        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+        "tests/test_bridge_process.py::test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched",
     ),
     Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
         "The robot left its walking modes by itself.",
         "Look at the robot: it may have fallen or been taken over; then arm again.",
-        "tests/test_bridge_process.py::test_a_robot_that_falls_silent_is_stopped",
+        "tests/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
         "robot-error", 42, Action.STOP, 1000, "bridge",
@@ -114,7 +114,7 @@ BRIDGE: tuple[Fault, ...] = (
         "emergency-stop", 47, Action.STOP, 60, "bridge",
         "The emergency stop was pressed, or the remote took over.",
         "Find out why, release it, then arm again.",
-        "tests/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+        "tests/test_bridge_process.py::test_a_hand_on_the_remote_is_zero_within_60_ms",
     ),
 )  # fmt: skip
 
@@ -129,7 +129,7 @@ START: tuple[Fault, ...] = (
         "provider-partial", 25, Action.STOP, 0, "start",
         "The execution provider takes no part of a graph.",
         "Build the engines again with edge-install engines and read what it says.",
-        "tests/test_engines.py::test_a_graph_that_the_provider_takes_no_part_of_is_refused",
+        "tests/test_doctor.py::test_one_node_that_fell_back_to_the_processor_fails_and_is_named",
     ),
     Fault(
         "artifact-corrupt", 53, Action.STOP, 0, "start",
@@ -141,13 +141,13 @@ START: tuple[Fault, ...] = (
         "external-data", 54, Action.STOP, 0, "start",
         "A graph points to data outside the manifest's list.",
         "Do not use these artifacts: somebody has changed them.",
-        "tests/test_manifest.py::test_a_data_file_that_the_manifest_does_not_list_is_refused",
+        "tests/test_manifest.py::test_external_data_that_leaves_its_listed_file_is_refused",
     ),
     Fault(
         "manifest-changed", 55, Action.STOP, 0, "start",
         "The manifest is not what was exported, or its signature does not match.",
         "Use the artifacts as they were exported, with the key that they were signed with.",
-        "tests/test_manifest.py::test_a_change_anywhere_in_the_manifest_is_refused",
+        "tests/test_signature.py::test_a_manifest_that_was_changed_and_sealed_again_is_refused_before_it_is_parsed",
     ),
     Fault(
         "code-in-artifacts", 56, Action.STOP, 0, "start",

@@ -128,9 +128,8 @@ class Supervisor:
             events.append(FaultEvent(now_ns, fault, True, finding.detail))
             self._stopped = self._stopped or fault.latch
         else:
-            if not fault.latch:  # a latched fault keeps telling what stopped the robot
-                entry.detail, entry.speed_scale = finding.detail, scale
-            entry.seen_ns = now_ns
+            # The detail stays that of the beginning: the operator is told a fault once, not in every tick.
+            entry.speed_scale, entry.seen_ns = scale, now_ns
         if fault.escalation is not None:
             instants = self._instants[fault.name]
             instants.append(now_ns)

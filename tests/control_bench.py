@@ -160,11 +160,30 @@ class Bench:
         self.feel(x_m)
         self.look()
 
-    def think(self, generation: int = 0, x_m: float | None = None, *, text: str = "", age_s: float = 0.0) -> None:
+    def think(
+        self,
+        generation: int = 0,
+        x_m: float | None = None,
+        *,
+        text: str = "",
+        complete: bool | None = None,
+        age_s: float = 0.0,
+    ) -> None:
         kv = np.zeros((1, 3, 8), dtype=np.float32)
         here = SE2(self.walked_m if x_m is None else x_m, 0.0, 0.0)
         anchor_ns = self.now_ns - round(age_s * 1e9)
-        self.slot.state = SemanticState(generation, anchor_ns, here, self.now_ns, kv, {}, text, parse_waypoints(text))
+        waypoints = parse_waypoints(text)
+        self.slot.state = SemanticState(
+            generation,
+            anchor_ns,
+            here,
+            self.now_ns,
+            kv,
+            {},
+            text,
+            waypoints,
+            bool(text) if complete is None else complete,
+        )
 
     def tick(self) -> tuple[float, str]:
         """One tick with what there is; afterwards it is time for the next one."""

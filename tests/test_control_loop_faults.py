@@ -473,6 +473,15 @@ def test_texts_are_not_judged_where_the_model_was_not_trained_to_write_them(benc
     assert bench.loop.statistics.faults == {}
 
 
+def test_texts_that_were_cut_short_are_not_judged() -> None:
+    bench = Bench(semantic=SemanticConfig(judge_text=True))
+    bench.drive()
+    for generation in range(5):
+        bench.see()
+        bench.think(generation, text="I see a corr", complete=False)
+        assert bench.tick()[1] == "ok"
+
+
 def test_a_semantic_state_from_the_future(bench: Bench) -> None:
     def ahead() -> None:
         bench.see()

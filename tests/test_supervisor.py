@@ -126,6 +126,15 @@ def test_the_operator_is_told_the_worst_fault_its_numbers_and_what_to_do() -> No
     assert says == f"{fault.says.removesuffix('.')} (why). {fault.advice}"
 
 
+def test_a_fault_that_lasts_is_told_in_the_same_words() -> None:
+    supervisor = Supervisor()
+    said = {
+        supervisor.step(SupervisorInputs((Finding("semantic-old", f"{age} s old", 0.5),), True), age * 100 * MS).says
+        for age in range(10, 20)
+    }
+    assert len(said) == 1
+
+
 def test_what_stopped_the_robot_stays_the_explanation() -> None:
     desk = Desk()
     first = desk.step("battery-empty").says

@@ -57,8 +57,10 @@ class SemanticMonitor:
             findings.append(Finding("semantic-old", f"{delay_s:.1f} s old", 1 - over_s / self._config.fade_s))
         if semantic.generation != self._generation:
             self._generation = semantic.generation
-            valid = semantic.waypoints is not None or not semantic.text
-            self._invalid = 0 if valid else self._invalid + 1
+            if semantic.waypoints is not None:
+                self._invalid = 0
+            elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
+                self._invalid += 1
         if self._config.judge_text and self._invalid >= INVALID_IN_A_ROW:
             findings.append(Finding("semantic-text-invalid"))
         return tuple(findings)
