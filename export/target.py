@@ -239,9 +239,11 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
-        both = isinstance(value, Mapping) and isinstance(below, Mapping)
         # A list of overrides or candidates belongs to its precision: replaced, never mixed.
-        merged[key] = _merged(below, value) if both and key not in ("overrides", "profile") else value
+        if isinstance(value, Mapping) and isinstance(below, Mapping) and key not in ("overrides", "profile"):
+            merged[key] = _merged(below, value)
+        else:
+            merged[key] = value
     return merged
 
 
