@@ -127,6 +127,7 @@ class ControlLoop:
         Returns why the bridge or the supervisor stopped the robot (`ended_by` says which), else None; raises
         BridgeUnavailable when the bridge has gone.
         """
+        self._watch.begin()
         deadline_ns = epoch_ns
         while end_ns is None or deadline_ns < end_ns:
             if self._wait_until(deadline_ns):

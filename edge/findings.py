@@ -44,6 +44,7 @@ class FindingQueue:
     def take(self) -> tuple[Finding, ...]:
         """Everything since the last call, oldest first; control thread only."""
         taken: list[Finding] = []
-        while self._queue and len(taken) < 256:
+        # No more than fit in the queue: a thread that adds without end must not hold the control thread up.
+        for _ in range(len(self._queue)):
             taken.append(self._queue.popleft())
         return tuple(taken)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from edge.faults import FAULT_OF_CAUSE
+from edge.findings import Finding
 from edge.geometry import SE2
 from tests.control_bench import PERIOD_NS, Bench
 
@@ -169,3 +170,13 @@ def test_a_stop_that_the_runner_itself_asked_for_is_no_fault(bench: Bench) -> No
     bench.sink.state, bench.sink.cause = "stopped", "client_stop"
     bench.loop.run(bench.now_ns, None)
     assert not bench.loop.supervision.stop
+
+
+def test_what_was_found_while_the_robot_was_stood_up_does_not_count(bench: Bench) -> None:
+    bench.drive()
+    bench.findings.put((Finding("odometry-jump"), Finding("odometry-jump")))
+    bench.malformed = 3
+    bench.see()
+    bench.stop.wait = lambda _seconds: bool(bench.on_time)  # type: ignore[method-assign,assignment]
+    assert bench.loop.run(bench.now_ns, None) is None
+    assert bench.loop.supervision.active == ()

@@ -54,6 +54,10 @@ class RobotMonitor:
         self._counts: deque[tuple[int, int]] = deque(maxlen=64)
         self._expected: float | None = None
 
+    def begin(self, malformed: int) -> None:
+        """Reports that were dropped until now do not count."""
+        self._malformed = malformed
+
     def urgent(self, attitude: Attitude | None, malformed: int) -> tuple[Finding, ...]:
         """What does not wait for a tick: a robot that tipped over, a report that had to be dropped (counted so far)."""
         findings: tuple[Finding, ...] = ()

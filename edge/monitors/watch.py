@@ -89,6 +89,11 @@ class Watch:
         self._pictures = FrameOutputs(False, 0, ())
         self.given_delay_s = config.semantic.given_delay_s
 
+    def begin(self) -> None:
+        """Driving begins now: what other threads found while the robot was stood up is over."""
+        self._sources.findings.take()
+        self._robot.begin(self._sources.malformed())
+
     def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
         """Before the encoder: whether the newest picture may be used. What was found is told by `tick`."""
         self._pictures = self._frame.step(picture, T_odom_base, now_ns)
