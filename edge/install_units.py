@@ -110,7 +110,10 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     verdict = host.check([path for path in contents if path.suffix == ".service"])
     _report(verdict, say)
     commands = _commands(contents, system=args.system)
-    say("nothing was enabled or started. To do so:")
+    say(
+        "nothing was enabled or started. The last command arms the robot and drives; `systemctl enable` it as well to do"
+    )
+    say("so whenever the machine starts:")
     for command in commands:
         say(f"  {command}")
     result: dict[str, Any] = {
@@ -265,7 +268,8 @@ def _commands(contents: Mapping[Path, str], *, system: bool) -> list[str]:
         *prepare,
         "sudo systemctl daemon-reload",
         f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
-        f"sudo systemctl enable --now {units.RUNNER_UNIT}",
+        # Not enabled: a machine that starts again after a brown-out must not drive before somebody has looked at it.
+        f"sudo systemctl start {units.RUNNER_UNIT}",
     ]
 
 

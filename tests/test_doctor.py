@@ -22,6 +22,7 @@ from edge.doctor_check import Check, Level
 from edge.doctor_graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
 from edge.doctor_robot import bridge, robot_link
 from edge.graph import CPU_PROVIDER
+from edge.install import main as install
 from edge.manifest import Artifacts
 from edge.target_facts import GIB, PlanFacts, plan_facts, target_facts
 from export.target import load_target
@@ -256,6 +257,14 @@ def test_missing_engines_fail_with_the_command_that_builds_them(artifacts_dir: P
 def test_a_robot_file_that_is_wrong_fails(tmp_path: Path) -> None:
     code, result = run(tmp_path, "--robot", str(tmp_path / "none.toml"))
     assert (code, by_name(result)["robot file"]["level"]) == (EXIT_CHECK_FAILED, "fail")
+
+
+def test_help_has_examples_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (main, install):
+        with pytest.raises(SystemExit) as ended:
+            command(["--help"])
+        text = capsys.readouterr().out
+        assert (ended.value.code, "examples:" in text, "exit codes:" in text) == (0, True, True)
 
 
 def test_bad_arguments_are_bad_input(tmp_path: Path) -> None:

@@ -73,8 +73,14 @@ def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Uni
     assert result["exposure"] == GOOD.exposure
     assert result["commands"][-2:] == [
         f"sudo systemctl enable --now {BRIDGE_UNIT}",
-        f"sudo systemctl enable --now {RUNNER_UNIT}",
+        f"sudo systemctl start {RUNNER_UNIT}",
     ]
+
+
+def test_a_machine_that_starts_again_does_not_drive_by_itself(units: Units) -> None:
+    _, result = units()
+    assert result is not None
+    assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])
 
 
 def test_a_user_that_exists_is_not_made_again(units: Units, host: Host, tmp_path: Path) -> None:

@@ -126,6 +126,24 @@ def test_the_bridge_outlives_the_runner() -> None:
     assert int(bridge["OOMScoreAdjust"][0]) < 0 < int(runner["OOMScoreAdjust"][0])
 
 
+def test_both_may_lock_their_memory_and_neither_may_take_all_of_it() -> None:
+    for unit in (bridge_unit, runner_unit):
+        found = settings(unit(inputs()))
+        assert (found["LimitMEMLOCK"], found["MemorySwapMax"]) == (["infinity"], ["0"])
+        assert "MemoryMax" in found
+
+
+def test_the_bridge_comes_before_the_control_thread_on_a_core() -> None:
+    bridge, runner = settings(bridge_unit(inputs())), settings(runner_unit(inputs()))
+    assert bridge["CPUSchedulingPolicy"] == ["fifo"]
+    assert int(bridge["CPUSchedulingPriority"][0]) > int(runner["LimitRTPRIO"][0]) > 0
+    assert "CPUSchedulingPolicy" not in runner
+
+
+def test_nothing_reports_to_anybody_outside() -> None:
+    assert settings(runner_unit(inputs()))["Environment"] == ["ORT_DISABLE_TELEMETRY=1"]
+
+
 def test_a_bridge_that_restarts_does_not_restart_the_runner() -> None:
     assert not {"Requires", "BindsTo", "PartOf"} & set(settings(runner_unit(inputs())))
 
