@@ -110,10 +110,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     verdict = host.check([path for path in contents if path.suffix == ".service"])
     _report(verdict, say)
     commands = _commands(contents, system=args.system)
-    say(
-        "nothing was enabled or started. The last command arms the robot and drives; `systemctl enable` it as well to do"
-    )
-    say("so whenever the machine starts:")
+    say("nothing was enabled or started. To do so; the last command arms the robot and drives:")
     for command in commands:
         say(f"  {command}")
     result: dict[str, Any] = {
