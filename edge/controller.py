@@ -73,6 +73,12 @@ def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
     return arc_m / time_s, 2 * bearing / time_s
 
 
+def is_plan(trajectory: npt.NDArray[np.float32]) -> bool:
+    """Whether this is something to drive by: rows of three finite numbers, at least one."""
+    shaped = trajectory.ndim == 2 and trajectory.shape[0] > 0 and trajectory.shape[1] == 3
+    return shaped and bool(np.isfinite(trajectory).all())
+
+
 def target_of(trajectory: npt.NDArray[np.float32], step_s: float) -> SE2:
     """The point of a finite plan [steps, 3] that is driven to: 1 s ahead, or the last one of a shorter plan."""
     index = min(len(trajectory), max(1, round(TARGET_TIME_S / step_s))) - 1
@@ -137,6 +143,6 @@ class Controller:
             return "stale-odometry"
         if inputs.trajectory is None:
             return "no-semantic-state"
-        if inputs.trajectory.ndim != 2 or not np.isfinite(inputs.trajectory).all():
+        if not is_plan(inputs.trajectory):
             return "bad-output"
         return None

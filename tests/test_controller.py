@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,6 +134,52 @@ def test_an_output_that_is_not_finite_stops_in_the_same_step(bad: float) -> None
     poisoned[29, 2] = bad
     command = controller.step(fresh(poisoned), 10 * TICK_NS)
     assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "bad-output")
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (30, 2), (30,), (1, 30, 3)])
+def test_an_output_of_another_shape_stops_in_the_same_step(shape: tuple[int, ...]) -> None:
+    command = Controller(CONFIG).step(fresh(np.zeros(shape, dtype=np.float32)), 0)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "bad-output")
+
+
+def driven(scale: float, trajectory: np.ndarray) -> tuple[float, float]:
+    controller = Controller(CONFIG)
+    for tick in range(10):
+        command = controller.step(replace(fresh(trajectory), speed_scale=scale), tick * TICK_NS)
+    return command.vx_mps, command.wz_radps
+
+
+def test_a_lower_speed_scale_lowers_the_limit_and_leaves_a_slow_plan_as_it_is() -> None:
+    assert driven(0.5, plan(0.2))[0] == pytest.approx(0.5 * LIMITS.vx_max_mps)
+    assert driven(0.5, plan(0.03))[0] == pytest.approx(0.3)
+
+
+@given(st.floats(0.01, 1.0), st.floats(0.06, 4.0), st.floats(-1.5, 1.5))
+def test_a_lower_speed_scale_keeps_the_arc(scale: float, distance: float, bearing: float) -> None:
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    trajectory = np.tile(np.float32([x, y, 0.0]), (30, 1))
+    (speed, yaw_rate), (full_speed, full_yaw_rate) = driven(scale, trajectory), driven(1.0, trajectory)
+    assert yaw_rate * full_speed == pytest.approx(full_yaw_rate * speed, abs=1e-6)
+    assert speed <= full_speed + 1e-12
+
+
+@pytest.mark.parametrize("scale", [1.5, 1e9, math.inf])
+def test_no_speed_scale_raises_a_limit(scale: float) -> None:
+    assert driven(scale, plan(0.5))[0] == pytest.approx(LIMITS.vx_max_mps)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, -math.inf])
+def test_a_speed_scale_that_is_none_gives_no_speed(scale: float) -> None:
+    assert driven(scale, plan(0.5)) == (0.0, 0.0)
+
+
+def test_a_reason_to_hold_is_zero_whatever_the_plan_and_speeding_up_begins_anew() -> None:
+    controller = Controller(CONFIG)
+    for tick in range(20):
+        controller.step(fresh(plan(0.08)), tick * TICK_NS)
+    held = controller.step(replace(fresh(plan(0.08)), hold="camera-stopped"), 20 * TICK_NS)
+    assert (held.vx_mps, held.reason) == (0.0, "camera-stopped")
+    assert controller.step(fresh(plan(0.08)), 21 * TICK_NS).vx_mps <= LIMITS.accel_mps2 * 0.1 + 1e-9
 
 
 @pytest.mark.parametrize(

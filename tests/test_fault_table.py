@@ -11,6 +11,7 @@ import pytest
 from edge.faults import FAULT_OF_CAUSE, FAULTS, LAST_ROW, NOT_HERE, Action, Escalation, Fault
 from edge.findings import Finding, FindingQueue
 from firmware_bridge.link import CAUSES
+from tools.fault_table import page
 
 ROOT = Path(__file__).parents[1]
 ROWS = sorted(FAULTS.values(), key=lambda fault: (fault.row, fault.name))
@@ -146,3 +147,9 @@ def test_a_queue_that_nobody_reads_stays_small_and_keeps_the_newest() -> None:
     for index in range(10):
         queue.put((Finding("odometry-late", str(index)),))
     assert [finding.detail for finding in queue.take()] == ["7", "8", "9"]
+
+
+def test_the_page_is_made_from_the_table() -> None:
+    assert (ROOT / "docs" / "faults.md").read_text(encoding="utf-8") == page(), (
+        "run python -m tools.fault_table > docs/faults.md"
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from edge.controller import TARGET_TIME_S, arc_to, limit_share, target_of
+from edge.controller import TARGET_TIME_S, arc_to, is_plan, limit_share, target_of
 from edge.findings import Finding
 from firmware_bridge.config import LimitsConfig
 
@@ -53,7 +53,7 @@ class OutputMonitor:
             self._velocity, self._plan = None, None
             self._turns.clear()
             return ()
-        if trajectory.ndim != 2 or not np.isfinite(trajectory).all():
+        if not is_plan(trajectory):
             return (Finding("output-not-finite"),)
         findings: list[Finding] = []
         self._judge_velocity(trajectory, findings)

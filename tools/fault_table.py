@@ -1,0 +1,54 @@
+"""Write the fault table as a page: what can go wrong, what the robot does, how soon, and the test that injects it.
+
+python -m tools.fault_table > docs/faults.md
+"""
+
+from __future__ import annotations
+
+import sys
+
+from edge.faults import FAULTS, NOT_HERE, Action, Fault
+
+HEAD = """# What can go wrong
+
+Made from `edge/faults.py` by `python -m tools.fault_table`; do not edit. *Row* is the row of the project's fault matrix.
+*Bound* runs from the fault's effect at our input to the velocity on the wire. What is done:
+
+* **nothing**: control must not change; the fault is dropped or counted.
+* **limit**: the speed limit is lowered, the arc is kept.
+* **zero**: zero velocity until the fault has been gone for its clear time.
+* **stop**: zero velocity until the robot is armed again.
+
+| row | fault | where | done | bound | ends | says | next |
+|---:|---|---|---|---:|---|---|---|
+"""
+
+
+def _done(fault: Fault) -> str:
+    share = f" to {fault.speed_scale:.0%}" if fault.action is Action.LIMIT and fault.speed_scale < 1 else ""
+    return fault.action.value + share
+
+
+def _ends(fault: Fault) -> str:
+    if fault.action is Action.NOTHING:
+        return ""
+    ends = "at the next arming" if fault.latch else f"{fault.clear_ms / 1000:g} s after it was last found"
+    if fault.escalation is None:
+        return ends
+    rule = fault.escalation
+    return f"{ends}; {rule.count} in {rule.window_ms / 1000:g} s are `{rule.to}`"
+
+
+def page() -> str:
+    """The whole table as Markdown, ordered by row."""
+    lines = [
+        f"| {fault.row} | `{fault.name}` | {fault.where} | {_done(fault)} | "
+        f"{f'{fault.bound_ms} ms' if fault.bound_ms else ''} | {_ends(fault)} | {fault.says} | {fault.advice} |"
+        for fault in sorted(FAULTS.values(), key=lambda fault: (fault.row, fault.bound_ms))
+    ]
+    left_out = [f"* row {row}: {why}" for row, why in sorted(NOT_HERE.items())]
+    return HEAD + "\n".join(lines) + "\n\nRows that are not here:\n\n" + "\n".join(left_out) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
