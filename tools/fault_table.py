@@ -11,11 +11,12 @@ from edge.faults import FAULTS, NOT_HERE, Action, Fault
 
 HEAD = """# What can go wrong
 
-Made from `edge/faults.py` by `python -m tools.fault_table`; do not edit. *Row* is the row of the project's fault matrix.
-*Bound* runs from the fault's effect at our input to the velocity on the wire. What is done:
+Made from `edge/faults.py` by `python -m tools.fault_table`; do not edit. *Row* is the row of the project's fault
+matrix. *Bound* runs from the fault's effect at our input to the velocity on the wire. What is done:
 
 * **nothing**: control must not change; the fault is dropped or counted.
-* **limit**: the speed limit is lowered, the arc is kept.
+* **limit**: the speed limit is lowered to the share that is given, the arc is kept; `semantic-old` lowers it with age;
+  without a share the operator is told and nothing else.
 * **zero**: zero velocity until the fault has been gone for its clear time.
 * **stop**: zero velocity until the robot is armed again.
 
