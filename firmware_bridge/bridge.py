@@ -18,6 +18,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -37,7 +38,6 @@ _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watc
 _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
 
 EPILOG: Final = """examples:
-  edge-bridge --robot firmware_bridge/robots/go2_sim.toml
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
   edge-bridge stop --robot go2.toml      emergency stop: the running bridge stops the robot and refuses to arm
   edge-bridge arm --robot go2.toml       takes that stop back, so that the runner may arm again
@@ -83,22 +83,11 @@ class Bridge:
 
     def result(self) -> dict[str, object]:
         """The JSON result."""
-        status = self._core.status(time.monotonic_ns())
-        robot = self._robot.counters()
-        return {
-            "state": status.state,
-            "cause": status.cause,
-            "reason": status.reason,
-            "commands": status.commands,
-            "rejected": status.rejected,
-            "clipped": self._core.clipped,
-            "last_seq": status.last_seq,
-            "last_command": list(status.last_command),
-            "zero_after_stop": status.zero_after_stop,
-            "malformed": {"client": self._link.malformed + self._operators.malformed, "robot": robot["malformed"]},
-            "reordered": robot["reordered"],
-            "failed_writes": robot["failed_writes"],
-        }
+        values = asdict(self._core.status(time.monotonic_ns()))
+        malformed, reordered, failed_writes = self._robot.dropped()
+        datagrams = {"client": self._link.malformed + self._operators.malformed, "robot": malformed}
+        values |= {"malformed": datagrams, "reordered": reordered, "failed_writes": failed_writes}
+        return {**values, "clipped": self._core.clipped}
 
     def _wait(self, wakeup: socket.socket, wake_ns: int) -> bool:
         """Wait for input or the deadline; True when it is time to leave."""
@@ -232,9 +221,8 @@ def main(argv: list[str] | None = None) -> int:
         if args.json == "-":
             sys.stdout.write(text)
         elif args.json:
-            partial = Path(args.json + ".partial")
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(args.json)
+            Path(args.json + ".partial").write_text(text, encoding="utf-8")
+            Path(args.json + ".partial").replace(args.json)
     except OSError as error:
         sys.stderr.write(f"edge-bridge: the result could not be written: {error}\n")
         return 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import stat
@@ -29,19 +30,14 @@ def listen(path: Path) -> socket.socket:
     if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
         # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
         raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-        try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            path.unlink(missing_ok=True)
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            raise ConfigError(f"socket {path}: cannot be used: {error.strerror}; give another --socket") from error
-        else:
-            raise SocketTakenError(f"another bridge listens at {path}; stop it first, one process commands a robot")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+            answer = probe.connect_ex(str(path))
+        if answer == 0:
+            raise SocketTakenError(f"another bridge listens at {path}; stop it first, one process commands a robot")
+        if answer == errno.ECONNREFUSED:
+            path.unlink(missing_ok=True)  # left behind by a bridge that was killed
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         umask = os.umask(0o177)
         try:
@@ -50,7 +46,7 @@ def listen(path: Path) -> socket.socket:
             os.umask(umask)
     except OSError as error:
         listener.close()
-        raise ConfigError(f"socket {path}: cannot be made: {error.strerror}; give another --socket") from error
+        raise ConfigError(f"socket {path}: cannot be used: {error.strerror}; give another --socket") from error
     listener.listen(4)
     listener.setblocking(False)
     return listener

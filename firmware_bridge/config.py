@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,14 +34,25 @@ def _require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
-def _require_between(low: float, value: float, high: float, key: str, *, above: bool = False) -> None:
-    """`above`: the lower end itself is not allowed."""
-    inside = low < value <= high if above else low <= value <= high
-    _require(inside, f"{key}: expected {low:g}..{high:g}, found {value}")
+def _within(low: float, high: float, default: Any = MISSING, *, above: bool = False) -> Any:
+    """A field whose value lies in low..high; `above`: low itself is not allowed."""
+    return field(default=default, metadata={"range": (low, high, above)})
 
 
 @dataclass(frozen=True)
-class DdsConfig:
+class _Section:
+    """A table of the robot file, named like its class; checks the fields made by `_within`."""
+
+    def __post_init__(self) -> None:
+        for each in (each for each in fields(self) if "range" in each.metadata):
+            (low, high, above), value = each.metadata["range"], getattr(self, each.name)
+            inside = low <= value <= high and not (above and value == low)
+            key = f"{type(self).__name__.removesuffix('Config').lower()}.{each.name}"
+            _require(inside, f"{key}: expected {low:g}..{high:g}, found {value}")
+
+
+@dataclass(frozen=True)
+class DdsConfig(_Section):
     """Where the robot is: DDS domain, our network interface, and unicast peers for links without multicast."""
 
     domain: int
@@ -56,32 +67,26 @@ class DdsConfig:
 
 
 @dataclass(frozen=True)
-class BridgeConfig:
+class BridgeConfig(_Section):
     """Timing of the deadman process; a relative socket path lies in the user's runtime directory."""
 
     socket: Path
-    rate_hz: int = 50
-    deadman_ms: int = 250
-    arm_timeout_s: float = 10.0
-    state_timeout_ms: int = 1000
+    rate_hz: int = _within(10, 200, 50)
+    deadman_ms: int = _within(20, 250, 250)  # above, "zero on the wire within 300 ms" cannot be kept
+    arm_timeout_s: float = _within(1, 60, 10.0)
+    state_timeout_ms: int = _within(100, 5000, 1000)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         path = self.socket if self.socket.is_absolute() else runtime_dir() / self.socket
         object.__setattr__(self, "socket", path)
         size = len(os.fsencode(path)) + len(OPERATOR_SUFFIX)
-        _require(
-            size <= MAX_SOCKET_PATH_BYTES,
-            f"bridge.socket: {size} bytes with its suffix {OPERATOR_SUFFIX}, the system allows 107: {path}",
-        )
-        _require_between(10, self.rate_hz, 200, "bridge.rate_hz")
-        # Above 250 ms the promise "zero on the wire within 300 ms" cannot be kept.
-        _require_between(20, self.deadman_ms, 250, "bridge.deadman_ms")
-        _require_between(1, self.arm_timeout_s, 60, "bridge.arm_timeout_s")
-        _require_between(100, self.state_timeout_ms, 5000, "bridge.state_timeout_ms")
+        fits = size <= MAX_SOCKET_PATH_BYTES
+        _require(fits, f"bridge.socket: {size} bytes with {OPERATOR_SUFFIX}, the system allows 107: {path}")
 
 
 @dataclass(frozen=True)
-class SafetyConfig:
+class SafetyConfig(_Section):
     """What forbids motion besides the bridge's own rules.
 
     `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
@@ -91,14 +96,13 @@ class SafetyConfig:
 
     sport_version: str = "1.0.0.1"
     accepted_error_codes: tuple[int, ...] = (0,)
-    battery_min_percent: int = 10
+    battery_min_percent: int = _within(0, 90, 10)
     remote_estop_keys: tuple[str, ...] = ("L2", "B")
-    remote_deadband: float = 0.1
+    remote_deadband: float = _within(0.01, 0.5, 0.1)
     estop_file: Path | None = None
 
     def __post_init__(self) -> None:
-        _require_between(0, self.battery_min_percent, 90, "safety.battery_min_percent")
-        _require_between(0.01, self.remote_deadband, 0.5, "safety.remote_deadband")
+        super().__post_init__()
         keys = self.remote_estop_keys
         known = len(keys) > 0 and set(keys) <= set(REMOTE_KEYS)
         _require(known, f"safety.remote_estop_keys: expected one or more of {', '.join(REMOTE_KEYS)}, found {keys}")
@@ -107,51 +111,38 @@ class SafetyConfig:
 
 
 @dataclass(frozen=True)
-class LimitsConfig:
+class LimitsConfig(_Section):
     """Velocity limits and speeding-up limits enforced on every command; slowing down is never limited."""
 
-    vx_min_mps: float
-    vx_max_mps: float
-    vy_max_mps: float
-    wz_max_radps: float
-    accel_mps2: float
-    alpha_radps2: float
-
-    def __post_init__(self) -> None:
-        # A Go2's Move limits as its maker documents them; a robot file may only lower them (protocol facts, "Move").
-        _require_between(-2.5, self.vx_min_mps, 0, "limits.vx_min_mps")
-        _require_between(0, self.vx_max_mps, 3.8, "limits.vx_max_mps", above=True)
-        _require_between(0, self.vy_max_mps, 1, "limits.vy_max_mps")
-        _require_between(0, self.wz_max_radps, 4, "limits.wz_max_radps", above=True)
-        _require_between(0, self.accel_mps2, 20, "limits.accel_mps2", above=True)
-        _require_between(0, self.alpha_radps2, 50, "limits.alpha_radps2", above=True)
+    # A Go2's Move limits as its maker documents them; a robot file may only lower them (protocol facts, "Move").
+    vx_min_mps: float = _within(-2.5, 0)
+    vx_max_mps: float = _within(0, 3.8, above=True)
+    vy_max_mps: float = _within(0, 1)
+    wz_max_radps: float = _within(0, 4, above=True)
+    accel_mps2: float = _within(0, 20, above=True)
+    alpha_radps2: float = _within(0, 50, above=True)
 
 
 @dataclass(frozen=True)
-class CameraConfig:
+class CameraConfig(_Section):
     """Front camera: how often to ask, how old a frame is when its answer arrives, how long to wait for one."""
 
-    rate_hz: float
-    latency_ms: float
-    timeout_ms: int
-
-    def __post_init__(self) -> None:
-        _require_between(0, self.rate_hz, 60, "camera.rate_hz", above=True)
-        _require_between(0, self.latency_ms, 2000, "camera.latency_ms")
-        _require_between(10, self.timeout_ms, 10000, "camera.timeout_ms")
+    rate_hz: float = _within(0, 60, above=True)
+    latency_ms: float = _within(0, 2000)
+    timeout_ms: int = _within(10, 10000)
 
 
 @dataclass(frozen=True)
-class OdometryConfig:
+class OdometryConfig(_Section):
     """Frame of the robot's velocity report, and the age from which its pose is too old to drive by."""
 
     velocity_frame: str
-    max_age_ms: int
+    max_age_ms: int = _within(20, 2000)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         frame_ok = self.velocity_frame in VELOCITY_FRAMES
         _require(frame_ok, f'odometry.velocity_frame: expected "odom" or "body", found {self.velocity_frame!r}')
-        _require_between(20, self.max_age_ms, 2000, "odometry.max_age_ms")
 
 
 @dataclass(frozen=True)
@@ -169,6 +160,9 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         _require(self.protocol in PROTOCOLS, f"protocol: expected one of {PROTOCOLS}, found {self.protocol!r}")
+
+
+_SECTIONS: Final = {kind.__name__.removesuffix("Config").lower(): kind for kind in _Section.__subclasses__()}
 
 
 def runtime_dir() -> Path:
@@ -192,33 +186,21 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
         raise ConfigError(f"robot file {path}: {error}") from error
 
 
-_SECTIONS: Final = {
-    "dds": DdsConfig,
-    "bridge": BridgeConfig,
-    "limits": LimitsConfig,
-    "camera": CameraConfig,
-    "odometry": OdometryConfig,
-    "safety": SafetyConfig,
-}
-
-
-def _build(cls: Any, table: object, section: str) -> Any:
+def _build(cls: Any, table: object, prefix: str) -> Any:
     """Dataclass `cls` from a TOML table, every key known, of the declared type and finite."""
-    _require(isinstance(table, dict), f"[{section}]: expected a table, found {table!r}")
-    assert isinstance(table, dict)
-    prefix = f"{section}." if section else ""
-    known = {field.name: field for field in fields(cls)}
+    if not isinstance(table, dict):
+        raise ConfigError(f"[{prefix[:-1]}]: expected a table, found {table!r}")
+    known = {each.name: each for each in fields(cls)}
     for key in table:
         _require(key in known, f"unknown key {prefix}{key}; expected {', '.join(known)}")
     values: dict[str, Any] = {}
-    for key, field in known.items():
+    for key, each in known.items():
         if key not in table:
-            required = repr(field.default).startswith("<dataclasses._MISSING")
-            _require(not required, f"missing key {prefix}{key}")
-        elif not section and key in _SECTIONS:
-            values[key] = _build(_SECTIONS[key], table[key], key)
+            _require(each.default is not MISSING, f"missing key {prefix}{key}")
+        elif cls is RobotConfig and key in _SECTIONS:
+            values[key] = _build(_SECTIONS[key], table[key], f"{key}.")
         else:
-            values[key] = _convert(table[key], str(field.type), prefix + key)
+            values[key] = _convert(table[key], str(each.type), prefix + key)
     return cls(**values)
 
 
@@ -232,6 +214,5 @@ def _convert(value: object, kind: str, where: str) -> object:
     if kind in ("Path", "Path | None") and isinstance(value, str) and value and "\0" not in value:
         return Path(value)
     if kind.startswith("tuple[") and isinstance(value, list):
-        item = kind[len("tuple[") :].partition(",")[0]
-        return tuple(_convert(each, item, where) for each in value)
+        return tuple(_convert(each, kind[len("tuple[") :].partition(",")[0], where) for each in value)
     raise ConfigError(f"{where}: expected {kind}, found {value!r}")

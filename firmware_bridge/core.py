@@ -51,23 +51,17 @@ _ASLEEP_NS: Final = 100 * _NS_PER_MS
 
 
 @dataclass(frozen=True)
-class Remote:
-    """The robot's wireless remote since the last step: a stick or key in use, the emergency-stop keys held."""
-
-    in_use: bool
-    estop: bool
-
-
-@dataclass(frozen=True)
 class Report:
     """What came over the robot's network since the last step.
 
-    `foreign` names a motion or mode request that is not ours; `version` is the sport service's answer to our question;
-    `writes_fail`: the network has not taken our last commands.
+    `remote_in_use`: a stick or key of the robot's remote, `remote_estop`: its emergency-stop keys; `foreign` names a
+    motion or mode request that is not ours; `version` is the sport service's answer to our question; `writes_fail`: the
+    network has not taken our last commands.
     """
 
     state: RobotState | None = None
-    remote: Remote | None = None
+    remote_in_use: bool = False
+    remote_estop: bool = False
     foreign: str | None = None
     battery_percent: int | None = None
     version: str | None = None
@@ -132,27 +126,20 @@ class BridgeCore:
         self._growth = tuple(a / bridge.rate_hz for a in (limits.accel_mps2, limits.accel_mps2, limits.alpha_radps2))
         self._state, self._cause, self._reason = "disarmed", "none", "waiting for a client to arm"
         self._robot: RobotState | None = None
-        self._first_report_ns: int | None = None
         self._battery_percent: int | None = None
         self._version: str | None = None
-        self._asked_ns = _NEVER_NS
-        self._foreign, self._foreign_ns = "", _NEVER_NS
-        self._remote_ns = self._remote_estop_ns = _NEVER_NS
-        self._writes_fail = self._estop = self._held = False
+        self._foreign = ""
+        self._writes_fail = self._estop = self._held = self._had_client = self._ever_armed = False
         self._asleep_ns: int | None = None
-        self._had_client = False
-        self._ever_armed = False
-        self._arm_until_ns = 0
+        self._first_report_ns: int | None = None
+        # When it was last: somebody else's request, a hand on the remote, its emergency keys, motion, our StopMove ...
+        self._foreign_ns = self._remote_ns = self._remote_estop_ns = self._moving_ns = self._stop_sent_ns = _NEVER_NS
+        self._stopped_ns = self._asked_ns = _NEVER_NS
         self._called: dict[int, int] = {}  # api id -> when, during this arming
-        self._target = _ZERO
-        self._good_until_ns = 0
-        self._stopped_ns = self._moving_ns = self._stop_sent_ns = _NEVER_NS
+        self._arm_until_ns = self._good_until_ns = 0
         self._next_ns = now_ns
-        self._last_seq = -1
-        self._last_command = _ZERO
-        self._commands = 0
-        self._rejected = 0
-        self._zero_after_stop = True
+        self._target = self._last_command = _ZERO
+        self._last_seq, self._commands, self._rejected = -1, 0, 0
         self._requests: list[Move | Call] = []
 
     def step(self, inputs: Inputs, now_ns: int) -> Outputs:
@@ -189,32 +176,19 @@ class BridgeCore:
 
     def status(self, now_ns: int) -> BridgeStatus:
         """What a client is told."""
-        counters = (max(self._last_seq, 0), self._commands, self._rejected)
-        blocked = self._blocked(now_ns)
-        return BridgeStatus(
-            now_ns,
-            self._state,
-            self._reason,
-            *counters,
-            self._last_command,
-            self._zero_after_stop,
-            self._cause,
-            "none" if blocked is None else blocked[0],
-        )
+        blocked, zero_after_stop = self._blocked(now_ns), self._state != "armed"
+        counters = (max(self._last_seq, 0), self._commands, self._rejected, self._last_command, zero_after_stop)
+        causes = (self._cause, "none" if blocked is None else blocked[0])
+        return BridgeStatus(now_ns, self._state, self._reason, *counters, *causes)
 
     def _note(self, inputs: Inputs, now_ns: int) -> None:
         """Remember what the step has brought, whatever the state."""
         report = inputs.robot
         if report.state is not None:
-            self._robot = report.state
-            if self._first_report_ns is None:
-                self._first_report_ns = now_ns
-            if self._moves(report.state):
-                self._moving_ns = now_ns
-        if report.remote is not None and report.remote.in_use:
-            self._remote_ns = now_ns
-        if report.remote is not None and report.remote.estop:
-            self._remote_estop_ns = now_ns
+            self._robot, self._first_report_ns = report.state, self._first_report_ns or now_ns
+            self._moving_ns = now_ns if _moves(report.state) else self._moving_ns
+        self._remote_ns = now_ns if report.remote_in_use else self._remote_ns
+        self._remote_estop_ns = now_ns if report.remote_estop else self._remote_estop_ns
         if report.foreign is not None:
             self._foreign, self._foreign_ns = report.foreign, now_ns
         if report.battery_percent is not None:
@@ -235,7 +209,7 @@ class BridgeCore:
 
     def _danger(self, now_ns: int) -> tuple[str, str] | None:
         """(cause, reason) of what forbids motion now, in every state."""
-        robot = None if self._silent(now_ns, self._state_timeout_ns) else self._robot
+        robot = self._fresh(now_ns, self._state_timeout_ns)
         if self._held:
             return "estop", "emergency stop by an operator; `edge-bridge arm` takes it back"
         if self._estop:
@@ -257,15 +231,14 @@ class BridgeCore:
 
     def _blocked(self, now_ns: int) -> tuple[str, str] | None:
         """(cause, reason) why an arm would be refused now."""
-        least = self._safety.battery_min_percent
+        percent, least, wanted = self._battery_percent, self._safety.battery_min_percent, self._safety.sport_version
         if (danger := self._danger(now_ns)) is not None:
             return danger
-        if self._silent(now_ns, self._state_timeout_ns):
+        if self._fresh(now_ns, self._state_timeout_ns) is None:
             return "state_silent", "the robot reports no state"
-        if self._battery_percent is not None and self._battery_percent < least:
-            return "battery_low", f"the battery has {self._battery_percent} %, at least {least} % are needed"
-        if self._version not in (None, self._safety.sport_version):
-            wanted = self._safety.sport_version
+        if percent is not None and percent < least:
+            return "battery_low", f"the battery has {percent} %, at least {least} % are needed"
+        if self._version not in (None, wanted):
             return "wrong_robot", f"the robot's sport service is {self._version}, the robot file expects {wanted}"
         return None
 
@@ -273,10 +246,8 @@ class BridgeCore:
         if self._state in ("arming", "armed"):
             return
         self._state, self._cause, self._reason = "arming", "none", "waiting for the robot's state"
-        self._arm_until_ns = now_ns + self._arm_timeout_ns
-        self._good_until_ns = 0
-        self._called = {}
-        self._version, self._asked_ns = None, _NEVER_NS
+        self._arm_until_ns, self._good_until_ns = now_ns + self._arm_timeout_ns, 0
+        self._called, self._version, self._asked_ns = {}, None, _NEVER_NS
 
     def _accept(self, command: Velocity, now_ns: int) -> None:
         """The gate. A command that is not good counts as absent, so the deadman goes on running."""
@@ -294,55 +265,46 @@ class BridgeCore:
             self._target = (vx, vy, wz)
 
     def _stand_up(self, now_ns: int) -> None:
-        robot = None if self._silent(now_ns, self._state_timeout_ns) else self._robot
-        blocked = self._blocked(now_ns)
-        if blocked is not None and robot is not None:
+        robot, blocked = self._fresh(now_ns, self._state_timeout_ns), self._blocked(now_ns)
+        if robot is not None and blocked is not None:
             self._stop(*blocked, now_ns)
         elif now_ns >= self._arm_until_ns:
-            self._stop("not_standing" if robot else "state_silent", self._why_not_armed(robot), now_ns)
+            waited = f"after {self._arm_timeout_ns / _NS_PER_S:g} s"
+            if robot is None:
+                self._stop("state_silent", f"the robot reports no state {waited}", now_ns)
+            elif self._version is None:
+                self._stop("wrong_robot", f"the robot's sport service does not answer {waited}", now_ns)
+            else:
+                self._stop("not_standing", f"the robot is in mode {robot.mode}, not standing {waited}", now_ns)
         elif robot is not None and self._version is None:
             if now_ns - self._asked_ns >= _NS_PER_S:
                 self._asked_ns, self._reason = now_ns, "asking the robot what it is"
                 self._requests.append(Call(ids.API_VERSION))
         elif robot is not None:
-            self._stand_up_from(ids.MODE_LOCOMOTION if self._moves(robot) else robot.mode, now_ns)
+            self._stand_up_from(ids.MODE_LOCOMOTION if _moves(robot) else robot.mode, now_ns)
 
     def _stand_up_from(self, mode: int, now_ns: int) -> None:
+        call = _NEXT_CALL.get(mode, ids.RECOVERY_STAND)
         if mode == ids.MODE_BALANCE_STAND:
-            self._state, self._reason = "armed", "driving"
-            self._ever_armed, self._zero_after_stop = True, False
+            self._state, self._reason, self._ever_armed = "armed", "driving", True
             # The runner streams commands while arming; one that only starts now gets a deadman time to do so.
             self._good_until_ns = max(self._good_until_ns, now_ns + self._deadman_ns)
             self._next_ns = now_ns
-            return
-        call = _NEXT_CALL.get(mode, ids.RECOVERY_STAND)
-        if now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
+        elif now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
             self._called[call] = now_ns
             self._reason = f"{ids.SPORT_API_NAMES[call]} sent, robot in mode {mode}"
             self._requests.append(Call(call))
 
-    def _why_not_armed(self, robot: RobotState | None) -> str:
-        waited = f"{self._arm_timeout_ns / _NS_PER_S:g} s"
-        if robot is None:
-            return f"the robot reports no state after {waited}"
-        if self._version is None:
-            return f"the robot's sport service does not answer after {waited}"
-        return f"the robot is in mode {robot.mode}, not standing after {waited}"
-
     def _watch(self, now_ns: int) -> None:
-        if now_ns > self._good_until_ns:
-            self._stop("deadman", "deadman: no good command in time", now_ns)
-        elif self._silent(now_ns, self._state_timeout_ns):
+        robot = self._fresh(now_ns, self._state_timeout_ns)
+        if robot is None:
             self._stop("state_silent", "the robot's state has gone silent", now_ns)
-        elif self._robot is not None and self._robot.mode not in _MODES_ARMED:
-            self._stop("wrong_mode", f"the robot left its walking modes (mode {self._robot.mode})", now_ns)
+        elif robot.mode not in _MODES_ARMED:
+            self._stop("wrong_mode", f"the robot left its walking modes (mode {robot.mode})", now_ns)
 
-    def _silent(self, now_ns: int, timeout_ns: int) -> bool:
-        return self._robot is None or now_ns - self._robot.received_ns > timeout_ns
-
-    @staticmethod
-    def _moves(robot: RobotState) -> bool:
-        return math.hypot(robot.vx_mps, robot.vy_mps) >= _STILL_MPS or abs(robot.wz_radps) >= _STILL_RADPS
+    def _fresh(self, now_ns: int, timeout_ns: int) -> RobotState | None:
+        """The robot's newest report if it is not older than this."""
+        return None if self._robot is None or now_ns - self._robot.received_ns > timeout_ns else self._robot
 
     def _stop(self, cause: str, reason: str, now_ns: int) -> None:
         if self._state not in ("arming", "armed"):
@@ -355,20 +317,17 @@ class BridgeCore:
             self._send_stop(now_ns)
         self._state = "disarmed" if refused and not self._ever_armed else "stopped"
         self._cause, self._reason = cause, f"arm refused: {reason}" if refused else reason
-        self._target, self._zero_after_stop, self._stopped_ns = _ZERO, True, now_ns
+        self._target, self._stopped_ns = _ZERO, now_ns
 
     def _stop_if_found_moving(self, now_ns: int) -> None:
         """A bridge that died while driving left a moving robot behind; its successor stops it before anything else."""
-        first_ns = self._first_report_ns
-        if self._state != "disarmed" or self._ever_armed or first_ns is None or self._robot is None:
+        robot, first_ns = self._robot, self._first_report_ns
+        if self._state != "disarmed" or self._ever_armed or first_ns is None or robot is None:
             return
-        moves = self._moves(self._robot) or self._robot.mode == ids.MODE_LOCOMOTION
+        moves = _moves(robot) or robot.mode == ids.MODE_LOCOMOTION
         if moves and now_ns - first_ns <= _FOUND_MOVING_NS < now_ns - self._remote_ns:
-            self._move(_ZERO)
-            self._send_stop(now_ns)
-            self._ever_armed, self._stopped_ns, self._next_ns = True, now_ns, now_ns + self._period_ns
-            self._state, self._cause = "stopped", "robot_moving"
-            self._reason = "the robot was moving when the bridge started; stopped it"
+            self._state, self._ever_armed = "armed", True  # what its predecessor was
+            self._stop("robot_moving", "the robot was moving when the bridge started; stopped it", now_ns)
 
     def _tick(self, now_ns: int) -> None:
         self._next_ns += self._period_ns
@@ -376,7 +335,7 @@ class BridgeCore:
             self._next_ns = now_ns + self._period_ns
         steered = now_ns - self._remote_ns < _REMOTE_NS and now_ns - self._stopped_ns >= _YIELD_NS
         if self._state == "armed":
-            blind = self._silent(now_ns, self._deadman_ns)  # not latched yet: one lost report must not end a run
+            blind = self._fresh(now_ns, self._deadman_ns) is None  # not latched yet: a lost report must not end a run
             self._move(_ZERO if blind else self._slew())
         elif self._ever_armed and not steered:  # arming again too: the robot keeps hearing zero
             self._move(_ZERO)
@@ -403,3 +362,7 @@ class BridgeCore:
 
     def _wake_ns(self) -> int:
         return min(self._next_ns, self._good_until_ns + 1) if self._state == "armed" else self._next_ns
+
+
+def _moves(robot: RobotState) -> bool:
+    return math.hypot(robot.vx_mps, robot.vy_mps) >= _STILL_MPS or abs(robot.wz_radps) >= _STILL_RADPS

@@ -19,25 +19,21 @@ MAGIC: Final = b"TVEB"
 VERSION: Final = 2
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
 CAUSES: Final = (
-    "none",
-    "client_stop",  # the runner asked for it
-    "client_lost",  # the runner's connection has closed
-    "deadman",  # no good command in time
-    "shutdown",  # the bridge was told to end
-    "suspended",  # the machine slept
-    "estop",  # an operator, the local input or the remote's emergency keys
-    "remote_takeover",  # a stick or key of the robot's remote
-    "second_commander",  # motion or mode requests that are not ours
-    "link_down",  # the network does not take our commands
-    "state_silent",  # no usable report from the robot
-    "wrong_mode",  # the robot left its walking modes
-    "robot_error",  # the robot's error code
-    "tipped",  # rolled or pitched beyond 30 degrees
-    "robot_moving",  # found moving when the bridge started
-    "not_standing",  # it did not stand up in time
-    "battery_low",  # less charge than the robot file asks for
-    "wrong_robot",  # another service version than the robot file's
+    *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
+    *("estop", "remote_takeover", "second_commander", "link_down"),
+    *("state_silent", "wrong_mode", "robot_error", "tipped", "robot_moving"),
+    *("not_standing", "battery_low", "wrong_robot"),
 )
+"""Why the bridge has stopped or would refuse to arm.
+
+client_stop: the runner asked for it; client_lost: its connection has closed; deadman: no good command in time;
+shutdown: the bridge was told to end; suspended: the machine slept; estop: an operator, the local input or the remote's
+emergency keys; remote_takeover: a stick or key of the robot's remote; second_commander: motion or mode requests that
+are not ours; link_down: the network does not take our commands; state_silent: no usable report from the robot;
+wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
+robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
+than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or does not say.
+"""
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512
 

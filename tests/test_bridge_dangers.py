@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_bridge.core import Call, Move, Remote
+from firmware_bridge.core import Call, Move
 from firmware_bridge.link import Arm, Stop, Velocity
 from firmware_bridge.unitree import ids
 from tests.bridge_bench import MS, ZERO, Bench
@@ -20,11 +20,11 @@ def _foreign(bench: Bench) -> None:
 
 
 def _stick(bench: Bench) -> None:
-    bench.step(remote=Remote(in_use=True, estop=False))
+    bench.step(remote_in_use=True)
 
 
 def _remote_estop(bench: Bench) -> None:
-    bench.step(remote=Remote(in_use=True, estop=True))
+    bench.step(remote_in_use=True, remote_estop=True)
 
 
 def _local_estop(bench: Bench) -> None:
@@ -195,7 +195,7 @@ class TestRemote:
 
     def test_an_untouched_remote_changes_nothing(self) -> None:
         bench = Bench().arm()
-        bench.step(remote=Remote(in_use=False, estop=False))
+        bench.step(remote_in_use=False)
         assert bench.status.state == "armed"
 
     def test_arming_is_refused_until_it_has_been_left_alone_for_a_second(self) -> None:
@@ -294,7 +294,7 @@ class TestFoundMoving:
 
     def test_a_robot_that_a_person_steers_is_left_alone(self) -> None:
         bench = Bench(client=False, robot={"vx_mps": 0.3})
-        bench.step(remote=Remote(in_use=True, estop=False))
+        bench.step(remote_in_use=True)
         bench.wait(500)
         assert bench.written == []
 

@@ -11,15 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from firmware_bridge.unitree import idl
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
-from firmware_bridge.unitree.idl import (
-    Request_,
-    RequestHeader_,
-    RequestIdentity_,
-    RequestLease_,
-    RequestPolicy_,
-    Response_,
-)
 from firmware_bridge.unitree.ids import request_topic, response_topic
 
 MAX_DATA_CHARS: Final = 64 * 1024
@@ -37,19 +30,19 @@ class Response:
     binary: bytes
 
     @classmethod
-    def checked(cls, sample: Response_ | None) -> Response | None:
+    def checked(cls, sample: idl.Response_ | None) -> Response | None:
         """The sample's content, or None when it did not decode or is larger than any real answer."""
         if sample is None or len(sample.data) > MAX_DATA_CHARS or len(sample.binary) > MAX_BINARY_BYTES:
             return None
-        header = sample.header
-        return cls(header.identity.id, header.identity.api_id, header.status.code, sample.data, bytes(sample.binary))
+        identity, status = sample.header.identity, sample.header.status
+        return cls(identity.id, identity.api_id, status.code, sample.data, bytes(sample.binary))
 
 
-def make_request(request_id: int, api_id: int, parameter: str, *, noreply: bool) -> Request_:
+def make_request(request_id: int, api_id: int, parameter: str, *, noreply: bool) -> idl.Request_:
     """A request without lease, priority or binary part, as the maker's client sends it."""
-    identity = RequestIdentity_(request_id, api_id)
-    header = RequestHeader_(identity, RequestLease_(0), RequestPolicy_(0, noreply))
-    return Request_(header, parameter, b"")
+    identity = idl.RequestIdentity_(request_id, api_id)
+    header = idl.RequestHeader_(identity, idl.RequestLease_(0), idl.RequestPolicy_(0, noreply))
+    return idl.Request_(header, parameter, b"")
 
 
 def move_parameter(vx_mps: float, vy_mps: float, wz_radps: float) -> str:
@@ -69,8 +62,8 @@ class Requester:
         """Writes that have failed in a row, up to now."""
         self._allowed = allowed
         self._last_id = 0
-        self._writer = bus.writer(request_topic(service), Request_)
-        self._reader = bus.reader(response_topic(service), Response_, depth=8, reliable=True)
+        self._writer = bus.writer(request_topic(service), idl.Request_)
+        self._reader = bus.reader(response_topic(service), idl.Response_, depth=8, reliable=True)
 
     def send(self, api_id: int, parameter: str = "", *, noreply: bool = False) -> int | None:
         """Write a request without waiting for anything; its id, or None when DDS did not take it.

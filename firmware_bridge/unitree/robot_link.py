@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from firmware_bridge.config import RobotConfig
-from firmware_bridge.core import Call, Move, Remote, Report
+from firmware_bridge.core import Call, Move, Report
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.idl import Request_, SportModeState_, WirelessController_
@@ -45,34 +45,23 @@ class RobotLink:
         self._sent: dict[int, int] = {}  # request id -> api id, of what has not been answered
         self._malformed = 0
 
-    def counters(self) -> dict[str, int]:
-        """What was dropped or refused so far."""
-        sport = self._sport
-        return {
-            "malformed": self._malformed + sport.malformed,
-            "reordered": self._order.dropped,
-            "failed_writes": sport.failed_writes,
-        }
+    def dropped(self) -> tuple[int, int, int]:
+        """How much so far: impossible messages, states out of order, requests that the network did not take."""
+        return self._malformed + self._sport.malformed, self._order.dropped, self._sport.failed_writes
 
     def read(self, now_ns: int) -> Report:
         """Everything that has arrived since the last call."""
-        return Report(
-            self._newest_state(),
-            self._remote(),
-            self._foreign(),
-            self._battery_percent(now_ns),
-            self._answers(),
-            self._sport.failing >= _FAILING_WRITES,
-        )
+        in_use, estop = self._remote()
+        state, foreign, battery_percent = self._newest_state(), self._foreign(), self._battery_percent(now_ns)
+        failing = self._sport.failing >= _FAILING_WRITES
+        return Report(state, in_use, estop, foreign, battery_percent, self._answers(), failing)
 
     def write(self, request: Move | Call) -> None:
         """Send one request and wait for nothing; what the network does not take is counted."""
         if isinstance(request, Move):
             parameter = move_parameter(request.vx_mps, request.vy_mps, request.wz_radps)
             self._sport.send(ids.MOVE, parameter, noreply=True)
-            return
-        request_id = self._sport.send(request.api_id)
-        if request_id is not None:
+        elif (request_id := self._sport.send(request.api_id)) is not None:
             if len(self._sent) >= _MAX_UNANSWERED:
                 self._sent.clear()
             self._sent[request_id] = request.api_id
@@ -87,16 +76,16 @@ class RobotLink:
                 newest = state
         return newest
 
-    def _remote(self) -> Remote | None:
-        in_use = estop = heard = False
+    def _remote(self) -> tuple[bool, bool]:
+        """Whether a stick or key is in use, whether the emergency-stop keys are held."""
+        in_use = estop = False
         for sample in take_each(self._remotes):
             if sample is None or not within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
                 self._malformed += 1
                 continue
-            heard = True
             in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
             estop |= sample.keys & self._estop_keys == self._estop_keys
-        return Remote(in_use, estop) if heard else None
+        return in_use, estop
 
     def _foreign(self) -> str | None:
         foreign = None
@@ -111,11 +100,12 @@ class RobotLink:
         if now_ns < self._battery_due_ns:
             return None
         self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
-        battery: Any = None
+        percent = None
         for sample in take_each(self._low_states):
             battery = None if sample is None else battery_state(sample, now_ns)
             self._malformed += battery is None
-        return None if battery is None else battery.soc_percent
+            percent = None if battery is None else battery.soc_percent
+        return percent
 
     def _answers(self) -> str | None:
         """The version the sport service has told us, if it has; errors go to the operator."""

@@ -21,7 +21,8 @@ MAX_ANGLE_RAD: Final = 2 * math.pi
 MAX_VOLTAGE_V: Final = 100.0
 MAX_CURRENT_A: Final = 200.0
 _NORM_TOLERANCE: Final = 0.05
-_CLOCK_RESTART_NS: Final = 1_000_000_000
+_NS_PER_S: Final = 1_000_000_000
+_CLOCK_RESTART_NS: Final = _NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -68,40 +69,26 @@ def robot_state(sample: SportModeState_, received_ns: int, velocity_frame: str) 
     `velocity_frame` is the frame of `sample.velocity`: the maker's simulator reports it in the odometry frame.
     """
     imu, stamp = sample.imu_state, sample.stamp
-    x_m, y_m, z_m = sample.position
+    (x_m, y_m, z_m), (roll_rad, pitch_rad, theta_rad) = sample.position, imu.rpy
     vx_mps, vy_mps, vz_mps = sample.velocity
-    roll_rad, pitch_rad, theta_rad = imu.rpy
     possible = (
         within(MAX_POSITION_M, x_m, y_m, z_m)
         and within(MAX_SPEED_MPS, vx_mps, vy_mps, vz_mps)
         and within(MAX_ANGLE_RAD, roll_rad, pitch_rad, theta_rad)
         and within(MAX_TURN_RADPS, sample.yaw_speed, *imu.gyroscope)
         and within(_NORM_TOLERANCE, math.hypot(*imu.quaternion) - 1.0)
-        and sample.mode <= LAST_MODE
-        and stamp.sec >= 0
-        and stamp.nanosec < 1_000_000_000
+        and (sample.mode <= LAST_MODE and stamp.sec >= 0 and stamp.nanosec < _NS_PER_S)
     )
     if not possible:
         return None
     if velocity_frame == "odom":
         cos, sin = math.cos(theta_rad), math.sin(theta_rad)
         vx_mps, vy_mps = cos * vx_mps + sin * vy_mps, cos * vy_mps - sin * vx_mps
+    motion = (received_ns, (x_m, y_m, theta_rad), vx_mps, vy_mps, sample.yaw_speed)
+    attitude = (z_m, roll_rad, pitch_rad, imu.gyroscope[2])
     fr, fl, rr, rl = sample.foot_force
-    return RobotState(
-        received_ns,
-        (x_m, y_m, theta_rad),
-        vx_mps,
-        vy_mps,
-        sample.yaw_speed,
-        sample.mode,
-        sample.error_code,
-        robot_stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
-        position_z_m=z_m,
-        roll_rad=roll_rad,
-        pitch_rad=pitch_rad,
-        gyro_wz_radps=imu.gyroscope[2],
-        foot_forces=(fr, fl, rr, rl),
-    )
+    stamp_ns = stamp.sec * _NS_PER_S + stamp.nanosec
+    return RobotState(*motion, sample.mode, sample.error_code, stamp_ns, *attitude, (fr, fl, rr, rl))
 
 
 def battery_state(sample: LowState_, received_ns: int) -> BatteryState | None:
