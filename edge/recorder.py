@@ -32,6 +32,8 @@ ARMING_FREE_SHARE = 0.07
 """Fault matrix row 51: a robot that records is not armed with less of its file system free (openpilot's figure)."""
 _FLUSH_PERIOD_NS = 900_000_000  # below one second even when a pass of the loop is late
 _POLL_S = 0.05  # the writer looks by itself, so that a caller never pays for waking it
+_PART_AGE_NS = 3600 * 1_000_000_000
+"""The index of a part is kept in memory until it is finished, so none is written for longer than this."""
 _NICENESS = 10
 _RESUME = 1.25
 """A paused recording goes on once there is this many times the floor: not on and off with every flush."""
@@ -217,14 +219,14 @@ class Recorder:
 
     def _write_all(self, part: LogPart) -> None:
         self._look_at_space()
-        flushed_ns = time.monotonic_ns()
+        begun_ns = flushed_ns = time.monotonic_ns()
         while True:
             # Asked before the queue is emptied: whatever was put before close() is then written.
             closing = self._closing.is_set()
             while (item := self._take()) is not None:
                 self._write(part, item)
                 if part.file.length >= self._limits.part_bytes:
-                    part = self._next_part(part)
+                    part, begun_ns = self._next_part(part), time.monotonic_ns()
                 if time.monotonic_ns() - flushed_ns >= _FLUSH_PERIOD_NS:
                     break
             now_ns = time.monotonic_ns()
@@ -235,6 +237,8 @@ class Recorder:
                 self._all_saved()
                 self._look_at_space()
                 flushed_ns = now_ns
+                if now_ns - begun_ns >= _PART_AGE_NS:
+                    part, begun_ns = self._next_part(part), now_ns
             if closing and not self._queue:
                 part.finish()
                 self._all_saved()

@@ -181,13 +181,13 @@ def test_a_disk_that_is_full_stops_writing_and_is_reported(tmp_path: Path) -> No
 
 
 FILL_THE_DISK = """
-import resource, sys, time
+import os, resource, sys, time
 from edge.recorder import Recorder
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 recorder = Recorder(sys.argv[1])
 given = 0
 while recorder.error is None:
-    recorder.put("/camera", given, bytes(range(256)) * 40)
+    recorder.put("/camera", given, os.urandom(10_000))
     given += 1
     time.sleep(0.001)
 print(given, recorder.dropped.get("/camera", 0), recorder.error)
@@ -257,6 +257,23 @@ def test_a_long_recording_goes_on_in_further_parts_that_are_read_as_one(tmp_path
     assert recorder.dropped == {}
     assert _ticks(path) == list(range(1_500))
     assert recorder.statistics()["bytes"] == sum(part.stat().st_size for part in parts(path))
+
+
+def test_a_part_that_grows_slowly_is_ended_after_an_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = [0]
+    monkeypatch.setattr("edge.recorder.time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
+    path = tmp_path / "flight.mcap"
+    recorder = Recorder(path)
+    recorder.put("/tick", 1, {"tick": 0})
+    assert _wait_for(lambda: recorder._unsaved["/tick"] == 1, 20)
+    now_ns[0] = 3_599 * 1_000_000_000
+    assert _wait_for(lambda: _ticks(path) == [0], 20)
+    assert len(parts(path)) == 1
+    now_ns[0] = 3_600 * 1_000_000_000
+    assert _wait_for(lambda: len(parts(path)) == 2, 20)
+    recorder.put("/tick", 2, {"tick": 1})
+    assert recorder.close()
+    assert _ticks(path) == [0, 1]
 
 
 def test_every_part_is_whole_by_itself_and_says_what_run_it_belongs_to(tmp_path: Path) -> None:
