@@ -76,6 +76,7 @@ def _kinds() -> dict[str, FaultKind]:
         ),
         "low-battery": FaultKind("state", "the battery reads nearly empty", {"soc_percent": (5.0, (0, 100))}),
         "error-code": FaultKind("state", "the robot reports an error", {"code": (1001.0, (0, 2**32 - 1))}),
+        "wrong-mode": FaultKind("state", "the robot reports another mode", {"mode": (7.0, (0, 255))}),
         "remote-keys": FaultKind("remote", "keys are held down on the remote", {"keys": (float(L2_B), (0, 65535))}),
         "remote-stick": FaultKind("remote", "a stick is pushed on the remote", {"ly": (0.6, (-1, 1))}),
         "stop-unanswered": FaultKind(

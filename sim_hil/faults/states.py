@@ -17,8 +17,8 @@ from sim_hil.faults.commands import FaultCommand
 _NAN: Final = math.nan
 # Taking effect with the next sport state; the others do at once.
 _IN_A_STATE: Final = frozenset(
-    {"odometry-jump", "odometry-freeze", "odometry-nan", "odometry-bias", "tip-over", "error-code", "state-reorder",
-     "state-duplicate"}
+    {"odometry-jump", "odometry-freeze", "odometry-nan", "odometry-bias", "tip-over", "error-code", "wrong-mode",
+     "state-reorder", "state-duplicate"}
 )  # fmt: skip
 
 
@@ -142,6 +142,8 @@ class StateFaults:
             self._tip(message.imu_state)
         if "error-code" in self._on:
             message.error_code = round(self._on["error-code"].number("code"))
+        if "wrong-mode" in self._on:
+            message.mode = round(self._on["wrong-mode"].number("mode"))
         if "odometry-nan" in self._on:
             self._poison(message, self._on["odometry-nan"].text("field"))
 

@@ -79,17 +79,17 @@ def count(row: Row, per_row: int) -> int:
 
 
 def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
-    """All injections of one row. Raises StepError or FaultError when the rig does not work."""
+    """All injections of one row. Raises FaultError when the robot's side does not answer."""
     samples: list[Sample] = []
     for index in range(times):
         begun_ns = time.monotonic_ns()
         try:
             sample = injection(rig, row, rng, host)
-        except FaultError as error:
-            # It may be that the product no longer does what the fault replaces: a row that fails, not a rig.
-            sample = Sample(None, 0.0, [str(error)])
+        except (FaultError, StepError) as error:
+            # A fault that did not strike or a runner that did not drive fails this injection, not those after it.
+            sample = Sample(None, 0.0, [str(error).splitlines()[0]])
             rig.kill_runner()
-            rig.clear()
+            rig.clear()  # raises when the robot's side has gone: that is the end
         samples.append(sample)
         shown = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
         wrong = f" ({'; '.join(sample.wrong)})" if sample.wrong else ""

@@ -19,15 +19,22 @@ MAX_TURN_RADPS = 0.95
 _STEER_PER_S = 1.5
 _APPROACH_PER_M = 1.5
 _RIPPLE = 0.03
+_SLOWEST = 0.1
+_SLOW_DOWN = 1.2  # full speed as long as the heading is within 34 degrees
 
 
-def turn_radps(T_odom_base: SE2) -> float:
-    """Yaw rate that leads onto the circle, counter-clockwise, from anywhere."""
+def steering(T_odom_base: SE2) -> tuple[float, float]:
+    """Speed (m/s) and yaw rate (rad/s) that lead onto the circle, counter-clockwise, from anywhere.
+
+    A robot that looks the wrong way turns nearly on the spot: it must not leave the small place.
+    """
     radius_m = math.hypot(T_odom_base.x_m, T_odom_base.y_m)
     tangent_rad = math.atan2(T_odom_base.y_m, T_odom_base.x_m) + math.pi / 2
     wanted_rad = tangent_rad + math.atan(_APPROACH_PER_M * (radius_m - RADIUS_M))
-    turn = SPEED_MPS / RADIUS_M + _STEER_PER_S * wrap_angle(wanted_rad - T_odom_base.theta_rad)
-    return min(max(turn, -MAX_TURN_RADPS), MAX_TURN_RADPS)
+    error_rad = wrap_angle(wanted_rad - T_odom_base.theta_rad)
+    speed = SPEED_MPS * min(1.0, max(_SLOWEST, _SLOW_DOWN * math.cos(error_rad)))
+    turn = speed / RADIUS_M + _STEER_PER_S * error_rad
+    return speed, min(max(turn, -MAX_TURN_RADPS), MAX_TURN_RADPS)
 
 
 def plan(T_odom_base: SE2, steps: int, step_s: float, phase_rad: float) -> npt.NDArray[np.float32]:
@@ -35,8 +42,8 @@ def plan(T_odom_base: SE2, steps: int, step_s: float, phase_rad: float) -> npt.N
 
     Without the ripple a robot that has found its circle would plan the same for ever, as a dead network does.
     """
-    turn = turn_radps(T_odom_base)
-    speed = SPEED_MPS * (1.0 + _RIPPLE * math.sin(phase_rad))
+    speed, turn = steering(T_odom_base)
+    speed *= 1.0 + _RIPPLE * math.sin(phase_rad)
     theta = turn * step_s * np.arange(1, steps + 1)
     reach = speed * step_s * np.arange(1, steps + 1)
     half = theta / 2

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from firmware_bridge.config import RobotConfig, load_robot_config
-from tools.children import Child, Children, StepError
+from tools.children import Child, Children, StepError, tail
 from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE
 from tools.faults.circle import SPEED_MPS
 from tools.faults.client import FaultClient, FaultError
@@ -22,6 +22,7 @@ MOVING_TIMEOUT_S = 60.0
 _POLL_S = 0.01
 _STEADY_MOVES = 10  # 0.2 s of the bridge's commands
 _STEADY_SHARE = 0.9
+_ATTEMPTS = 4
 
 
 class Rig:
@@ -97,18 +98,21 @@ class Rig:
 
     def ensure_moving(self) -> None:
         """Have the robot driven, steadily and at full speed; starts what is not running. Raises StepError."""
-        if self.bridge is None or not self.bridge.running:
-            self.forget_runner()
-            self._forget(self.bridge)
-            self.start_bridge()
-        if self.runner is None or not self.runner.running:
-            self.forget_runner()
-            self.start_runner()
-        assert self.runner is not None
-        runner = self.runner
-        self._wait(lambda: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
-        if not runner.running:
-            raise runner.failure(f"it ended with exit code {runner.process.returncode} before the robot moved")
+        for _ in range(_ATTEMPTS):
+            if self.bridge is None or not self.bridge.running:
+                self.kill_runner()
+                self.kill_bridge()
+                self.start_bridge()
+            if self.runner is None or not self.runner.running:
+                self.kill_runner()
+                self.start_runner()
+            assert self.runner is not None
+            runner = self.runner
+            self._wait(lambda runner=runner: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
+            if runner.running:
+                return
+            self._say(f"the runner ended before it was asked to: {tail(runner.log, 2)[0]}")
+        raise runner.failure(f"it ended {_ATTEMPTS} times, at last with {runner.process.returncode}")
 
     def moving(self) -> bool:
         """Whether the newest commands are all near full speed, and fresh."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from types import MappingProxyType
 
 from edge.faults import FAULTS, Action
 from tools.faults.rig import Rig
@@ -92,6 +93,29 @@ class Row:
         """Whether the run is over after it."""
         return self.ends_run or (self.fault is not None and FAULTS[self.fault].latch)
 
+
+NOT_INJECTED: Mapping[str, str] = MappingProxyType(
+    {
+        "camera-from-future": "the Go2's protocol carries no capture stamp that could lie in the future",
+        "frame-refused": "tells the operator and changes no speed; three in a row are injected",
+        "output-out-of-range": "tells the operator and changes no speed; five in a second are injected",
+        "reasoning-failed": "tells the operator and changes no speed; five in a minute are injected",
+        "output-unsteady": "a milder oscillation; the hard one is injected",
+        "semantic-old": "the way to an expired semantic state, which is injected",
+        "semantic-delay-invalid": "needs a defect in our own stamps; test on a fake clock",
+        "instruction-injected": "changes nothing by construction; test over a thousand texts",
+        "tick-late": "needs a machine that is slow by some share; a tick that takes too long is injected",
+        "suspended": "would suspend this machine; test on a fake clock",
+        "clock-backwards": "the kernel does not let a process move the monotonic clock; test on a fake clock",
+        "thermal-throttle": "needs a board that is hot; test on a fake sysfs tree",
+        "thermal-trip": "needs a board that is hot; test on a fake sysfs tree",
+        "out-of-memory": "to the robot the same as a runner that is killed, which is injected",
+        "message-flood": "to the bridge the same as old commands after SIGCONT, which are injected",
+        "message-reordered": "commands cannot change places on a local SEQPACKET socket; states are injected",
+        "robot-link-down": "would take the network of this machine down; test on fake writes that fail",
+    }
+)
+"""Faults of the table that no row makes happen, each with its reason. Those of the start never move a robot at all."""
 
 UNCHANGED_GAP_MS = 100.0
 """Five of the bridge's periods, and one tick."""
@@ -202,6 +226,7 @@ def rows() -> tuple[Row, ...]:
         Row("runner SIGSTOP, SIGCONT", "runner-frozen", lambda rig: rig.send(rig.runner, signal.SIGSTOP), thaw=True),
         Row("runner SIGTERM", None, lambda rig: rig.send(rig.runner, signal.SIGTERM), judge=Judge.ZERO, ends_run=True),
         _inside("control thread dies", "control-thread-dead", "control-death"),
+        _inside("action expert takes 0.6 s", "commands-late", "tick-slow", seconds_s=0.6),
         _inside("graph does not come back", "graph-hung", "control-hang"),
         _with(_inside("reasoning thread dies", "semantic-expired", "reasoning-death"), ends_run=True, share=0.5),
         _inside("reasoning fails five times", "reasoning-failing", "reasoning-error", after=5.0),
@@ -211,6 +236,8 @@ def rows() -> tuple[Row, ...]:
         _robot("speed reads 1 m/s too high", "odometry-speed-mismatch", "odometry-bias"),
         _robot("robot tips over", "tipped-over", "tip-over"),
         _with(_robot("battery at 3 %", "battery-empty", "low-battery", soc_percent=3.0), share=0.4),
+        _robot("robot reports an error", "robot-error", "error-code"),
+        _robot("robot reports damping", "robot-mode-left", "wrong-mode", mode=7.0),
         _robot("remote: L2+B", "emergency-stop", "remote-keys"),
         _robot("remote: stick pushed", "emergency-stop", "remote-stick"),
         Row("second commander", "second-commander", lambda rig: rig.rogue(1.0)),

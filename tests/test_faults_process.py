@@ -1,0 +1,51 @@
+"""A handful of `make faults`' injections into real processes; the sniffer on the robot's side is the judge.
+
+The other rows, and enough samples to speak of a percentile, are `make faults`.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tools.demo import socket_dir
+from tools.faults.measure import injection
+from tools.faults.report import RowResult
+from tools.faults.rig import Rig
+from tools.faults.rows import rows
+from tools.host_stall import HostStall
+
+ROWS = {row.name: row for row in rows()}
+
+
+@pytest.fixture(scope="module")
+def host() -> Iterator[HostStall]:
+    with HostStall() as watching:
+        yield watching
+
+
+@pytest.fixture(scope="module")
+def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
+    with socket_dir() as folder, Rig(folder, artifacts_dir, dds_domain, print) as rig:
+        rig.start()
+        yield rig
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        # In this order: those that leave the run alive share one runner.
+        "camera stops",
+        "plan is NaN",
+        "robot's state silent",
+        "remote: L2+B",
+        "runner SIGSTOP, SIGCONT",
+        "bridge SIGKILL",
+    ],
+)
+def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
+    result = RowResult(ROWS[name], [injection(rig, ROWS[name], random.Random(name), host)])
+    assert not result.problems, result.as_json()
