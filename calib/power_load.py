@@ -23,6 +23,7 @@ from edge.semantic import SemanticState
 
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 READ_S: Final = 0.05
+AWAIT_S: Final = 2.0
 LEAST_COVERED: Final = 0.9
 REST_S: Final = 0.5
 """Between phases, so that one's clocks do not reach into the next."""
@@ -78,6 +79,13 @@ class EnergyLog:
             self._samples.append(self._meter.read(self._clock()))
         except MeterError as error:
             self.error = str(error)
+
+    def await_reading(self, after_ns: int) -> None:
+        """Wait for a reading from after that instant, at most 2 s: the last part of a phase is in it."""
+        for _ in range(round(AWAIT_S / READ_S)):
+            if self._samples and self._samples[-1].stamp_ns >= after_ns:
+                return
+            time.sleep(READ_S)
 
     def energy_j(self, begin_ns: int, end_ns: int) -> float:
         """Energy in J; each sample stands for the time since the one before. Raises MeterError for too few samples."""
@@ -201,7 +209,7 @@ def run_phases(
                 before, begin_ns = counts.copy(), time.monotonic_ns()
                 run(begin_ns / 1e9 + seconds)
                 end_ns, after = time.monotonic_ns(), counts.copy()
-                time.sleep(2 * READ_S)  # the reading that ends after the phase is still to come
+                log.await_reading(end_ns)
                 ran = {stage: after[stage] - before[stage] for stage in STAGES if after[stage] > before[stage]}
                 phase = Phase(name, (end_ns - begin_ns) / 1e9, log.energy_j(begin_ns, end_ns), ran, check)
                 say(f"round {number + 1}/{rounds}: {name} {phase.power_w:.2f} W")
