@@ -28,7 +28,7 @@ from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
 from edge.reasoning_loop import ReasoningLoop, SemanticSlot
 from edge.ring import EncodedFrame, TokenRing
-from edge.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, schedule_for
+from edge.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, run_as, schedule_for
 from edge.stats import percentiles
 from export.measure import INSTRUCTION
 
@@ -133,17 +133,35 @@ def run(artifacts: Artifacts, rounds: int, alone_s: float) -> dict[str, Any]:
         for late in (False, True)
     }
     ticks.fill()
-    for _ in range(2):  # what is allocated once, and the first guesses of how long a prefix takes
-        for warmed in loops.values():
-            generate(warmed, ticks, ALONE)
-    ticks.samples_ms.clear()
-    freeze_garbage()
-    said = enter(schedule.reasoning)
+    samples = run_as(schedule.reasoning, lambda: take_turns(ticks, loops, rounds, alone_s))
+    return {
+        "artifacts": str(artifacts.directory),
+        "model": artifacts.model_name,
+        "manifest_sha256": artifacts.manifest_sha256,
+        "rounds": rounds,
+        "shared": schedule.shared,
+        "said": [*schedule.notes, *ticks.said],
+        "missed_ticks": ticks.missed,
+        "variants": {name: summary(values, ticks.samples_ms.get(name, [])) for name, values in samples.items()},
+        "tick_alone_ms": percentiles(ticks.samples_ms.get(ALONE, []), "p50", "p99", "max"),
+        "saved_ms_median": {way: saved(samples, way) for way in ("", ", gives way")},
+        "samples": samples,
+        "tick_samples_ms": ticks.samples_ms,
+        "tagged": "measured",
+    }
+
+
+def take_turns(
+    ticks: Ticks, loops: dict[str, ReasoningLoop], rounds: int, alone_s: float
+) -> dict[str, dict[str, list[float]]]:
+    """Every variant's samples by name (reasoning thread)."""
+    for warmed in loops.values():  # what is allocated once
+        generate(warmed, ticks, ALONE)
     samples: dict[str, dict[str, list[float]]] = {
         name: {"anchor_to_ready_ms": [], "generation_ms": [], "late_anchor_ms": []} for name in loops
     }
     with ticks:
-        for name, one in loops.items():
+        for name, one in loops.items():  # the first guesses of how long calls take
             generate(one, ticks, name)
         ticks.samples_ms.clear()
         rest(ticks, alone_s)
@@ -155,21 +173,7 @@ def run(artifacts: Artifacts, rounds: int, alone_s: float) -> dict[str, Any]:
                 for key, values in samples[name].items():
                     values.append(getattr(one, key).newest)
         rest(ticks, alone_s)
-    return {
-        "artifacts": str(artifacts.directory),
-        "model": artifacts.model_name,
-        "manifest_sha256": artifacts.manifest_sha256,
-        "rounds": rounds,
-        "shared": schedule.shared,
-        "said": [*schedule.notes, *ticks.said, *said],
-        "missed_ticks": ticks.missed,
-        "variants": {name: summary(values, ticks.samples_ms.get(name, [])) for name, values in samples.items()},
-        "tick_alone_ms": percentiles(ticks.samples_ms.get(ALONE, []), "p50", "p99", "max"),
-        "saved_ms_median": {way: saved(samples, way) for way in ("", ", gives way")},
-        "samples": samples,
-        "tick_samples_ms": ticks.samples_ms,
-        "tagged": "measured",
-    }
+    return samples
 
 
 def rest(ticks: Ticks, seconds: float) -> None:
@@ -213,6 +217,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.rounds < 1 or not 1 <= args.alone <= 600:
             raise ArtifactError("--rounds must be at least 1 and --alone 1 to 600 s")
         check_result_target(args.json)
+        freeze_garbage()
         result = run(load_artifacts(args.artifacts), args.rounds, args.alone)
         write_result(args.json, result)
     except (ArtifactError, OSError) as error:
