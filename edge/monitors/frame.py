@@ -43,7 +43,7 @@ class Picture(Protocol):
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """What is expected of the camera. With ticks of 100 ms and a bridge of 20 ms both ages keep zero below 500 ms."""
+    """What is expected of the camera. With ticks of 100 ms and a bridge of 20 ms its ages keep zero below 500 ms."""
 
     image_px: int | None
     """Side of the encoder's picture; None: not checked."""
@@ -53,8 +53,8 @@ class FrameConfig:
     """Zero when the picture that is driven by is older."""
     stale_ms: float = 300.0
     """A picture that is older when it is first seen is refused."""
-    frozen_ms: float = 300.0
-    """Zero when the content has been the same for so long while the robot moved."""
+    frozen_ms: float = 190.0
+    """Zero when the content has been the same for so long while the robot moved: at 10 Hz the second repetition."""
     moved_m: float = 0.02
     moved_rad: float = 0.02
 
