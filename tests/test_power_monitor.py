@@ -5,24 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from edge.findings import FindingQueue
 from edge.log_schemas import SCHEMAS
-from edge.power.assembly import RunEnergy, run_meter, run_monitor
 from edge.power.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
 from edge.power.meter import MeterError, PowerSample
 from edge.power.modelled import ModelledMeter
 from edge.power.monitor import Activity, PowerMonitor
-from edge.power.plan import PowerPlan
 from edge.power.statistics import PowerStatistics
 from edge.power.thermal import ThermalReader, ThermalState
-from tools.bench.governor import orin
 
-TREES = Path(__file__).parent / "data/sysfs"
 SECOND = 1_000_000_000
 
 
@@ -235,38 +230,3 @@ def test_memory_of_the_statistics_does_not_grow() -> None:
     for index in range(10_000):
         statistics.add(index, float(index % 2000))
     assert len(statistics._seconds) == before
-
-
-def test_a_run_on_the_orins_board_is_metered_and_says_how() -> None:
-    said: list[str] = []
-    running = run_monitor(orin()[1], activity=Activity, say=said.append, sysfs_root=TREES / "orin_nx_jp6")
-    assert running.statistics()["source"] == "none"  # before the first sample
-    assert said == ["power: ina3221 VDD_IN, VDD_IN is the module's input: the carrier board draws more than that"]
-
-
-def test_a_run_without_a_meter_is_held_by_the_plan_and_says_so() -> None:
-    said: list[str] = []
-    plan = orin()[1]
-    meter = run_meter(plan, Activity, said.append, TREES / "no_meter")
-    assert isinstance(meter, ModelledMeter)
-    assert said[0].startswith("power: modelled, not measured (ina3221: looked for")
-
-
-def test_a_run_without_meter_and_plan_is_not_limited_and_says_so() -> None:
-    said: list[str] = []
-    plan = PowerPlan("rapl", None, None, 10.0, 48, None)
-    assert run_meter(plan, Activity, said.append, TREES / "no_meter") is None
-    assert said[0].startswith("power: not measured (rapl: looked for")
-
-
-def test_modelled_energy_is_that_of_ticks_and_of_reasoning_time() -> None:
-    model = orin()[1].model
-    assert model is not None
-    now, state = [0], [Activity()]
-    energy = RunEnergy(model, 48, lambda: state[0], clock=lambda: now[0])
-    energy()
-    state[0], now[0] = Activity(ticks=10, reasoning=True), SECOND
-    energy()
-    state[0], now[0] = Activity(ticks=20), 3 * SECOND
-    expected = 20 * (model.encode_j + model.act_j) + 2.0 * model.reasoning_w(48)
-    assert energy() == pytest.approx(expected)

@@ -37,7 +37,7 @@ _OFF_MARGIN: Final = 0.97
 _LOST_S: Final = 1.0
 _TRIM_PER_S: Final = 0.05
 _TRIM_MOST: Final = 0.05
-_TRIM_FORGET_S: Final = 60.0
+_TRIM_FORGET_S: Final = 300.0
 _LONGEST_PAUSE_S: Final = 60.0
 _COARSE_S, _FINE_S = 0.5, 0.1
 
@@ -180,7 +180,10 @@ class Governor:
             dt_s = max(0.0, (now_ns - last_ns) / 1e9)
             if dt_s > 0:
                 share = min(1.0, max(0.0, (inputs.reasoning_s - last.reasoning_s) / dt_s))
-            if inputs.generations > last.generations or (last.reasoning and not inputs.reasoning):
+            ended = last.reasoning and not inputs.reasoning
+            # One that began and ended between two steps, or was followed by the next at once.
+            missed = inputs.generations > last.generations and inputs.reasoning_s > last.reasoning_s
+            if ended or missed:
                 self._ended_ns = now_ns
         self._times.update(inputs.generations, inputs.reasoning_s, self._cap)
         if not inputs.reasoning:

@@ -1,10 +1,10 @@
-"""Does the governor keep the budget? The real one, on a modelled Orin NX with a fake clock, at four loads.
+"""Does the governor keep the budget? The real one, on a modelled Orin NX with a fake clock, at five loads.
 
     python -m tools.bench.governor --json out/bench/governor.json
 
 The device is the plan's: stages take turns on one accelerator, control first. Its generations draw a multiple of the
 plan's power: `light` needs no shedding, `limit` would draw exactly the budget, `plan` is the plan as it is, `far` asks
-for three times. Meter noise, lost readings, texts of random length, heat and leakage are added. The judge is the
+for three times, `lag` is `far` with a meter that averages over a second, as NVML's may. Meter noise, lost readings, texts of random length, heat and leakage are added. The judge is the
 device's true power, not the governor's figures. Exit code 1: the 10 s average was above the budget + 2 % later than
 30 s after the start, control missed a tick, or reasoning was shed where it need not be. Everything here is modelled.
 """
@@ -35,7 +35,8 @@ REST_C, C_PER_W = 51.6, 1.39
 """Steady temperature over power: a line through ARK's notes for the Orin NX (4.6 W 58 °C, 29.4 W 89 to 92 °C)."""
 HEAT_S, LEAKAGE_PER_C = 60.0, 0.002
 """Thermal time constant, and growth of what a stage draws with temperature. Assumptions."""
-LOADS: Final = ("light", "limit", "plan", "far")
+LOADS: Final = ("light", "limit", "plan", "far", "lag")
+LAG_S: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def load_factor(load: str, stages: Stages, budget_w: float) -> float:
     control_w = stages.rise_w * stages.tick_s / stages.period_s
     rest_w = stages.rise_w * (1 - stages.tick_s / stages.period_s)
     limit = (budget_w - stages.idle_w - control_w) / rest_w
-    return {"light": 0.7 * limit, "limit": limit, "plan": 1.0, "far": 3.0}[load]
+    return {"light": 0.7 * limit, "limit": limit, "plan": 1.0, "far": 3.0, "lag": 3.0}[load]
 
 
 class Reasoning:
@@ -154,7 +155,7 @@ def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: b
     run = Run([], [], [], [])
     outputs = GovernorOutputs(UNLIMITED)
     temperature_c, free_s, spent_ns = REST_C + C_PER_W * stages.idle_w, 0.0, 0
-    carried_j = 0.0
+    carried_j, shown_w = 0.0, stages.idle_w
     for index in range(round(seconds / stages.period_s)):
         start_s, end_s = index * stages.period_s, (index + 1) * stages.period_s
         hot = 1 + LEAKAGE_PER_C * (temperature_c - REST_C - C_PER_W * 25.0)
@@ -177,7 +178,8 @@ def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: b
         power_w = stages.idle_w + energy_j / stages.period_s
         temperature_c += (REST_C + C_PER_W * power_w - temperature_c) * stages.period_s / HEAT_S
         run.true_w.append(power_w)
-        reading = None if rng.random() < LOST else max(0.0, power_w * rng.gauss(1.0, NOISE))
+        shown_w += (power_w - shown_w) * (1 - math.exp(-stages.period_s / LAG_S) if load == "lag" else 1.0)
+        reading = None if rng.random() < LOST else max(0.0, shown_w * rng.gauss(1.0, NOISE))
         inputs = GovernorInputs(reading, reasoning.running, reasoning.taken_s(end_s), reasoning.generations)
         began_ns = time.perf_counter_ns()
         outputs = governor.step(inputs, round(end_s * 1e9))
