@@ -49,6 +49,31 @@ class Interrupt:
         self.options.terminate = True
 
 
+class Binding:
+    """Buffers that a graph reads and writes; the arrays behind them are the caller's to keep alive.
+
+    On an accelerator an input is copied to it when it is bound, which can fail there as a run can: with a GraphError.
+    """
+
+    def __init__(self, graph: str, buffers: ort.IOBinding) -> None:
+        self._graph = graph
+        self.buffers = buffers
+
+    def bind_ortvalue_input(self, name: str, value: ort.OrtValue) -> None:
+        """Read an input from a buffer."""
+        try:
+            self.buffers.bind_ortvalue_input(name, value)
+        except Exception as error:
+            raise GraphError(f"{self._graph}: input {name}: {str(error).splitlines()[0]}") from error
+
+    def bind_ortvalue_output(self, name: str, value: ort.OrtValue) -> None:
+        """Write an output to a buffer."""
+        try:
+            self.buffers.bind_ortvalue_output(name, value)
+        except Exception as error:
+            raise GraphError(f"{self._graph}: output {name}: {str(error).splitlines()[0]}") from error
+
+
 class Graph:
     """A session on the execution provider and with the threads that the manifest names, unless told otherwise.
 
@@ -133,14 +158,14 @@ class Graph:
             raise self._failure(error, interrupt) from error
         return result
 
-    def binding(self) -> ort.IOBinding:
+    def binding(self) -> Binding:
         """A new set of bound buffers for `run_bound`."""
-        return self._session.io_binding()
+        return Binding(self.name, self._session.io_binding())
 
-    def run_bound(self, binding: ort.IOBinding, interrupt: Interrupt | None = None) -> None:
+    def run_bound(self, binding: Binding, interrupt: Interrupt | None = None) -> None:
         """Run on bound buffers, in place where an input and an output share one; raises as `run` does."""
         try:
-            self._session.run_with_iobinding(binding, interrupt.options if interrupt else None)
+            self._session.run_with_iobinding(binding.buffers, interrupt.options if interrupt else None)
         except Exception as error:
             raise self._failure(error, interrupt) from error
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge.geometry import SE2
-from edge.graph import CancelledError, Graph, Interrupt
+from edge.graph import CancelledError, Graph, GraphError, Interrupt
 from edge.manifest import Artifacts
 from edge.policy import Policy
 from edge.scheduling import TickActivity, schedule_for
@@ -100,6 +100,18 @@ def test_a_plan_survives_the_next_tick(policy: Policy, artifacts: Artifacts) -> 
     kept = first.copy()
     policy.act(tokens, (0.9, 0.0, 0.9), 9.0, HERE, state)
     np.testing.assert_array_equal(first, kept)
+
+
+def test_a_context_that_does_not_fit_the_graph_is_a_failure_of_that_tick_only(
+    policy: Policy, artifacts: Artifacts
+) -> None:
+    """The control thread takes a GraphError for no plan at all; anything else would end it."""
+    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
+    good = policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state)
+    foreign = {**state.context, "context.0.key": np.zeros((1, 1, 1, 1), dtype=np.float32)}
+    with pytest.raises(GraphError, match="action_expert"):
+        policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, dataclasses.replace(state, context=foreign))
+    np.testing.assert_array_equal(policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state), good)
 
 
 def test_a_semantic_context_can_be_interrupted(policy: Policy, artifacts: Artifacts) -> None:
