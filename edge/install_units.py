@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
 from pathlib import Path
+from stat import S_IROTH, S_IXOTH
 from typing import Any, Final
 
 import psutil
@@ -103,6 +104,14 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         if args.system:
             raise ArtifactError(f"{lacking}: the runner could not start; install on the device that it is made for")
         say(f"{lacking}: run this on the device itself before you use the runner's unit")
+    needed = [inputs.robot, inputs.artifacts]
+    if inputs.engines is not None and inputs.engines.is_dir():
+        needed.append(inputs.engines)
+    elif inputs.engines is not None:
+        say(f"{inputs.engines}: not there yet; build it before the runner starts: edge-install engines")
+    closed = unreadable(needed)
+    for path in closed:
+        say(f"{path}: {inputs.user} cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
     contents = _contents(args, inputs, host)
     written = _write(contents, force=args.force)
     for path in contents:
@@ -121,6 +130,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         "exposure": verdict.exposure,
         "max_exposure": MAX_EXPOSURE,
         "not_checked": list(verdict.not_checked),
+        "unreadable": [str(path) for path in closed],
         "commands": commands,
     }
     write_result(args.json, result)
@@ -163,6 +173,20 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         control_priority=artifacts.runtime.control_priority,
         bridge_cores=_bridge_cores(artifacts, facts),
     )
+
+
+def unreadable(paths: Sequence[Path]) -> list[Path]:
+    """What of these files and folders, and of the way to them, only its owner or group may read."""
+    closed: list[Path] = []
+    for path in paths:
+        # What lies in a folder that the services do not see is shown to them without the way to it.
+        way = (
+            [] if units.is_hidden(path) else [folder for folder in path.parents if not folder.stat().st_mode & S_IXOTH]
+        )
+        inside = sorted(path.iterdir()) if path.is_dir() else []
+        needs = {path: S_IROTH | S_IXOTH if path.is_dir() else S_IROTH, **dict.fromkeys(inside, S_IROTH)}
+        closed += [*way, *(entry for entry, bits in needs.items() if entry.stat().st_mode & bits != bits)]
+    return list(dict.fromkeys(closed))
 
 
 def _instruction(args: argparse.Namespace) -> str:

@@ -225,7 +225,7 @@ def _cores(cores: Sequence[int]) -> list[Setting | str]:
 def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
     """What both services give up; `needed`: what they read besides Python."""
     networks = " ".join(str(network) for network in (*inputs.networks, MULTICAST))
-    hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if _is_hidden(path)})
+    hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if is_hidden(path)})
     return [
         "The robot's network and nothing else: its body is an unauthenticated peer.",
         ("IPAddressDeny", "any"),
@@ -260,7 +260,8 @@ def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | 
     ]
 
 
-def _is_hidden(path: Path) -> bool:
+def is_hidden(path: Path) -> bool:
+    """Whether a hardened service does not see it unless it is shown to it."""
     return any(path.is_relative_to(folder) for folder in HIDDEN)
 
 

@@ -15,7 +15,7 @@ from edge.artifact_files import seal
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.device_nodes import device_nodes
 from edge.install import main
-from edge.install_units import Host, robot_networks
+from edge.install_units import Host, robot_networks, unreadable
 from edge.unit_check import UnitVerdict
 from edge.unit_text import UnitError
 from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE
@@ -216,6 +216,28 @@ def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> 
     (node,) = device_nodes(("CUDAExecutionProvider",), tmp_path)
     assert node.path == Path("/dev/nvmap")
     assert node.group is not None
+
+
+def test_what_the_services_user_could_not_read_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "artifacts"
+    folder.mkdir(mode=0o755)
+    for name, mode in (("graph.onnx", 0o600), ("manifest.json", 0o644)):
+        (folder / name).touch()
+        (folder / name).chmod(mode)
+    assert unreadable([folder]) == [folder / "graph.onnx"]
+    folder.chmod(0o700)
+    assert unreadable([folder, folder]) == [folder, folder / "graph.onnx"]
+
+
+def test_the_way_to_a_file_counts_where_the_services_see_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "closed").mkdir(mode=0o700)
+    robot = tmp_path / "closed" / "robot.toml"
+    robot.touch()
+    robot.chmod(0o644)
+    monkeypatch.setattr("edge.units.HIDDEN", (str(tmp_path),))
+    assert unreadable([robot]) == []
+    monkeypatch.setattr("edge.units.HIDDEN", ())
+    assert tmp_path / "closed" in unreadable([robot])
 
 
 def test_a_processor_has_no_node(tmp_path: Path) -> None:
