@@ -12,9 +12,10 @@ import pytest
 
 from edge.geometry import SE2
 from edge.graph import CancelledError, Graph, GraphError, Interrupt
+from edge.language import LanguageModel
 from edge.manifest import Artifacts
 from edge.policy import Policy
-from edge.scheduling import TickActivity, schedule_for
+from edge.scheduling import Role, Schedule, TickActivity, schedule_for
 from edge.semantic import SemanticState
 
 HERE = SE2(0.0, 0.0, 0.0)
@@ -144,15 +145,9 @@ def test_a_graphs_own_workers_run_where_the_role_says(artifacts: Artifacts) -> N
     tasks = Path("/proc/self/task")
     before = {path.name for path in tasks.iterdir()}
     graph = Graph(artifacts, "action_expert", threads=2, cores=(core,))
-    allowed = [
-        line.split()[1]
-        for path in tasks.iterdir()
-        if path.name not in before
-        for line in (path / "status").read_text().splitlines()
-        if line.startswith("Cpus_allowed_list")
-    ]
+    workers = [int(path.name) for path in tasks.iterdir() if path.name not in before]
     assert graph.name == "action_expert"
-    assert allowed == [str(core)]
+    assert [os.sched_getaffinity(worker) for worker in workers] == [{core}]
 
 
 def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts) -> None:
@@ -166,3 +161,17 @@ def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts)
 def test_a_priority_of_zero_is_none(artifacts: Artifacts) -> None:
     runtime = dataclasses.replace(artifacts.runtime, control_priority=0)
     assert schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed={0}).control.priority is None
+
+
+def test_the_language_models_workers_are_as_patient_as_reasoning_is(artifacts: Artifacts) -> None:
+    """Else they would be as urgent as the control thread, whatever the thread that calls them is."""
+    core = min(os.sched_getaffinity(0))
+    schedule = Schedule(Role("control"), Role("reasoning", cores=(core,), niceness=17), shared=False)
+    tasks = Path("/proc/self/task")
+    before = {path.name for path in tasks.iterdir()}
+    language = LanguageModel(artifacts, threads=2, schedule=schedule)
+    workers = [int(path.name) for path in tasks.iterdir() if path.name not in before]
+    assert language.runtime is artifacts.runtime
+    assert workers
+    assert {os.getpriority(os.PRIO_PROCESS, worker) for worker in workers} == {17}
+    assert {frozenset(os.sched_getaffinity(worker)) for worker in workers} == {frozenset({core})}
