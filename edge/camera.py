@@ -38,9 +38,18 @@ class CameraPoller:
     """Asks `request(timeout_s)` for a JPEG every period, on absolute deadlines, `lead` before each control tick."""
 
     def __init__(
-        self, request: Callable[[float], bytes], *, image_px: int, period_ns: int, timeout_s: float, latency_ns: int
+        self,
+        request: Callable[[float], bytes],
+        *,
+        image_px: int,
+        period_ns: int,
+        timeout_s: float,
+        latency_ns: int,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
+        """`on_frame` is given every frame in the camera thread, after the control thread may see it."""
         self._request = request
+        self._on_frame = on_frame
         self._image_px = image_px
         self._period_ns = period_ns
         self._timeout_s = timeout_s
@@ -83,5 +92,7 @@ class CameraPoller:
             # The protocol carries no capture stamp: the answer's arrival less the camera's latency, and never before
             # the request, since both known robots sample when asked.
             stamp_ns = max(requested_ns, arrived_ns - self._latency_ns)
-            self.newest = Frame(stamp_ns, pixels, jpeg)
+            self.newest = frame = Frame(stamp_ns, pixels, jpeg)
             self.frames += 1
+            if self._on_frame is not None:
+                self._on_frame(frame)

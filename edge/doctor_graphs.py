@@ -16,6 +16,7 @@ import onnxruntime as ort
 from edge.doctor_check import Check, Level, skipped
 from edge.geometry import SE2
 from edge.graph import CPU_PROVIDER, Array, zeros
+from edge.guidance import STRAIGHT_AHEAD
 from edge.manifest import Artifacts, GraphContract
 from edge.policy import Policy
 from edge.semantic import SemanticState
@@ -134,7 +135,7 @@ def measure_ticks(artifacts: Artifacts, count: int, budget_s: float, prompt_toke
     here = SE2(0.0, 0.0, 0.0)
     frame = np.zeros((1, runtime.image_px, runtime.image_px, 3), dtype=np.uint8)
     kv = np.zeros((1, prompt_tokens, runtime.kv_dim), dtype=np.float32)
-    semantic = SemanticState(0, 0, here, 0, kv, policy.semantic_context(kv), "", None)
+    semantic = SemanticState(0, 0, here, 0, kv, policy.semantic_context(kv), "", STRAIGHT_AHEAD)
     times: list[float] = []
     deadline_ns = time.monotonic_ns() + round(budget_s * 1e9)
     for number in range(count + 2):

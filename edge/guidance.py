@@ -11,7 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.geometry import SE2
-from edge.reasoning_text import Waypoints
+from edge.reasoning_text import WAYPOINT_TIMES_S, Waypoints
+
+STRAIGHT_AHEAD: Waypoints = tuple((time_s / 2, 0.0) for time_s in WAYPOINT_TIMES_S)
+"""At 0.5 m/s: what graphs are warmed up and timed with."""
 
 
 def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:

@@ -20,6 +20,7 @@ from edge.artifact_files import (
     read_manifest_bytes,
 )
 from edge.external_data import ExternalDataError, external_data
+from edge.reasoning_text import WAYPOINT_TIMES_S
 from edge.signature import Trust
 
 LANGUAGE_WHOLE = ("language_model",)
@@ -148,6 +149,11 @@ class Artifacts:
     def language_graphs(self) -> tuple[str, ...]:
         """The language model's graphs: one, or the pair of prefill and decode."""
         return LANGUAGE_WHOLE if LANGUAGE_WHOLE[0] in self.graphs else LANGUAGE_PAIR
+
+    @property
+    def guided_by_waypoints(self) -> bool:
+        """Whether the action expert is given the waypoints that were written, instead of last-layer K‖V."""
+        return any(tensor.name == "waypoints" for tensor in self.graphs["semantic_context"].inputs)
 
     def check_unchanged(self, names: Iterable[str]) -> None:
         """Raise ArtifactError if a data file is not the one that was hashed any more."""
@@ -311,7 +317,7 @@ def check_contract(artifacts: Artifacts) -> None:
         (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
         (first, first.input("image_offset"), "int64", (1,)),
         (last, last.output("next_token"), "int64", (1, 1)),
-        (context, context.input("last_layer_kv"), "float", (1, "T", runtime.kv_dim)),
+        (context, *_guidance(artifacts)),
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),
         (action, action.input("latency"), "float", (1, 4)),
@@ -344,6 +350,14 @@ def check_contract(artifacts: Artifacts) -> None:
         raise ArtifactError(
             f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at"
         )
+
+
+def _guidance(artifacts: Artifacts) -> tuple[TensorContract, str, tuple[int | str, ...]]:
+    """What the semantic context is made from, and the form that the runner gives it in."""
+    context = artifacts.graphs["semantic_context"]
+    if artifacts.guided_by_waypoints:
+        return context.input("waypoints"), "float", (1, len(WAYPOINT_TIMES_S), 2)
+    return context.input("last_layer_kv"), "float", (1, "T", artifacts.runtime.kv_dim)
 
 
 def _form(tensor: TensorContract) -> tuple[str, tuple[int | str, ...]]:

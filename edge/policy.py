@@ -12,7 +12,8 @@ import numpy.typing as npt
 import onnxruntime as ort
 
 from edge.geometry import SE2
-from edge.graph import Graph, Interrupt, zeros
+from edge.graph import Graph, GraphError, Interrupt, zeros
+from edge.guidance import waypoints_now
 from edge.manifest import Artifacts
 from edge.scheduling import Schedule, TickActivity, run_as
 from edge.semantic import Context, SemanticState
@@ -54,7 +55,10 @@ class Policy:
         self._vision, self._action = run_as(
             control, lambda: (graph("vision_encoder", cores), graph("action_expert", cores))
         )
-        self._context = run_as(reasoning, lambda: graph("semantic_context", reasoning.cores if reasoning else ()))
+        self.guided_by_waypoints = artifacts.guided_by_waypoints
+        """The semantic context is made of the waypoints that were written, anew in every tick, instead of K‖V."""
+        role = control if self.guided_by_waypoints else reasoning
+        self._context = run_as(role, lambda: graph("semantic_context", role.cores if role else ()))
         self._activity = activity or TickActivity(artifacts.runtime.tick_period_ms * 1_000_000)
         self.tokens_shape = zeros(self._vision.contract.output("visual_tokens")).shape
         """Of one frame's visual tokens, (1, N, D)."""
@@ -85,8 +89,16 @@ class Policy:
         return tokens
 
     def semantic_context(self, last_layer_kv: FloatArray, interrupt: Interrupt | None = None) -> Context:
-        """K‖V [1, T, kv_dim] → keys and values for every layer (once a generation, reasoning thread)."""
-        outputs = self._context.run({"last_layer_kv": last_layer_kv}, interrupt=interrupt)
+        """K‖V [1, T, kv_dim] → keys and values for every layer (once a generation, reasoning thread).
+
+        Empty for a policy that is guided by waypoints.
+        """
+        if self.guided_by_waypoints:
+            return {}
+        return self._make_context({"last_layer_kv": last_layer_kv}, interrupt)
+
+    def _make_context(self, feeds: Context, interrupt: Interrupt | None = None) -> Context:
+        outputs = self._context.run(feeds, interrupt=interrupt)
         return dict(zip(self._context.output_names, outputs, strict=True))
 
     def act(
@@ -97,11 +109,16 @@ class Policy:
         offset: SE2,
         semantic: SemanticState,
     ) -> FloatArray:
-        """Planned trajectory [steps, 3] in the current robot frame (every tick, control thread)."""
-        if semantic.context is not self._bound:
-            for name, tensor in semantic.context.items():
+        """Planned trajectory [steps, 3] in the current robot frame (every tick, control thread); raises GraphError."""
+        context = semantic.context
+        if self.guided_by_waypoints:
+            if semantic.waypoints is None:
+                raise GraphError("the semantic state has no waypoints to be guided by")
+            context = self._make_context({"waypoints": waypoints_now(semantic.waypoints, offset)})
+        if context is not self._bound:
+            for name, tensor in context.items():
                 self._acting.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(tensor))
-            self._bound = semantic.context
+            self._bound = context
         self._state[0] = state
         self._latency[0] = delay_s, offset.x_m, offset.y_m, offset.theta_rad
         # Bound anew in every call: an accelerator's provider copies an input at the moment it is bound.

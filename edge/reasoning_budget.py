@@ -1,4 +1,4 @@
-"""How much the reasoning thread may think: set by the power governor, read by the reasoning loop before a generation."""
+"""How much the reasoning thread may think: set by the power governor, read before a generation."""
 
 from __future__ import annotations
 

@@ -28,7 +28,10 @@ FRAME_POLL_S = 0.002
 """How often a generation whose older frames are prefilled looks for its newest."""
 SYNC_DRIVE_S = 0.5
 """Paper, appendix D, synchronous inference: how long one generation is driven by."""
+PREFIXES = 3
+"""How many generations it is remembered of how long their older frames took."""
 RETRY_S = 0.5
+"""Rest after a failed generation."""
 FAILURES = 5
 FAILURE_WINDOW_S = 60.0
 """Fault matrix row 18: so many failures within this time end reasoning until the next start."""
@@ -49,6 +52,10 @@ class Mode(Enum):
 
 class NotFiniteError(RuntimeError):
     """Keys and values of a generation that hold a NaN or an infinity."""
+
+
+class NoGuidanceError(RuntimeError):
+    """A text without waypoints, for a policy that is guided by nothing else."""
 
 
 class MissedFrameError(RuntimeError):
@@ -123,7 +130,7 @@ class ReasoningLoop:
         self._last_anchor_ns = -1
         self._finished_ns: int | None = None
         self._retry_ns = 0
-        self._prefix_ns = 0
+        self._prefixes_ns: deque[int] = deque(maxlen=PREFIXES)
         self._context_ns = 0
         self._failures: deque[int] = deque(maxlen=FAILURES)
         if self._sync:
@@ -195,6 +202,9 @@ class ReasoningLoop:
             self.cancelled += not self._stop.is_set()
         except MissedFrameError:
             self.missed_frames += 1
+        except NoGuidanceError:
+            # The state before goes on growing old; the control thread slows down by its age.
+            pass
         except (GraphError, ContextOverflowError, NotFiniteError) as error:
             self._fail(str(error))
         finally:
@@ -292,7 +302,8 @@ class ReasoningLoop:
         begun_ns = self._ring.newest_ns
         if begun_ns is None:
             raise MissedFrameError
-        plan = Anchor.after(begun_ns, self._prefix_ns) if self._late_anchor else Anchor.now(begun_ns)
+        # The shortest of late: expecting too little moves the frame by less than its tolerance, too much is waited for.
+        plan = Anchor.after(begun_ns, min(self._prefixes_ns, default=0)) if self._late_anchor else Anchor.now(begun_ns)
         frames: list[EncodedFrame] = []
         started_ns = self._clock()
         for offset_s in self._offsets_s:
@@ -304,7 +315,7 @@ class ReasoningLoop:
                 continue
             frames.append(frame)
             run.feed([self._language.prompt.frame(len(frames), frame, job.instruction)])
-        self._prefix_ns = self._clock() - started_ns
+        self._prefixes_ns.append(self._clock() - started_ns)
         while True:
             newest_ns = self._ring.newest_ns
             stamp_ns = None if newest_ns is None else plan.choose(newest_ns)
@@ -325,6 +336,11 @@ class ReasoningLoop:
 
     def _publish(self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool) -> SemanticState:
         waypoints = parse_waypoints(generation.text)
+        if complete:
+            self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
+            self.invalid_texts += waypoints is None
+        if waypoints is None and self._policy.guided_by_waypoints:
+            raise NoGuidanceError
         ready_ns = self._clock()
         state = SemanticState(
             generation=self.generations,
@@ -341,8 +357,5 @@ class ReasoningLoop:
         self._slot.state = state
         if self._sync:
             self._slot.drive_until_ns = ready_ns + round(SYNC_DRIVE_S * 1e9)
-        if complete:
-            self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
-            self.invalid_texts += waypoints is None
         self.generations += 1
         return state

@@ -24,9 +24,13 @@ from edge.cli import (
     write_result,
 )
 from edge.manifest import load_artifacts
+from edge.odometry_calibration import CalibrationError
 from edge.prompt import InstructionError, check_instruction
+from edge.reasoning_loop import Mode
+from edge.recording import parts
 from edge.release import ReleaseDelayError, parse_release_delay
 from edge.session import RefusedError, RunOptions, RunSession, StoppedEarlyError
+from edge.signature import STATE_DIRECTORY, KeyFileError, Trust
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.unitree.dds import DdsError
@@ -53,7 +57,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
     p.add_argument("--robot", type=Path, required=True, metavar="FILE.toml", help="the robot and its limits")
     p.add_argument("--instruction", required=True, metavar="TEXT", help="what the robot is to do, in plain words")
-    p.add_argument("--mode", choices=["async", "no-reasoning"], default="async", help="no-reasoning: prefill only")
+    p.add_argument(
+        "--mode",
+        choices=[mode.value for mode in Mode],
+        default=Mode.ASYNC.value,
+        help="sync: halt to think, then drive 0.5 s; no-reasoning: prefill only (default: async)",
+    )
     p.add_argument("--duration", type=float, metavar="S", help="drive for this long (default: until a signal)")
     p.add_argument(
         "--release-delay",
@@ -63,6 +72,19 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--engines", type=Path, metavar="DIR", help="engines built by edge-install (default: ARTIFACTS.engines)"
+    )
+    p.add_argument(
+        "--trust",
+        type=Path,
+        metavar="KEY.pub",
+        help="drive only artifacts signed with this key (python -m edge.signature)",
+    )
+    p.add_argument(
+        "--state",
+        type=Path,
+        default=STATE_DIRECTORY,
+        metavar="DIR",
+        help="where the newest release that was trusted is remembered (default: %(default)s)",
     )
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
@@ -82,14 +104,15 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
         raise ConfigError(f"--duration {args.duration}: expected a positive number of seconds")
     check_result_target(args.json)
     if args.record is not None:
-        if args.record.exists():
-            raise ConfigError(f"--record {args.record}: exists; a flight log is never overwritten, name another file")
+        there = [part for part in parts(args.record) if part.exists()]
+        if there:
+            raise ConfigError(f"--record {there[0]}: exists; a flight log is never overwritten, name another file")
         if not args.record.parent.is_dir():
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     options = RunOptions(
         instruction=check_instruction(args.instruction),
-        reasoning=args.mode == "async",
+        mode=Mode(args.mode),
         duration_s=args.duration,
         release_delay=parse_release_delay(args.release_delay),
         record=args.record,
@@ -112,14 +135,15 @@ def main(argv: list[str] | None = None) -> int:
 
     try:
         robot, options = _read(args)
-        artifacts = load_artifacts(args.artifacts.absolute())
+        trust = None if args.trust is None else Trust(args.trust, args.state / "release.json")
+        artifacts = load_artifacts(args.artifacts.absolute(), trust)
         if engines.needed(artifacts):
             # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
             folder = args.engines or engines.default_directory(artifacts.directory)
             engines.check(artifacts, folder)
             artifacts = engines.with_engines(artifacts, folder)
         session = RunSession(artifacts, robot, options, _say)
-    except (ConfigError, InstructionError, ReleaseDelayError) as error:
+    except (ConfigError, InstructionError, ReleaseDelayError, KeyFileError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
     except (ArtifactError, engines.EngineError) as error:
@@ -141,7 +165,10 @@ def main(argv: list[str] | None = None) -> int:
     except StoppedEarlyError as error:
         _say(str(error))
         return EXIT_INTERRUPTED if signal.SIGINT in received else EXIT_DONE
-    except (RefusedError, BridgeUnavailable, DdsError) as error:
+    except CalibrationError as error:
+        _say(str(error))
+        return EXIT_BAD_INPUT
+    except (RefusedError, ArtifactError, BridgeUnavailable, DdsError) as error:
         _say(str(error))
         return EXIT_REFUSED
     for fault in result["faults"]:

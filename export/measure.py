@@ -22,6 +22,7 @@ from edge.artifact_files import ArtifactError, read_manifest
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
 from edge.device import read_device
 from edge.geometry import SE2
+from edge.guidance import STRAIGHT_AHEAD
 from edge.language import Generation, LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
@@ -64,7 +65,7 @@ def _samples(artifacts: Artifacts, repeats: int) -> dict[str, Any]:
 
     generation = generate()
     context = policy.semantic_context(generation.last_layer_kv)
-    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, generation.text, None)
+    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, generation.text, STRAIGHT_AHEAD)
     generations = [generate() for _ in range(max(3, repeats // 2))]
     return {
         "vision_encoder": _timed(lambda: policy.encode(image), repeats),

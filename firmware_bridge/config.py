@@ -133,14 +133,32 @@ class CameraConfig(_Section):
 
 
 @dataclass(frozen=True)
+class MountConfig(_Section):
+    """How the front camera is mounted: horizontal field of view, lens above the floor and ahead of the base while the
+    robot stands, and how far it looks down. Visual odometry needs it.
+    """
+
+    hfov_deg: float = _within(20, 160)
+    height_m: float = _within(0.05, 3)
+    pitch_deg: float = _within(-45, 80)
+    forward_m: float = _within(-2, 2)
+
+
+@dataclass(frozen=True)
 class OdometryConfig(_Section):
-    """Frame of the robot's velocity report, and the age from which its pose is too old to drive by."""
+    """Frame of the robot's velocity report, and the age from which its pose is too old to drive by.
+
+    `calibration`: absolute path of what `edge-calib odometry` has written for this robot.
+    """
 
     velocity_frame: str
     max_age_ms: int = _within(20, 2000)
+    calibration: Path | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        file_ok = self.calibration is None or self.calibration.is_absolute()
+        _require(file_ok, f"odometry.calibration: expected an absolute path, found {self.calibration}")
         frame_ok = self.velocity_frame in VELOCITY_FRAMES
         _require(frame_ok, f'odometry.velocity_frame: expected "odom" or "body", found {self.velocity_frame!r}')
 
@@ -157,6 +175,7 @@ class RobotConfig:
     camera: CameraConfig
     odometry: OdometryConfig
     safety: SafetyConfig = SafetyConfig()
+    mount: MountConfig | None = None
 
     def __post_init__(self) -> None:
         _require(self.protocol in PROTOCOLS, f"protocol: expected one of {PROTOCOLS}, found {self.protocol!r}")

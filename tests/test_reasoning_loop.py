@@ -79,6 +79,8 @@ class FakeLanguage:
 
 
 class FakePolicy:
+    guided_by_waypoints = False
+
     def semantic_context(self, last_layer_kv: np.ndarray, interrupt: Interrupt) -> dict[str, np.ndarray]:
         return {"context.0.key": last_layer_kv + 1, "context.0.value": last_layer_kv + 2}
 
@@ -311,6 +313,23 @@ def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
         bench.frame(10.4)
         bench.wait_for(lambda: bench.loop.generations == 2)
         assert bench.language.prompts[1][-1] == pytest.approx(10.4)
+
+
+def test_one_slow_prefill_does_not_make_the_next_generation_wait(bench: Bench, clock: Clock) -> None:
+    for tenth in range(960, 1010):
+        bench.frame(tenth / 10)
+    for took_s in (0.2, 0.2, 0.2, 1.5, 0.2):
+
+        def prefill(took_s: float = took_s) -> None:
+            for _ in range(round(took_s * 10)):
+                clock.s += 0.1
+                bench.frame(clock.s)
+
+        clock.s += 0.1
+        bench.frame(clock.s)
+        bench.language.during_feed = prefill
+        assert bench.loop.step()
+    assert bench.loop.late_anchor_ms.newest == pytest.approx(200.0)
 
 
 def test_when_prefill_takes_far_longer_than_planned_the_spacing_is_kept(bench: Bench, clock: Clock) -> None:

@@ -1,0 +1,84 @@
+"""The power side of a run: the target's meter, its governor, and what the program tells them it is doing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edge.findings import Finding
+from edge.manifest import Artifacts
+from edge.power.battery import ReadBattery
+from edge.power.governor import Governor, GovernorConfig
+from edge.power.meter import MeterError, PowerMeter
+from edge.power.monitor import Activity, PowerMonitor
+from edge.power.overcurrent import OverCurrentEvents
+from edge.power.plan import PowerModel, PowerPlan, read_power_plan
+from edge.power.select import open_meter
+from edge.power.sysfs import SYSFS
+from edge.power.thermal import ThermalReader
+
+
+def make_power_monitor(
+    artifacts: Artifacts,
+    *,
+    activity: Callable[[], Activity],
+    new_tokens: Callable[[], int],
+    battery: ReadBattery,
+    on_sample: Callable[[int, dict[str, Any]], object],
+    on_findings: Callable[[tuple[Finding, ...]], object],
+    say: Callable[[str], object],
+    sysfs_root: Path = SYSFS,
+) -> PowerMonitor:
+    """The monitor of a target's power plan; raises ArtifactError.
+
+    Without the meter that the target names, its model stands in and the operator is told. `new_tokens`: generated so
+    far, for that model.
+    """
+    plan = read_power_plan(artifacts)
+    meter = _meter(plan, lambda: _energy_j(plan.model, activity(), new_tokens()), battery, say, sysfs_root)
+    config = GovernorConfig(
+        budget_w=plan.budget_w,
+        max_new_tokens=plan.max_new_tokens,
+        max_delay_s=plan.max_delay_s,
+        model=plan.model,
+    )
+    return PowerMonitor(
+        meter,
+        Governor(config),
+        activity=activity,
+        thermal=ThermalReader(sysfs_root),
+        battery=battery,
+        over_current=OverCurrentEvents(sysfs_root),
+        on_sample=on_sample,
+        on_findings=on_findings,
+        say=say,
+    )
+
+
+def _meter(
+    plan: PowerPlan,
+    energy_j: Callable[[], float],
+    battery: ReadBattery,
+    say: Callable[[str], object],
+    sysfs_root: Path,
+) -> PowerMeter | None:
+    if plan.meter == "none":
+        return None
+    idle_w = None if plan.model is None else plan.model.idle_w
+    try:
+        return open_meter(
+            plan.meter, sysfs_root=sysfs_root, rail=plan.rail, idle_w=idle_w, energy_j=energy_j, battery=battery
+        )
+    except MeterError as error:
+        instead = "nothing stands in for it" if idle_w is None else "the plan's model stands in for it"
+        say(f"power: {error}; {instead}")
+        return None if idle_w is None else open_meter("modelled", idle_w=idle_w, energy_j=energy_j)
+
+
+def _energy_j(model: PowerModel | None, activity: Activity, new_tokens: int) -> float:
+    """Modelled energy above idle of all that has run."""
+    if model is None:
+        return 0.0
+    ticks = activity.ticks * (model.encode_j + model.act_j)
+    return ticks + (activity.generations or 0) * model.generation_j(0) + new_tokens * model.token_j

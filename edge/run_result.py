@@ -1,0 +1,77 @@
+"""The result of a run as JSON values (design §9: other tools rely on these keys)."""
+
+from __future__ import annotations
+
+import math
+import resource
+from typing import Any
+
+from edge.control_loop import ControlLoop
+from edge.reasoning_loop import ReasoningLoop
+from edge.robot_inputs import RobotInputs
+from edge.stats import percentiles
+from firmware_bridge.client import BridgeStatus
+
+
+def run_result(
+    control: ControlLoop,
+    reasoning: ReasoningLoop,
+    inputs: RobotInputs,
+    status: BridgeStatus | None,
+    *,
+    power_w: dict[str, Any],
+    faults: list[str],
+    duration_s: float,
+) -> dict[str, Any]:
+    """What happened; `faults` are lines for the operator, each of which ended the run."""
+    ticks = control.statistics
+    return {
+        "control": {
+            "ticks": ticks.ticks,
+            "missed": ticks.missed,
+            "tick_ms": percentiles(ticks.tick_ms, "p50", "p99", "p999", "max"),
+            "unsent": ticks.unsent,
+            "reasons": ticks.reasons,
+            "faults": ticks.faults,
+            "state": control.supervision.state.value,
+        },
+        "reasoning": {
+            "generations": reasoning.generations,
+            "failed": reasoning.failed,
+            "cancelled": reasoning.cancelled,
+            "missed_frames": reasoning.missed_frames,
+            "invalid_texts": reasoning.invalid_texts,
+            "generation_ms": percentiles(reasoning.generation_ms, "p50", "p99", "max"),
+            "anchor_to_ready_ms": percentiles(reasoning.anchor_to_ready_ms, "p50", "p99", "max"),
+            "late_anchor_ms": percentiles(reasoning.late_anchor_ms, "p50", "p99", "max"),
+        },
+        "delay_s": percentiles(ticks.delay_s, "p50", "p99", "max"),
+        "delay_error_ms": percentiles(ticks.delay_error_ms, "max"),
+        "camera": {"frames": inputs.camera.frames, "failures": inputs.camera.failures},
+        "odometry": _odometry(inputs),
+        "power_w": power_w,
+        "bridge": {
+            "commands": status.commands if status is not None else None,
+            "last_command": list(status.last_command) if status is not None else None,
+            "zero_after_stop": status.zero_after_stop if status is not None else False,
+        },
+        "faults": faults,
+        "duration_s": duration_s,
+        "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "tagged": "measured",
+    }
+
+
+def _odometry(inputs: RobotInputs) -> dict[str, Any]:
+    estimator, newest = inputs.estimator, inputs.odometry
+    drift = None if newest is None else newest.drift
+    rad_per_m = None if drift is None else drift.rad_per_m
+    return {
+        "reports": inputs.states,
+        "rejected": estimator.rejected,
+        "visual_used": estimator.visual_used,
+        "visual_rejected": estimator.visual_rejected,
+        "drift_m_per_m": None if drift is None else drift.m_per_m,
+        "drift_deg_per_m": None if rad_per_m is None else math.degrees(rad_per_m),
+        "driven_m": 0.0 if drift is None else drift.distance_m,
+    }
