@@ -90,8 +90,10 @@ class CameraPoller:
                 self.last_error = str(error)
                 continue
             # The protocol carries no capture stamp: the answer's arrival less the camera's latency, and never before
-            # the request, since both known robots sample when asked.
-            stamp_ns = max(requested_ns, arrived_ns - self._latency_ns)
+            # the request, since both known robots sample when asked. Of an answer that took much longer nobody knows
+            # when it was captured: as long ago as it can have been.
+            slow = arrived_ns - requested_ns > self._latency_ns + self._period_ns
+            stamp_ns = requested_ns if slow else max(requested_ns, arrived_ns - self._latency_ns)
             self.newest = frame = Frame(stamp_ns, pixels, jpeg)
             self.frames += 1
             if self._on_frame is not None:

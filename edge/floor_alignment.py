@@ -8,7 +8,7 @@ pass for motion. Tukey's weights keep out what is not floor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from edge.camera_geometry import Array, Attitude, FloorProjector, seen_from
 
 Picture = npt.NDArray[np.float32]
-_STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4))
+_STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4))
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class AlignmentConfig:
     attitude_sigma_rad: float = math.radians(0.15)
     height_sigma: float = 0.01
     """Relative error of the height between two frames."""
+    tilt_sigma_rad: float = math.radians(0.1)
+    """What one pair of pictures may say about the camera's angle to the floor."""
     grey_sigma: float = 1.5
     """Of a pixel of a smoothed picture, at least."""
     smooth_px: float = 1.0
@@ -59,12 +61,18 @@ class AlignmentConfig:
 
 @dataclass(frozen=True)
 class Solution:
-    """The six unknowns, the covariance [3, 3] of x, y and θ, how many measurements agreed and their share of all."""
+    """The unknowns, the covariance [3, 3] of x, y and θ, how many measurements agreed and their share of all.
+
+    By the pictures there is a seventh unknown, the tilt of the camera in both: `tilt_rad` is what they say of it on
+    their own, `tilt_sigma_rad` its standard error.
+    """
 
     unknowns: Array
     covariance: Array
     inliers: int
     share: float
+    tilt_rad: float = 0.0
+    tilt_sigma_rad: float = math.inf
 
 
 def smooth(grey: npt.NDArray[np.uint8], config: AlignmentConfig) -> Picture:
@@ -119,16 +127,27 @@ def align_pictures(
     wanted = key[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     # Half of the next and half of the previous pixel: the derivative of the picture that is sampled linearly below.
     slope = (cv2.Sobel(now, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(now, cv2.CV_32F, 0, 1, scale=1 / 8))
-    q, normal = start.copy(), np.eye(6)
+    q, normal = np.append(start, 0.0), np.eye(7)
+    prior = np.append(config.prior, 1 / config.tilt_sigma_rad**2) * config.correlation
+    chosen = pixels.astype(np.float64)
     height, width = now.shape
     weight = np.zeros(0)
-    rows = np.zeros((len(points), 6))
+    rows = np.zeros((len(points), 7))
+
+    def reprojected(unknowns: Array) -> Array:
+        tilted = replace(key_attitude, pitch_rad=key_attitude.pitch_rad + float(unknowns[6]))
+        points, _ = projector.floor_points(chosen, tilted)
+        return _project(
+            projector, points, replace(attitude, pitch_rad=attitude.pitch_rad + float(unknowns[6])), unknowns
+        )
+
     for iteration in range(10):
         # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
         if iteration in (0, 2):
-            at, jacobian = _pixels_of(projector, points, attitude, q)
+            at = reprojected(q)
+            jacobian = np.stack([(reprojected(q + step) - at) / step.sum() for step in np.diag(_STEPS)], axis=-1)
         else:
-            at = _project(projector, points, attitude, q)
+            at = reprojected(q)
         inside = (at[:, 0] > 2) & (at[:, 0] < width - 3) & (at[:, 1] > 2) & (at[:, 1] < height - 3)
         if np.count_nonzero(inside) < config.min_points:
             return None
@@ -142,23 +161,32 @@ def align_pictures(
             slopes[inside] = np.stack([_sampled(picture, spots) for picture in slope], axis=1)
             rows = (slopes[:, None, :] @ jacobian)[:, 0, :]
         weighted = rows[inside] * (weight / sigma**2)[:, None]
-        normal = weighted.T @ rows[inside] + np.diag(config.prior * config.correlation)
-        step = _solve(normal, weighted.T @ r + config.prior * config.correlation * q)
+        normal = weighted.T @ rows[inside] + np.diag(prior)
+        step = _solve(normal, weighted.T @ r + prior * q)
         if step is None:
             return None
         q = q + step
         if iteration >= 2 and np.abs(step[:3]).max() < 1e-4:
             break
     inliers = int(np.count_nonzero(weight > 0.05))
-    covariance = config.correlation * np.linalg.inv(normal)[:3, :3]
-    return Solution(q, covariance, inliers, inliers / len(weight))
+    covariance = config.correlation * np.linalg.inv(normal)
+    # Take the prior out again: whoever adds up many such answers must not count it many times.
+    told = 1.0 - float(covariance[6, 6]) / config.tilt_sigma_rad**2
+    tilt_rad, tilt_sigma_rad = 0.0, math.inf
+    if told > 0.02:
+        tilt_rad, tilt_sigma_rad = float(q[6]) / told, config.tilt_sigma_rad * math.sqrt((1 - told) / told)
+    return Solution(q, covariance[:3, :3], inliers, inliers / len(weight), tilt_rad, tilt_sigma_rad)
 
 
 def _pixels_of(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> tuple[Array, Array]:
     """Where floor points of the earlier frame are seen in the later one, [n, 2], and derivatives [n, 2, 6]."""
     at = _project(projector, points, attitude, q)
-    steps = [(_project(projector, points, attitude, q + step) - at) / step.sum() for step in np.diag(_STEPS)]
+    steps = [(_project(projector, points, attitude, q + step) - at) / step.sum() for step in np.diag(_STEPS)[:6, :6]]
     return at, np.stack(steps, axis=-1)
+
+
+def _tilted(attitude: Attitude, tilt_rad: float) -> Attitude:
+    return replace(attitude, pitch_rad=attitude.pitch_rad + tilt_rad)
 
 
 def _project(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> Array:

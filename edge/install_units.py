@@ -104,7 +104,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         if args.system:
             raise ArtifactError(f"{lacking}: the runner could not start; install on the device that it is made for")
         say(f"{lacking}: run this on the device itself before you use the runner's unit")
-    needed = [inputs.robot, inputs.artifacts]
+    # An emergency stop's input may appear at start-up only; a calibration that is not there is refused here.
+    needed = [inputs.robot, inputs.artifacts, *(path for path in inputs.robot_files if not path.is_relative_to("/sys"))]
     if inputs.engines is not None and inputs.engines.is_dir():
         needed.append(inputs.engines)
     elif inputs.engines is not None:
@@ -160,6 +161,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         programs=host.programs,
         prefixes=host.prefixes,
         robot=args.robot.resolve(),
+        robot_files=tuple(path for path in (robot.odometry.calibration, robot.safety.estop_file) if path is not None),
         artifacts=artifacts.directory,
         engines=folder,
         instruction=check_instruction(_instruction(args)),

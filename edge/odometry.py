@@ -33,12 +33,12 @@ __all__ = ["DriftConfig", "DriftEstimator", "OdometryInputs", "OdometryOutputs"]
 class DriftConfig:
     """How far each source is trusted, and how much of the past is kept."""
 
-    gyro_noise_radps_rthz: float = math.radians(0.05)
-    """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes it."""
+    gyro_noise_radps_rthz: float = math.radians(0.08)
+    """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
     gyro_bias_walk_radps_rts: float = math.radians(0.002)
     scale_walk_rtm: float = 0.005
     """Change of the odometry's scales per square root of a metre."""
-    visual_scale_sigma: float = 0.005
+    visual_scale_sigma: float = 0.008
     """Error that all visual motions share: of the camera's height and mounting angle."""
     visual_gate: float = 25.0
     """Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""

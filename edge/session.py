@@ -266,6 +266,7 @@ class RunSession:
                     findings=inputs.findings,
                     attitude=inputs.reader.state,
                     states=lambda: inputs.states,
+                    malformed=lambda: inputs.reader.malformed,
                     failed_generations=lambda: reasoning.failed,
                 ),
             ),

@@ -48,6 +48,8 @@ class ServiceInputs:
     prefixes: tuple[Path, ...]
     """Folders that Python itself and its packages are read from."""
     robot: Path
+    robot_files: tuple[Path, ...]
+    """Files that the robot file names."""
     artifacts: Path
     engines: Path | None
     instruction: str
@@ -120,7 +122,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("RuntimeDirectory", SOCKET.parent.name),
         ("RuntimeDirectoryMode", "0700"),
         ("RuntimeDirectoryPreserve", "restart"),
-        *_hardening(inputs, (inputs.robot,)),
+        *_hardening(inputs, (inputs.robot, *inputs.robot_files)),
         ("PrivateDevices", "yes"),
         ("ProcSubset", "pid"),
         ("PrivateUsers", "yes"),
@@ -144,7 +146,12 @@ def runner_unit(inputs: ServiceInputs) -> str:
     # One word with its text, so that a text that begins with a dash is no option.
     command.append(argument(f"--instruction={inputs.instruction}"))
     command += [argument("--record"), FLIGHT_LOG]
-    needed = (inputs.robot, inputs.artifacts, *(() if inputs.engines is None else (inputs.engines,)))
+    needed = (
+        inputs.robot,
+        *inputs.robot_files,
+        inputs.artifacts,
+        *(() if inputs.engines is None else (inputs.engines,)),
+    )
     service: list[Setting | str] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),

@@ -42,6 +42,13 @@ class VisualConfig:
     min_brightness: float = 12.0
     """Mean grey value, 0..255."""
     hypotheses: int = 64
+    tilt_sigma_rad: float = math.radians(0.2)
+    """Error of the camera's angle to the floor: mounting, lens centre and the robot's own attitude together."""
+    tilt_caution: float = 2.0
+    """One answer about it errs by this much more than its pixels say: their errors are alike from frame to frame."""
+    tilt_floor_rad: float = math.radians(0.03)
+    """It is never known better than this, and so goes on being learned."""
+    max_tilt_rad: float = math.radians(1.0)
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
 
     def __post_init__(self) -> None:
@@ -50,7 +57,8 @@ class VisualConfig:
                              f"{self.min_corners} and {self.max_corners}")  # fmt: skip
         positive = (
             self.min_depression_rad, self.keyframe_distance_m, self.keyframe_turn_rad, self.keyframe_age_ns,
-            self.max_gap_ns, self.hypotheses,
+            self.max_gap_ns, self.hypotheses, self.tilt_sigma_rad, self.tilt_caution, self.tilt_floor_rad,
+            self.max_tilt_rad,
         )  # fmt: skip
         if not all(math.isfinite(v) and v > 0 for v in positive) or not 0 < self.min_inlier_share <= 1:
             raise ValueError(f"visual odometry: expected positive settings, found {self}")
@@ -120,6 +128,9 @@ class VisualOdometry:
         self._key: _Keyframe | None = None
         self._tracked: Array = np.zeros((0, 2))
         self._rng = np.random.default_rng(0)
+        self.tilt_rad = 0.0
+        """How much further down than told the camera looks, as learned so far."""
+        self._tilt_variance = self._config.tilt_sigma_rad**2
         self.refused = 0
         """Frames on which the floor could not be followed any more."""
 
@@ -138,6 +149,7 @@ class VisualOdometry:
             self._projector = FloorProjector(self._geometry, grey.shape[1], grey.shape[0])
             self._key = None
         assert self._projector is not None
+        attitude = replace(attitude, pitch_rad=attitude.pitch_rad + self.tilt_rad)
         motion: VisualMotion | None = None
         restart = True
         if self._key is not None and stamp_ns - self._previous_ns <= self._config.max_gap_ns and self._follow(grey):
@@ -171,16 +183,32 @@ class VisualOdometry:
         config = self._config.alignment
         now = smooth(grey, config)
         aligned = align_pictures(
-            projector, key.picture, key.attitude, now, attitude, solved.unknowns, key.floor, config
+            projector,
+            key.picture,
+            key.attitude,
+            now,
+            attitude,
+            solved.unknowns,
+            key.floor,
+            config,
         )
         if aligned is not None and aligned.share >= config.min_share:
             apart = np.abs(aligned.unknowns[:3] - solved.unknowns[:3])
             if apart[:2].max() < config.settle_m and apart[2] < config.settle_rad:
                 solved = aligned
+                self._learn_tilt(aligned)
         x, y, theta = (float(v) for v in solved.unknowns[:3])
         c = [float(v) for v in solved.covariance.ravel()]
         covariance: Covariance = (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
         return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
+
+    def _learn_tilt(self, aligned: Solution) -> None:
+        """What near and far floor agree on best is how the camera really looks down: mounting, attitude and lens."""
+        config = self._config
+        gain = self._tilt_variance / (self._tilt_variance + (config.tilt_caution * aligned.tilt_sigma_rad) ** 2)
+        learned = self.tilt_rad + gain * aligned.tilt_rad
+        self.tilt_rad = min(max(learned, -config.max_tilt_rad), config.max_tilt_rad)
+        self._tilt_variance = max((1.0 - gain) * self._tilt_variance, config.tilt_floor_rad**2)
 
     def _set_keyframe(self, projector: FloorProjector, grey: Grey, stamp_ns: int, attitude: Attitude) -> None:
         self._key, self._tracked = None, np.zeros((0, 2))

@@ -27,6 +27,7 @@ def inputs(**changes: object) -> ServiceInputs:
         programs=Path("/opt/tic-vla/bin"),
         prefixes=(Path("/opt/tic-vla"), Path("/usr")),
         robot=Path("/etc/tic-vla/go2.toml"),
+        robot_files=(),
         artifacts=Path("/opt/tic-vla/orin"),
         engines=None,
         instruction="walk to the vending machine",
@@ -185,6 +186,12 @@ def test_what_lies_in_a_home_folder_is_shown_and_nothing_else() -> None:
     assert found["ProtectHome"] == ["tmpfs"]
     assert read_words(found["BindReadOnlyPaths"][0], variables=False) == ["/home/me/100%", "/home/me/tic vla/.venv"]
     assert settings(runner_unit(inputs()))["ProtectHome"] == ["yes"]
+
+
+def test_what_the_robot_file_names_is_shown_to_both() -> None:
+    for unit in (bridge_unit, runner_unit):
+        found = settings(unit(inputs(robot_files=(Path("/home/me/odometry.json"),))))
+        assert read_words(found["BindReadOnlyPaths"][0], variables=False) == ["/home/me/odometry.json"]
 
 
 def test_a_processor_needs_no_device_and_no_new_code() -> None:

@@ -114,6 +114,7 @@ class Governor:
         self._estimate = LevelEstimator(start)
         self._times = GenerationTimes(OFF)
         self._history = PowerHistory(config.window_s)
+        self._shares = PowerHistory(config.window_s)
         self._limits = HeatAndBattery(config.limits, OFF)
         self._level = 0
         self._applied = 0
@@ -185,6 +186,7 @@ class Governor:
             missed = inputs.generations > last.generations and inputs.reasoning_s > last.reasoning_s
             if ended or missed:
                 self._ended_ns = now_ns
+            self._shares.add(last_ns, share)
         self._times.update(inputs.generations, inputs.reasoning_s, self._cap)
         if not inputs.reasoning:
             self._cap = self._applied  # what the next generation starts with
@@ -235,14 +237,17 @@ class Governor:
         if levels.at(1.0) <= aim_w or mean_s is None:
             return 0.0
         generation_s = max(longest or 0.0, mean_s)
-        before_j = self._history.energy_since(now_ns)
+        metered_j, busy_s = self._history.energy_since(now_ns), self._shares.energy_since(now_ns)
         window_s = self._config.window_s
         ended_ns = now_ns if inputs.reasoning or self._ended_ns is None else self._ended_ns
 
         def fits(wait_s: float) -> bool:
             end_ns = now_ns + round((wait_s + generation_s) * 1e9)
             rest_s = min(wait_s, max(0.0, window_s - generation_s))
-            spent_j = before_j(min(now_ns, end_ns - round(window_s * 1e9)))
+            since_ns = min(now_ns, end_ns - round(window_s * 1e9))
+            # Whichever is more: a meter that averages shows the end of a generation late.
+            known_j = levels.base_w * (now_ns - since_ns) / 1e9 + levels.rise_w * busy_s(since_ns)
+            spent_j = max(metered_j(since_ns), known_j)
             busy_j = levels.at(1.0) * min(generation_s, window_s)
             return spent_j + levels.base_w * rest_s + busy_j <= aim_w * window_s
 

@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+SMOOTH_S = 1.0
 LEARN_S = 4.0
 """Time constant: a few times the period of the samples, shorter than a generation."""
 
@@ -29,6 +30,7 @@ class LevelEstimator:
         self._start = start
         self._base_w: float | None = None if start is None else start.base_w
         self._rise_w: float | None = None if start is None else start.rise_w
+        self._smooth: tuple[float, float] | None = None
 
     @property
     def levels(self) -> Levels | None:
@@ -39,6 +41,12 @@ class LevelEstimator:
         """A sample during which reasoning ran `share` (0 to 1) of the time."""
         if self._base_w is None:
             self._base_w = power_w
+        if self._smooth is not None:
+            # A meter that averages over a second is late; as late as this, what ran is compared with what it shows.
+            keep = math.exp(-dt_s / SMOOTH_S)
+            power_w += (self._smooth[0] - power_w) * keep
+            share += (self._smooth[1] - share) * keep
+        self._smooth = (power_w, share)
         if self._rise_w is None:
             if share < 0.5:
                 self._base_w += (power_w - self._base_w) * (1 - math.exp(-dt_s / LEARN_S))
@@ -48,7 +56,7 @@ class LevelEstimator:
         error = power_w - (self._base_w * (1 - share) + busy_w * share)
         step = error * (1 - math.exp(-dt_s / LEARN_S)) / ((1 - share) ** 2 + share**2)
         busy_w += step * share
-        if share == 0.0:
+        if share < 0.02:
             busy_w += step  # what changes without reasoning changes under it too
         self._base_w += step * (1 - share)
         self._rise_w = max(0.0, busy_w - self._base_w)
