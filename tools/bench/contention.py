@@ -1,0 +1,199 @@
+"""What the reasoning thread costs the control thread: one long drive in which the VLM is on and off in turn.
+
+    python -m tools.bench.contention --artifacts out/demo/artifacts --duration 600 --json out/bench/contention.json
+
+Real processes on loopback: edge-hil, edge-bridge and the runner, whose reasoning budget alone is replaced: allowed for
+a block of time, forbidden for the next, so that both are measured in one run. Generations follow one another without a
+pause while they are allowed. A tick is timed from its deadline to its command, in the flight log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from edge import runner
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.power.monitor import PowerMonitor
+from edge.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.recording import RecordingError, read_messages
+from tools.children import Children, StepError
+from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+
+BLOCK_S = 20.0
+SETTLE_S = 1.0
+"""Left out after every change: a generation under way is being ended."""
+P999_MS = 100.0
+RATIO = 1.25
+DRIVE = "--drive"
+"""First argument of the process that is the runner."""
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One tick of the log."""
+
+    start_ns: int
+    tick_ms: float
+    reasoning: bool | None
+    """Whether reasoning was allowed; None too near to a change."""
+
+
+def allowed(now_ns: int) -> bool:
+    """Blocks begin on the monotonic clock, which runner and report share."""
+    return int(now_ns / 1e9 / BLOCK_S) % 2 == 0
+
+
+def drive(arguments: Sequence[str]) -> int:
+    """`edge-run` whose power governor allows reasoning in every other block."""
+
+    def budget(_monitor: PowerMonitor) -> ReasoningBudget:
+        return UNLIMITED if allowed(time.monotonic_ns()) else ReasoningBudget(allowed=False)
+
+    with mock.patch.object(PowerMonitor, "budget", budget):
+        return runner.main(list(arguments))
+
+
+def read_ticks(log: Path) -> tuple[list[Tick], int, float]:
+    """Ticks of a flight log, its number of generations, and the share of allowed time they took. RecordingError."""
+    ticks: list[Tick] = []
+    generations, busy_ns = 0, 0
+    for topic, _, record in read_messages(log):
+        if topic == "/semantic":
+            generations += 1
+            busy_ns += record["finished_ns"] - record["started_ns"]
+        elif topic == "/tick":
+            start_ns = int(record["start_ns"])
+            into_s = start_ns / 1e9 % BLOCK_S
+            phase = allowed(start_ns) if into_s >= SETTLE_S else None
+            ticks.append(Tick(start_ns, record["late_ms"] + record["duration_ms"], phase))
+    seconds = sum(1 for tick in ticks if allowed(tick.start_ns)) * 0.1
+    return ticks, generations, busy_ns / 1e9 / seconds if seconds else 0.0
+
+
+def block_ratios(ticks: Sequence[Tick]) -> list[float]:
+    """Median with reasoning over median without, of every pair of neighbouring blocks."""
+    blocks: dict[int, list[float]] = {}
+    for tick in ticks:
+        if tick.reasoning is not None:
+            blocks.setdefault(int(tick.start_ns / 1e9 / BLOCK_S), []).append(tick.tick_ms)
+    medians = {number: float(np.median(values)) for number, values in blocks.items() if len(values) >= 50}
+    pairs = [(n, n + 1) if n % 2 == 0 else (n + 1, n) for n in medians if n + 1 in medians]
+    return [medians[on] / medians[off] for on, off in pairs]
+
+
+def _quantile(values: npt.NDArray[np.float64], share: float) -> float:
+    return float(np.percentile(values, 100 * share, method="inverted_cdf"))
+
+
+def summarise(ticks: Sequence[Tick], missed: int, generations: int, busy: float) -> dict[str, object]:
+    """Figures and verdicts; raises ValueError for a log without both phases."""
+    figures: dict[str, dict[str, float]] = {}
+    for name, chosen in (
+        ("all", list(ticks)),
+        ("reasoning", [tick for tick in ticks if tick.reasoning is True]),
+        ("alone", [tick for tick in ticks if tick.reasoning is False]),
+    ):
+        if not chosen:
+            raise ValueError(f"no ticks of the phase {name!r}: drive for at least {3 * BLOCK_S:g} s")
+        values = np.array([tick.tick_ms for tick in chosen])
+        quantiles = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+        figures[name] = {
+            "n": len(values),
+            **{key: round(_quantile(values, share), 3) for key, share in quantiles.items()},
+        }
+        figures[name]["max"] = round(float(values.max()), 3)
+    ratios = block_ratios(ticks)
+    ratio = float(np.median(ratios)) if ratios else figures["reasoning"]["p50"] / figures["alone"]["p50"]
+    checks = {
+        "p999_ms": figures["all"]["p999"] <= P999_MS,
+        "missed": missed == 0,
+        "ratio": ratio <= RATIO,
+    }
+    return {
+        "tick_ms": figures,
+        "missed": missed,
+        "ratio": round(ratio, 4),
+        "block_ratios": [round(value, 4) for value in ratios],
+        "generations": generations,
+        "reasoning_share": round(busy, 3),
+        "bounds": {"p999_ms": P999_MS, "missed": 0, "ratio": RATIO},
+        "checks": checks,
+        "ok": all(checks.values()),
+        "tagged": "measured",
+    }
+
+
+def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], int, float, int]:
+    with contextlib.ExitStack() as stack:
+        children = stack.enter_context(Children(folder))
+        domain = ["--domain", str(free_domain())]
+        link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
+        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "4"]
+        hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *domain])
+        children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
+        children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+        log = folder / "flight.mcap"
+        run = [sys.executable, "-m", "tools.bench.contention", DRIVE, *link, "--artifacts", str(artifacts)]
+        run += ["--instruction", INSTRUCTION, "--duration", str(duration_s), "--record", str(log)]
+        child = children.start("runner", run)
+        code = children.wait(child, duration_s + 120.0, lambda: None)
+        children.forget(child)
+        if code != EXIT_DONE:
+            raise child.failure(f"exit code {code}")
+        missed = next((int(r["control"]["missed"]) for topic, _, r in read_messages(log) if topic == "/result"), -1)
+        return *read_ticks(log), missed
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    arguments = sys.argv[1:] if argv is None else argv
+    if arguments[:1] == [DRIVE]:
+        return drive(arguments[1:])
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p.add_argument("--duration", type=float, default=600.0, metavar="S", help="default: 600")
+    p.add_argument("--json", metavar="FILE|-")
+    args = p.parse_args(arguments)
+    try:
+        check_result_target(args.json)
+        with socket_dir() as folder:
+            ticks, generations, busy, missed = _run(args.artifacts.absolute(), args.duration, folder)
+        result = summarise(ticks, missed, generations, busy)
+        write_result(args.json, {**result, "samples": [list(asdict(tick).values()) for tick in ticks]})
+    except (StepError, RecordingError, OSError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return EXIT_BAD_INPUT
+    _print(result)
+    return EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED
+
+
+def _print(result: dict[str, object]) -> None:
+    table = Table(title="tick, from its deadline to its command (ms)")
+    for column in ("phase", "n", "p50", "p99", "p99.9", "max"):
+        table.add_column(column, justify="left" if column == "phase" else "right")
+    figures = result["tick_ms"]
+    assert isinstance(figures, dict)
+    for name, row in figures.items():
+        table.add_row(name, f"{row['n']:.0f}", *(f"{row[key]:.1f}" for key in ("p50", "p99", "p999", "max")))
+    console = Console(stderr=True)
+    console.print(table)
+    console.print(
+        f"missed {result['missed']}; median with reasoning over alone {result['ratio']} (bound {RATIO}); "
+        f"{result['generations']} generations, busy {result['reasoning_share']} of the time they were allowed"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
