@@ -28,6 +28,9 @@ from edge.visual_odometry import VisualMotion
 
 __all__ = ["DriftConfig", "DriftEstimator", "OdometryInputs", "OdometryOutputs"]
 
+_SHORT = 1.2
+"""Error rate of a few decimetres over that of a metre, in which part of it has already averaged out."""
+
 
 @dataclass(frozen=True)
 class DriftConfig:
@@ -305,8 +308,8 @@ class DriftEstimator:
             a, b = math.sqrt(prior / (prior + weight)), math.sqrt(weight / (prior + weight))
             self._model = replace(
                 self._model,
-                rate_m_per_m=math.hypot(known.drift_m_per_m * a, rate.m_per_m * b),
-                rate_rad_per_m=math.hypot(known.drift_rad_per_m * a, rate.rad_per_m * b),
+                rate_m_per_m=_SHORT * math.hypot(known.drift_m_per_m * a, rate.m_per_m * b),
+                rate_rad_per_m=_SHORT * math.hypot(known.drift_rad_per_m * a, rate.rad_per_m * b),
             )
 
     def _replay(
