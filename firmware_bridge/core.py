@@ -281,7 +281,8 @@ class BridgeCore:
                 self._asked_ns, self._reason = now_ns, "asking the robot what it is"
                 self._requests.append(Call(ids.API_VERSION))
         elif robot is not None:
-            self._stand_up_from(ids.MODE_LOCOMOTION if _moves(robot) else robot.mode, now_ns)
+            walks = robot.mode == ids.MODE_BALANCE_STAND and _moves(robot)
+            self._stand_up_from(ids.MODE_LOCOMOTION if walks else robot.mode, now_ns)
 
     def _stand_up_from(self, mode: int, now_ns: int) -> None:
         call = _NEXT_CALL.get(mode, ids.RECOVERY_STAND)

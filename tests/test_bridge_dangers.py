@@ -287,6 +287,14 @@ class TestFoundMoving:
         bench.wait(40)
         assert bench.status.state == "armed"
 
+    def test_the_swaying_of_a_robot_that_gets_up_is_no_reason_to_interrupt_it(self) -> None:
+        bench = Bench(mode=ids.MODE_LIE_DOWN)
+        bench.wait(1100)
+        bench.ask_to_arm()
+        bench.robot = {"vx_mps": 0.2}
+        bench.wait(1000)
+        assert bench.calls() == [ids.STAND_UP]
+
     def test_zeros_go_on(self) -> None:
         bench = Bench(client=False, robot={"vx_mps": 0.3})
         bench.wait(1000)
