@@ -7,7 +7,6 @@ import signal
 import time
 from dataclasses import asdict, dataclass, field
 
-from tools.faults.client import FaultError
 from tools.faults.heard import Heard, first_lasting, longest_gap_ms, moves
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row
@@ -55,7 +54,7 @@ def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample
         sample = _unchanged(rig, effect_ns, host)
     else:
         sample = _awaited(rig, row, effect_ns, known, host)
-    _aftermath(rig, row, sample)
+    _aftermath(rig, row, sample, known)
     return sample
 
 
@@ -100,18 +99,16 @@ def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
     return sample
 
 
-def _aftermath(rig: Rig, row: Row, sample: Sample) -> None:
+def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> None:
     """Make it good again and see that the robot does what it should then."""
     if row.thaw:
-        thawed_ns = rig.send(rig.runner, signal.SIGCONT)
-        time.sleep(STAY_S)
-        if any(one.moving for one in rig.hearing.since(thawed_ns)):
-            sample.wrong.append("moved after SIGCONT")
+        rig.send(rig.runner, signal.SIGCONT)
+        _stays(rig, sample, known, "moved after SIGCONT")
     if row.undo is not None:
         row.undo(rig)
     if row.latches:
         if not row.thaw:
-            _stays(rig, sample)
+            _stays(rig, sample, known, "moved although the stop latches")
         rig.kill_runner()
         if row.kills_bridge:
             rig.kill_bridge()
@@ -122,12 +119,9 @@ def _aftermath(rig: Rig, row: Row, sample: Sample) -> None:
         rig.clear()
 
 
-def _stays(rig: Rig, sample: Sample) -> None:
+def _stays(rig: Rig, sample: Sample, known: frozenset[int], otherwise: str) -> None:
     """A latched stop stays one when its fault has gone; a runner that has ended cannot show it."""
     since_ns = time.monotonic_ns()
     time.sleep(STAY_S)
-    if any(one.moving for one in rig.hearing.since(since_ns)):
-        sample.wrong.append("moved although the stop latches")
-
-
-__all__ = ["FaultError", "Sample", "injection"]
+    if any(one.moving and one.source in known for one in rig.hearing.since(since_ns)):
+        sample.wrong.append(otherwise)

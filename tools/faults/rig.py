@@ -111,8 +111,8 @@ class Rig:
             self._wait(lambda runner=runner: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
-            self._say(f"the runner ended before it was asked to: {tail(runner.log, 2)[0]}")
-        raise runner.failure(f"it ended {_ATTEMPTS} times, at last with {runner.process.returncode}")
+            self._say(f"the runner ended before it was asked to: {last_words(runner)}")
+        raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_words(runner)}")
 
     def moving(self) -> bool:
         """Whether the newest commands are all near full speed, and fresh."""
@@ -213,4 +213,7 @@ class Rig:
             time.sleep(_POLL_S)
 
 
-__all__ = ["FaultError", "Rig", "StepError"]
+def last_words(child: Child) -> str:
+    """The last thing that a process has said in words, its result left out."""
+    said = [line for line in tail(child.log, 4) if "{" not in line]
+    return said[-1] if said else f"nothing, exit code {child.process.returncode}"

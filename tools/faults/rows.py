@@ -181,9 +181,9 @@ def _stop_unanswered(rig: Rig) -> int:
 
 
 def _dead_link(rig: Rig) -> int:
-    rig.robot.ask("deaf")
-    rig.robot.ask("state-silent")
-    return min(rig.robot.effect_ns("deaf"), rig.robot.effect_ns("state-silent"))
+    effect_ns = rig.robot.inject("deaf")
+    rig.robot.inject("state-silent")
+    return effect_ns
 
 
 def rows() -> tuple[Row, ...]:
