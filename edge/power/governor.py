@@ -37,7 +37,7 @@ _OFF_MARGIN: Final = 0.97
 _LOST_S: Final = 1.0
 _TRIM_PER_S: Final = 0.05
 _TRIM_MOST: Final = 0.05
-_TRIM_FORGET_S: Final = 300.0
+_TRIM_FORGET_S: Final = 120.0
 _LONGEST_PAUSE_S: Final = 60.0
 _COARSE_S, _FINE_S = 0.5, 0.1
 

@@ -6,7 +6,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-SMOOTH_S = 1.0
+SMOOTH_S = 2.0
+"""Time constant by which power and what ran are both smoothed before they are compared."""
 LEARN_S = 4.0
 """Time constant: a few times the period of the samples, shorter than a generation."""
 

@@ -4,9 +4,10 @@
 
 The device is the plan's: stages take turns on one accelerator, control first. Its generations draw a multiple of the
 plan's power: `light` needs no shedding, `limit` would draw exactly the budget, `plan` is the plan as it is, `far` asks
-for three times, `lag` is `far` with a meter that averages over a second, as NVML's may. Meter noise, lost readings, texts of random length, heat and leakage are added. The judge is the
-device's true power, not the governor's figures. Exit code 1: the 10 s average was above the budget + 2 % later than
-30 s after the start, control missed a tick, or reasoning was shed where it need not be. Everything here is modelled.
+for three times, `lag` is `far` with a meter that averages over a second, as NVML's may. Meter noise, lost readings,
+texts of random length, heat and leakage are added. The judge is the device's true power, not the governor's figures.
+Exit code 1: the 10 s average was above the budget + 2 % later than 30 s after the start, control missed a tick, or
+reasoning was shed where it need not be. Everything here is modelled.
 """
 
 from __future__ import annotations
