@@ -119,6 +119,7 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
 
 UNCHANGED_GAP_MS = 100.0
 """Five of the bridge's periods, and one tick."""
+_BETWEEN_JUMPS_S = 5.0
 _INSIDE_S = 30.0
 """A fault of the reasoning strikes in its next run."""
 
@@ -159,6 +160,7 @@ def _jump(rig: Rig) -> int:
 def _two_jumps(rig: Rig) -> int:
     _jump(rig)
     time.sleep(0.5)
+    rig.drives_on(_BETWEEN_JUMPS_S)  # the first one stops it for a second only
     return _jump(rig)
 
 
