@@ -107,7 +107,8 @@ def fit_corners(
             break
     inliers = int(np.count_nonzero(weight > 0.05))
     # The axes of one corner err together, and neighbouring corners share texture: count half of them as independent.
-    return Solution(q, 2.0 * np.linalg.inv(normal)[:3, :3], inliers, inliers / len(before))
+    covariance = _inverse(normal)
+    return None if covariance is None else Solution(q, 2.0 * covariance[:3, :3], inliers, inliers / len(before))
 
 
 def align_pictures(
@@ -126,7 +127,7 @@ def align_pictures(
         return None
     wanted = key[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     # Half of the next and half of the previous pixel: the derivative of the picture that is sampled linearly below.
-    slope = (cv2.Sobel(now, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(now, cv2.CV_32F, 0, 1, scale=1 / 8))
+    slope = _slopes(now)
     q, normal = np.append(start, 0.0), np.eye(7)
     prior = np.append(config.prior, 1 / config.tilt_sigma_rad**2) * config.correlation
     chosen = pixels.astype(np.float64)
@@ -169,7 +170,10 @@ def align_pictures(
         if iteration >= 2 and np.abs(step[:3]).max() < 1e-4:
             break
     inliers = int(np.count_nonzero(weight > 0.05))
-    covariance = config.correlation * np.linalg.inv(normal)
+    inverse = _inverse(normal)
+    if inverse is None:
+        return None
+    covariance = config.correlation * inverse
     # Take the prior out again: whoever adds up many such answers must not count it many times.
     told = 1.0 - float(covariance[6, 6]) / config.tilt_sigma_rad**2
     tilt_rad, tilt_sigma_rad = 0.0, math.inf
@@ -203,15 +207,30 @@ def _solve(normal: Array, gradient: Array) -> Array | None:
         step = np.linalg.solve(normal, -gradient)
     except np.linalg.LinAlgError:
         return None
-    return step if np.all(np.isfinite(step)) and np.abs(step[:3]).max() < 1.0 else None
+    return np.asarray(step, np.float64) if np.all(np.isfinite(step)) and np.abs(step[:3]).max() < 1.0 else None
+
+
+def _inverse(normal: Array) -> Array | None:
+    """Covariance of a least-squares problem; None when it leaves a direction open."""
+    try:
+        inverse = np.asarray(np.linalg.inv(normal), np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return inverse if np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) > 0) else None
 
 
 def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8], config: AlignmentConfig) -> npt.NDArray[np.int64]:
     """Pixels [n, 2] (column, row) of the floor with enough slope, evenly thinned to about `points`."""
-    gx, gy = cv2.Sobel(key, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(key, cv2.CV_32F, 0, 1, scale=1 / 8)
+    gx, gy = _slopes(key)
     rows, columns = np.nonzero((np.hypot(gx, gy) > config.min_gradient) & (floor > 0))
     every = max(1, len(rows) // config.points)
     return np.stack((columns[::every], rows[::every]), axis=1)
+
+
+def _slopes(picture: Picture) -> tuple[Picture, Picture]:
+    """Derivatives along the columns and along the rows, grey levels a pixel."""
+    across, down = (cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
+    return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
 
 def _sampled(picture: Picture, at: npt.NDArray[np.float32]) -> Array:

@@ -1,0 +1,367 @@
+"""`edge-calib odometry`: fits a robot's odometry to what its gyro and camera, or a measured truth, say of a drive.
+
+The drive is cut into intervals: between two answers of the camera, or by time where there is a truth. For each, the
+robot's own motion is compared with the reference. Scales and bias come from least squares with the calibration of an
+unknown robot as prior, so that what the drive does not show (sideways motion, say) stays where it was, as uncertain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.camera_geometry import Attitude, CameraGeometry
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result, write_whole
+from edge.dead_reckoning import Interval, OdometryModel, integrate, split
+from edge.drift_rate import Comparison, DriftMonitor
+from edge.geometry import SE2, interpolate, wrap_angle
+from edge.odometry_calibration import OdometryCalibration
+from edge.odometry_gate import Increment, OdometryGate, OdometryInputs
+from edge.recording import RecordingError, jpeg_bytes, read_messages
+from edge.visual_odometry import VisualMotion, VisualOdometry, grey_frame
+from firmware_bridge.config import ConfigError, load_robot_config
+
+Array = npt.NDArray[np.float64]
+EPILOG = """examples:
+  edge-calib odometry flight.mcap --robot go2.toml --out go2.odometry.toml
+  edge-calib odometry flight.mcap --truth trace.jsonl --json -
+Drive at least 10 m for this, with curves to both sides, and stand for 3 s before.
+"""
+TRUTH_INTERVAL_NS = 500_000_000
+MIN_DISTANCE_M = 5.0
+MIN_INTERVALS = 15
+MAX_UNEXPLAINED = 0.15
+"""Largest share of the motion (RMS over the intervals) that may be left unexplained: beyond it no fit is one."""
+GYRO_NOISE_RADPS_RTHZ = math.radians(0.08)
+STILL_MPS = 0.03
+STILL_RADPS = math.radians(2.0)
+
+
+class LogError(ValueError):
+    """A log that cannot be calibrated from; one line: what is missing, what to do."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What a log says: reports in the order of their stamps, and pictures (stamp, JPEG)."""
+
+    reports: tuple[OdometryInputs, ...]
+    pictures: tuple[tuple[int, bytes], ...]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Motion over an interval by something better than the odometry; `variance`: m² per axis and rad²."""
+
+    start_ns: int
+    end_ns: int
+    motion: SE2
+    variance_m2: float
+    variance_rad2: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A calibration and how good it is: share of the motion left unexplained, before and after."""
+
+    calibration: OdometryCalibration
+    intervals: int
+    distance_m: float
+    unexplained_before: float
+    unexplained: float
+    drift_m_per_m_sigma: float
+    drift_rad_per_m_sigma: float
+
+    @property
+    def good(self) -> bool:
+        """Whether the calibration should be used."""
+        enough = self.distance_m >= MIN_DISTANCE_M and self.intervals >= MIN_INTERVALS
+        return enough and self.unexplained <= MAX_UNEXPLAINED
+
+
+def read_drive(path: Path) -> Drive:
+    """Odometry and pictures of a flight log. Raises LogError, RecordingError or OSError."""
+    reports: list[OdometryInputs] = []
+    pictures: list[tuple[int, bytes]] = []
+    for topic, stamp_ns, payload in read_messages(path):
+        try:
+            if topic == "/odometry":
+                reports.append(_report(stamp_ns, payload))
+            elif topic == "/camera":
+                pictures.append((stamp_ns, jpeg_bytes(payload)))
+        except (KeyError, TypeError, ValueError) as error:
+            raise LogError(
+                f"{path}: {topic} at {stamp_ns} ns cannot be read ({error}): is the log of an older release?"
+            ) from error
+    if len(reports) < 100:
+        raise LogError(f"{path}: {len(reports)} odometry reports, expected at least 100: record a drive with --record")
+    reports.sort(key=lambda report: report.received_ns)
+    pictures.sort(key=lambda picture: picture[0])
+    return Drive(tuple(reports), tuple(pictures))
+
+
+def _report(stamp_ns: int, payload: dict[str, Any]) -> OdometryInputs:
+    # The recorder writes a number that was not finite as null.
+    x, y, theta = (math.nan if v is None else float(v) for v in payload["raw_pose"])
+    vx, vy, wz = (math.nan if v is None else float(v) for v in payload["velocity"])
+    gyro, command = payload["gyro_wz_radps"], payload["command"]
+    return OdometryInputs(
+        received_ns=stamp_ns,
+        T_odom_base=(x, y, theta),
+        vx_mps=vx,
+        vy_mps=vy,
+        wz_radps=wz,
+        gyro_wz_radps=None if gyro is None else float(gyro),
+        roll_rad=float(payload.get("roll_rad") or 0.0),
+        pitch_rad=float(payload.get("pitch_rad") or 0.0),
+        commanded=None if command is None else (float(command[0]), float(command[1]), float(command[2])),
+    )
+
+
+def increments(drive: Drive) -> tuple[int, list[Increment]]:
+    """Accepted motion between reports, and where it begins; jumps and garbage are left out as in the runner."""
+    gate = OdometryGate()
+    begin_ns: int | None = None
+    accepted: list[Increment] = []
+    for report in drive.reports:
+        verdict = gate.step(report)
+        if verdict.increment is not None:
+            accepted.append(verdict.increment)
+        elif begin_ns is None and not verdict.findings:
+            begin_ns = report.received_ns
+    if begin_ns is None or not accepted:
+        raise LogError("the log holds no usable odometry: expected finite poses that advance")
+    return begin_ns, accepted
+
+
+def gyro_bias(drive: Drive, prior: OdometryCalibration) -> tuple[float, float]:
+    """Mean of the gyro while the robot stood, and its standard error, rad/s; the prior's where it never stood."""
+    rates = [
+        report.gyro_wz_radps
+        for report in drive.reports
+        if report.gyro_wz_radps is not None
+        and math.hypot(report.vx_mps, report.vy_mps) < STILL_MPS
+        and abs(report.gyro_wz_radps) < STILL_RADPS
+        and (report.commanded is None or not any(report.commanded))
+    ]
+    seconds = len(rates) * _period_s(drive)
+    if seconds < 0.5:
+        return prior.gyro_bias_radps, prior.gyro_bias_sigma_radps
+    return float(np.mean(rates)), GYRO_NOISE_RADPS_RTHZ / math.sqrt(seconds)
+
+
+def _period_s(drive: Drive) -> float:
+    span_ns = drive.reports[-1].received_ns - drive.reports[0].received_ns
+    return span_ns / 1e9 / max(1, len(drive.reports) - 1)
+
+
+def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]:
+    """Motion by the camera, over the intervals of its own choice."""
+    eye = VisualOdometry(geometry)
+    stamps = [report.received_ns for report in drive.reports]
+    found: list[Reference] = []
+    for stamp_ns, jpeg in drive.pictures:
+        grey = grey_frame(jpeg)
+        if grey is None:
+            continue
+        report = drive.reports[min(bisect_right(stamps, stamp_ns), len(stamps) - 1)]
+        motion = eye.step(grey, stamp_ns, Attitude(report.roll_rad, report.pitch_rad))
+        if motion is not None:
+            found.append(_reference(motion))
+    return found
+
+
+def _reference(motion: VisualMotion) -> Reference:
+    c = motion.covariance
+    return Reference(motion.start_ns, motion.end_ns, motion.T_start_end, 0.5 * (c[0] + c[4]), c[8])
+
+
+def truth_references(path: Path, begin_ns: int, end_ns: int) -> list[Reference]:
+    """Motion by a trace of ground truth (`edge-hil --trace`), every half second. Raises LogError or OSError."""
+    stamps: list[int] = []
+    poses: list[SE2] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            if entry["kind"] == "pose":
+                stamps.append(int(entry["t_ns"]))
+                poses.append(SE2(float(entry["x"]), float(entry["y"]), float(entry["theta"])))
+        except (KeyError, TypeError, ValueError) as error:
+            raise LogError(f"{path}:{number}: expected a line of edge-hil's trace ({error})") from error
+    references: list[Reference] = []
+    start_ns = max(begin_ns, stamps[0]) if stamps else end_ns
+    while stamps and start_ns + TRUTH_INTERVAL_NS <= min(end_ns, stamps[-1]):
+        ends = [_pose_at(stamps, poses, ns) for ns in (start_ns, start_ns + TRUTH_INTERVAL_NS)]
+        references.append(Reference(start_ns, start_ns + TRUTH_INTERVAL_NS, ends[0].inverse() @ ends[1], 1e-6, 1e-6))
+        start_ns += TRUTH_INTERVAL_NS
+    if not references:
+        raise LogError(f"{path}: no poses of the time of the log: expected a trace on the same monotonic clock")
+    return references
+
+
+def _pose_at(stamps: Sequence[int], poses: Sequence[SE2], stamp_ns: int) -> SE2:
+    index = min(max(bisect_right(stamps, stamp_ns), 1), len(stamps) - 1)
+    before_ns, after_ns = stamps[index - 1], stamps[index]
+    return interpolate(poses[index - 1], poses[index], (stamp_ns - before_ns) / max(1, after_ns - before_ns))
+
+
+def fit(drive: Drive, references: Sequence[Reference], prior: OdometryCalibration) -> Fit:
+    """Fit scales and drift to the references. Raises LogError when no interval of the drive has one."""
+    bias, bias_sigma = gyro_bias(drive, prior)
+    has_gyro = drive.reports[0].gyro_wz_radps is not None
+    model = OdometryModel(has_gyro, bias if has_gyro else 0.0, 0.0, 0.0, 1.0, 1.0, GYRO_NOISE_RADPS_RTHZ, 0.05, 0.05)
+    begin_ns, accepted = increments(drive)
+    pairs = [(interval, reference) for reference, interval in _intervals(begin_ns, accepted, references, model)]
+    if not pairs:
+        raise LogError("no interval of the drive could be compared: expected pictures of the floor, or --truth")
+    raw = np.array([interval.motion[:2] for interval, _ in pairs])
+    true = np.array([(r.motion.x_m, r.motion.y_m) for _, r in pairs])
+    weight = np.array([1 / (r.variance_m2 + (0.02 * math.hypot(r.motion.x_m, r.motion.y_m)) ** 2) for _, r in pairs])
+    turned = np.array([interval.odometry_rad for interval, _ in pairs])
+    # The gyro turns more truly than a picture does; without one, or with a truth, the reference's own yaw is taken.
+    gyro_wins = has_gyro and all(r.variance_rad2 > GYRO_NOISE_RADPS_RTHZ**2 for _, r in pairs)
+    yaw = np.array([float(i.motion[2]) if gyro_wins else r.motion.theta_rad for i, r in pairs])
+    (scale_x,), sigma_x = _least_squares(true[:, :1], raw[:, 0], weight, [prior.scale_x], [prior.scale_x_sigma])
+    (scale_y, sideways), sigma_y = _least_squares(
+        np.stack((true[:, 1], true[:, 0]), axis=1), raw[:, 1], weight,
+        [prior.scale_y, prior.sideways_m_per_m], [prior.scale_y_sigma, prior.sideways_sigma],
+    )  # fmt: skip
+    yaw_weight = np.full(len(pairs), 1 / math.radians(0.3) ** 2)
+    (scale_yaw,), sigma_yaw = _least_squares(
+        yaw[:, None], turned, yaw_weight, [prior.scale_yaw], [prior.scale_yaw_sigma]
+    )
+    corrected = np.stack((raw[:, 0] / scale_x, (raw[:, 1] - sideways * true[:, 0]) / scale_y), axis=1)
+    monitor = DriftMonitor(math.inf)
+    for (_, r), point, odometry, reference_yaw in zip(pairs, corrected, turned / scale_yaw, yaw, strict=True):
+        error = (float(point[0]) - r.motion.x_m, float(point[1]) - r.motion.y_m)
+        variance_rad2 = 0.0 if gyro_wins else r.variance_rad2
+        turn = wrap_angle(float(odometry) - float(reference_yaw))
+        length = math.hypot(r.motion.x_m, r.motion.y_m)
+        monitor.add(Comparison(length, *error, yaw_rad=turn, variance_m2=r.variance_m2, variance_rad2=variance_rad2))
+    rate = monitor.rate()
+    if rate.m_per_m is None or rate.rad_per_m is None:
+        raise LogError(f"the robot moved {rate.distance_m:.1f} m in all: expected at least {MIN_DISTANCE_M:g} m")
+    assert rate.m_per_m_sigma is not None and rate.rad_per_m_sigma is not None
+    motion = math.sqrt(float((true**2).sum()))
+    return Fit(
+        calibration=replace(
+            prior,
+            scale_x=scale_x, scale_x_sigma=sigma_x[0], scale_y=scale_y, scale_y_sigma=sigma_y[0],
+            scale_yaw=scale_yaw, scale_yaw_sigma=sigma_yaw[0], sideways_m_per_m=sideways, sideways_sigma=sigma_y[1],
+            gyro_bias_radps=bias, gyro_bias_sigma_radps=bias_sigma,
+            drift_m_per_m=max(rate.m_per_m, 1e-3), drift_rad_per_m=max(rate.rad_per_m, 1e-4),
+        ),
+        intervals=len(pairs),
+        distance_m=rate.distance_m,
+        unexplained_before=math.sqrt(float(((raw - true) ** 2).sum())) / motion,
+        unexplained=math.sqrt(float(((corrected - true) ** 2).sum())) / motion,
+        drift_m_per_m_sigma=rate.m_per_m_sigma,
+        drift_rad_per_m_sigma=rate.rad_per_m_sigma,
+    )  # fmt: skip
+
+
+def _intervals(
+    begin_ns: int, accepted: Sequence[Increment], references: Sequence[Reference], model: OdometryModel
+) -> Iterator[tuple[Reference, Interval]]:
+    """Every reference with the odometry of its time, where there is some without a gap."""
+    rest = list(accepted)
+    for reference in references:
+        if reference.start_ns < begin_ns or not rest or reference.end_ns > rest[-1].end_ns:
+            continue
+        _, inside, rest = split(rest, begin_ns, reference.start_ns, reference.end_ns)
+        begin_ns = reference.end_ns
+        span_s = (reference.end_ns - reference.start_ns) / 1e9
+        if inside and abs(sum(increment.dt_s for increment in inside) - span_s) < 0.1:
+            yield reference, integrate(inside, model)
+
+
+def _least_squares(
+    columns: Array, values: Array, weight: Array, prior: Sequence[float], prior_sigma: Sequence[float]
+) -> tuple[list[float], list[float]]:
+    """Weighted least squares with a prior on each unknown; estimates and their standard errors."""
+    information = np.diag(1 / np.square(prior_sigma))
+    normal = (columns * weight[:, None]).T @ columns + information
+    solution = np.linalg.solve(normal, (columns * weight[:, None]).T @ values + information @ np.array(prior))
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return [float(v) for v in solution], [float(v) for v in sigma]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this job."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log (MCAP) of a drive")
+    parser.add_argument("--robot", type=Path, metavar="FILE.toml", help="robot file, for its camera's [mount]")
+    parser.add_argument("--truth", type=Path, metavar="FILE.jsonl", help="trace of edge-hil, instead of the camera")
+    parser.add_argument("--out", type=Path, metavar="FILE.toml", help="write the calibration here, if the fit is good")
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit and write; returns the exit code."""
+    try:
+        check_result_target(args.json)
+        drive = read_drive(args.log)
+        prior = OdometryCalibration()
+        fitted = fit(drive, _references(args, drive), prior)
+        if fitted.good and args.out is not None:
+            comment = (
+                f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
+            )
+            write_whole(args.out, fitted.calibration.to_toml(comment))
+        write_result(args.json, {"good": fitted.good, **asdict(fitted)})
+    except (LogError, RecordingError, ConfigError, OSError) as error:
+        sys.stderr.write(f"edge-calib odometry: {error}\n")
+        return EXIT_BAD_INPUT
+    sys.stderr.write(_table(fitted))
+    if fitted.good:
+        return EXIT_DONE
+    sys.stderr.write(
+        f"edge-calib odometry: the fit is not good enough to be used: {fitted.intervals} intervals over "
+        f"{fitted.distance_m:.1f} m, {100 * fitted.unexplained:.0f} % of the motion unexplained; expected at least "
+        f"{MIN_INTERVALS} over {MIN_DISTANCE_M:g} m and at most {100 * MAX_UNEXPLAINED:.0f} %: drive on, in light\n"
+    )
+    return EXIT_CHECK_FAILED
+
+
+def _references(args: argparse.Namespace, drive: Drive) -> list[Reference]:
+    if args.truth is not None:
+        return truth_references(args.truth, drive.reports[0].received_ns, drive.reports[-1].received_ns)
+    if args.robot is None:
+        raise LogError("expected --robot FILE.toml, whose [mount] says how the camera looks at the floor, or --truth")
+    mount = load_robot_config(args.robot).mount
+    if mount is None:
+        raise LogError(f"{args.robot}: has no [mount]: add how the camera is mounted, or give --truth")
+    geometry = CameraGeometry(
+        math.radians(mount.hfov_deg), mount.height_m, math.radians(mount.pitch_deg), mount.forward_m
+    )
+    return visual_references(drive, geometry)
+
+
+def _table(fitted: Fit) -> str:
+    c = fitted.calibration
+    rows = (
+        ("scale forward", c.scale_x, c.scale_x_sigma, ""),
+        ("scale left", c.scale_y, c.scale_y_sigma, ""),
+        ("scale yaw", c.scale_yaw, c.scale_yaw_sigma, ""),
+        ("sideways", c.sideways_m_per_m, c.sideways_sigma, "m/m"),
+        ("gyro bias", math.degrees(c.gyro_bias_radps), math.degrees(c.gyro_bias_sigma_radps), "°/s"),
+        ("drift", c.drift_m_per_m, fitted.drift_m_per_m_sigma, "m/m"),
+        ("drift", math.degrees(c.drift_rad_per_m), math.degrees(fitted.drift_rad_per_m_sigma), "°/m"),
+    )
+    lines = [f"{name:14} {value:9.4f} ± {sigma:.4f} {unit}".rstrip() for name, value, sigma, unit in rows]
+    lines.append(
+        f"{fitted.intervals} intervals, {fitted.distance_m:.1f} m; unexplained "
+        f"{100 * fitted.unexplained_before:.1f} % as reported, {100 * fitted.unexplained:.1f} % as calibrated"
+    )
+    return "\n".join(lines) + "\n"
