@@ -147,8 +147,6 @@ class ReasoningLoop:
         self.invalid_texts = 0
         """Complete texts that were not of the grammar; one that the budget or the mode cuts short is not counted."""
         self.invalid_in_a_row = 0
-        self.new_tokens = 0
-        """Tokens written so far."""
         self._computed_ns = 0
         self._computing_since_ns: int | None = None
         self.generation_ms = Samples(SAMPLES)
@@ -265,7 +263,6 @@ class ReasoningLoop:
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
-        self.new_tokens += generation.new_tokens
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:

@@ -13,7 +13,7 @@ from edge.power.governor import Governor, GovernorConfig
 from edge.power.meter import MeterError, PowerMeter
 from edge.power.monitor import Activity, PowerMonitor
 from edge.power.overcurrent import OverCurrentEvents
-from edge.power.plan import PowerModel, PowerPlan, read_power_plan
+from edge.power.plan import PowerPlan, read_power_plan
 from edge.power.select import open_meter
 from edge.power.sysfs import SYSFS
 from edge.power.thermal import ThermalReader
@@ -23,7 +23,6 @@ def make_power_monitor(
     artifacts: Artifacts,
     *,
     activity: Callable[[], Activity],
-    new_tokens: Callable[[], int],
     battery: ReadBattery,
     on_sample: Callable[[int, dict[str, Any]], object],
     on_findings: Callable[[tuple[Finding, ...]], object],
@@ -32,11 +31,10 @@ def make_power_monitor(
 ) -> PowerMonitor:
     """The monitor of a target's power plan; raises ArtifactError.
 
-    Without the meter that the target names, its model stands in and the operator is told. `new_tokens`: generated so
-    far, for that model.
+    Without the meter that the target names, its model stands in and the operator is told.
     """
     plan = read_power_plan(artifacts)
-    meter = _meter(plan, lambda: _energy_j(plan.model, activity(), new_tokens()), battery, say, sysfs_root)
+    meter = _meter(plan, lambda: _energy_j(plan, activity()), battery, say, sysfs_root)
     config = GovernorConfig(
         budget_w=plan.budget_w,
         max_new_tokens=plan.max_new_tokens,
@@ -76,9 +74,10 @@ def _meter(
         return None if idle_w is None else open_meter("modelled", idle_w=idle_w, energy_j=energy_j)
 
 
-def _energy_j(model: PowerModel | None, activity: Activity, new_tokens: int) -> float:
-    """Modelled energy above idle of all that has run."""
+def _energy_j(plan: PowerPlan, activity: Activity) -> float:
+    """Modelled energy above idle of all that has run; a generation's is spread over the time that it takes."""
+    model = plan.model
     if model is None:
         return 0.0
-    ticks = activity.ticks * (model.encode_j + model.act_j)
-    return ticks + (activity.generations or 0) * model.generation_j(0) + new_tokens * model.token_j
+    reasoning_j = (activity.reasoning_s or 0.0) * model.reasoning_w(plan.max_new_tokens)
+    return activity.ticks * (model.encode_j + model.act_j) + reasoning_j

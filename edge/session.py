@@ -211,7 +211,6 @@ class RunSession:
         power = make_power_monitor(
             self._artifacts,
             activity=activity,
-            new_tokens=lambda: loops[0][1].new_tokens,
             battery=inputs.battery,
             on_sample=lambda stamp_ns, record: None if recorder is None else recorder.put("/power", stamp_ns, record),
             on_findings=inputs.findings.put,
