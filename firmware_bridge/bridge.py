@@ -60,7 +60,7 @@ class Bridge:
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns())
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
-        self._said = ""
+        self._said, self._ready = "", False
 
     def run(self, wakeup: socket.socket) -> None:
         """Serve until a byte arrives on `wakeup`; leave with the robot stopped, whatever happens."""
@@ -115,6 +115,7 @@ class Bridge:
 
     def _report_progress(self, status: BridgeStatus) -> None:
         said = f"{status.state}: {status.reason}"
+        self._ready = self._ready or self._notifier.ready(said)  # again until the manager has taken it
         if said != self._said:
             self._said = said
             self._log.say(said)
@@ -174,7 +175,6 @@ def serve(config: RobotConfig) -> dict[str, object]:
         bridge = Bridge(config, log, notifier)
         where = f"domain {config.dds.domain} on {config.dds.interface}, socket {config.bridge.socket}"
         log.say(f"ready, robot {config.name}, {where}")
-        notifier.ready(f"waiting for a client, robot {config.name}")
         gc.collect()
         gc.freeze()  # what exists now stays; collections look at a step's objects only
         if (unlocked := lock_memory()) is not None:

@@ -365,6 +365,14 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 
+def test_the_status_of_a_running_bridge_is_json_on_request(
+    bridge: Running, socket_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["status", "--robot", str(GO2_SIM), "--socket", str(socket_path), "--json", "-"]
+    assert bridge_main(command) == 0
+    assert json.loads(capsys.readouterr().out)["state"] == "disarmed"
+
+
 def test_an_idle_operator_connection_is_not_in_the_way_of_a_stop(bridge: Running, socket_path: Path) -> None:
     idle = BridgeClient(f"{socket_path}.operator")
     assert operate("stop", socket_path)[0] == 0
@@ -459,7 +467,7 @@ def test_systemd_hears_ready_the_state_the_watchdog_and_the_end(
 def test_a_frozen_bridge_does_not_feed_the_watchdog() -> None:
     pings: list[int] = []
     shell = Bridge.__new__(Bridge)
-    shell._said, shell._log = "armed: driving", None  # type: ignore[assignment]
+    shell._said, shell._ready = "armed: driving", True
     shell._notifier = SimpleNamespace(watchdog_period_ns=100, watchdog=lambda: pings.append(1))  # type: ignore
     shell._pinged_ns, shell._wake_ns = 0, 10**9
     status = BridgeStatus(10**9 + 60_000_000, "armed", "driving", 0, 0, 0, ZERO, False)

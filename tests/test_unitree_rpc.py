@@ -19,9 +19,10 @@ from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.client import CameraError, Go2Reader, RobotState, robot_state
 from firmware_bridge.unitree.dds import Bus, DdsError, domain_xml
 from firmware_bridge.unitree.idl import RequestIdentity_, Response_, ResponseHeader_, ResponseStatus_, SportModeState_
+from firmware_bridge.unitree.idl_low import LowState_
 from firmware_bridge.unitree.rpc import MAX_BINARY_BYTES, Response, RpcClient, RpcError
 from sim_hil.unitree.service import ServiceServer
-from sim_hil.unitree.state import OdometryFrame, sport_mode_state
+from sim_hil.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
 from tests.fake_go2 import standing
 from tests.processes import GO2_SIM, wait_for
 
@@ -185,6 +186,28 @@ def test_a_state_with_a_number_that_is_not_finite_is_dropped(bus: Bus, reader: G
     writer.write(state)
     wait_for(lambda: reader.malformed == 1, 3, "the state to be counted")
     assert reader.state() is None
+
+
+def test_a_state_that_overtook_an_older_one_is_not_followed_by_it(bus: Bus, reader: Go2Reader) -> None:
+    writer = bus.writer(ids.SPORT_STATE_TOPIC, SportModeState_)
+    for time_s in (2.0, 1.0):
+        writer.write(sport_mode_state(standing(time_s=time_s), OdometryFrame((0.0, 0.0, 0.0))))
+        wait_for(lambda: reader.state() is not None, 3, "a state")
+        time.sleep(0.05)
+    wait_for(lambda: reader.reordered == 1, 3, "the old state to be counted")
+    assert reader.state().robot_stamp_ns == 2_000_000_000  # type: ignore[union-attr]
+
+
+def test_the_battery_is_looked_at_twice_a_second(bus: Bus, reader: Go2Reader) -> None:
+    assert reader.battery() is None
+    writer, message = bus.writer(ids.LF_LOW_STATE_TOPIC, LowState_), LowStateMessage().message
+    message.bms_state.soc, message.power_v, message.power_a = 42, 29.5, 3.5
+    before_ns = time.monotonic_ns()
+    writer.write(message)
+    wait_for(lambda: reader.battery() is not None, 3, "the battery")
+    battery = reader.battery()
+    assert battery is not None and before_ns <= battery.received_ns <= time.monotonic_ns()
+    assert (battery.soc_percent, battery.voltage_v, battery.current_a) == (42, 29.5, 3.5)
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-3, 3), st.floats(-3, 3))
