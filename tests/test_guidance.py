@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.geometry import SE2
-from edge.guidance import waypoints_now
+from edge.graph import GraphError
+from edge.guidance import STRAIGHT_AHEAD, waypoints_now
+from edge.language import LanguageModel
+from edge.manifest import Artifacts, load_artifacts
+from edge.policy import Policy
+from edge.reasoning_text import Waypoints
+from edge.semantic import SemanticState
+from edge.session import warm_up
+from export.model.config import PRESETS
+from export.model.network import build
+from tests.artifact_directory import write_artifacts
 
 METRES = st.floats(-50, 50)
 POSES = st.builds(SE2, METRES, METRES, st.floats(-3, 3))
@@ -28,3 +40,44 @@ def test_a_waypoint_is_the_same_place_seen_from_anywhere(anchor: SE2, now: SE2, 
 def test_a_robot_that_has_not_moved_sees_them_as_they_were_written() -> None:
     written = ((1.0, 0.0), (2.0, 0.5), (3.0, -1.25))
     assert np.array_equal(waypoints_now(written, SE2(0.0, 0.0, 0.0)), np.array([written], dtype=np.float32))
+
+
+@pytest.fixture(scope="module")
+def guided(tmp_path_factory: pytest.TempPathFactory) -> Artifacts:
+    """A small policy that reads waypoints, and no motion offset beside them."""
+    config = dataclasses.replace(
+        PRESETS["nano"],
+        action=dataclasses.replace(
+            PRESETS["nano"].action, layers=2, semantic_interface="waypoints", motion_offset=False
+        ),
+    )
+    return load_artifacts(write_artifacts(build(config, 3), tmp_path_factory.mktemp("guided")))
+
+
+def state(waypoints: Waypoints | None, policy: Policy) -> SemanticState:
+    kv = np.zeros((1, 5, 256), np.float32)
+    return SemanticState(0, 0, SE2(0.0, 0.0, 0.0), 0, kv, policy.semantic_context(kv), "", waypoints)
+
+
+def test_a_guided_policy_drives_by_the_waypoints_as_seen_from_here(guided: Artifacts) -> None:
+    policy = Policy(guided, threads=1)
+    tokens = policy.encode(np.full((1, 128, 128, 3), 90, np.uint8))
+    offset, here = SE2(0.6, -0.3, 0.4), SE2(0.0, 0.0, 0.0)
+    seen = tuple((float(x), float(y)) for x, y in waypoints_now(STRAIGHT_AHEAD, offset)[0])
+
+    def plan(waypoints: Waypoints, moved: SE2) -> np.ndarray:
+        return policy.act(tokens, (0.3, 0.0, 0.0), 2.0, moved, state(waypoints, policy))
+
+    np.testing.assert_allclose(plan(STRAIGHT_AHEAD, offset), plan(seen, here), atol=1e-5)
+    assert np.abs(plan(STRAIGHT_AHEAD, offset) - plan(STRAIGHT_AHEAD, here)).max() > 1e-4
+
+
+def test_a_guided_policy_has_no_plan_without_waypoints(guided: Artifacts) -> None:
+    policy = Policy(guided, threads=1)
+    tokens = policy.encode(np.zeros((1, 128, 128, 3), np.uint8))
+    with pytest.raises(GraphError, match="no waypoints"):
+        policy.act(tokens, (0.0, 0.0, 0.0), 1.0, SE2(0.0, 0.0, 0.0), state(None, policy))
+
+
+def test_the_runner_warms_a_guided_policy_up(guided: Artifacts) -> None:
+    warm_up(Policy(guided, threads=1), LanguageModel(guided, threads=1), 128, 2)

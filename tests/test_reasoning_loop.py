@@ -90,6 +90,7 @@ class Bench:
 
     def __init__(self, delay_s: float = 0.0, **more: object) -> None:
         self.language = FakeLanguage()
+        self.policy = FakePolicy()
         self.ring = TokenRing(256)
         self.slot = SemanticSlot()
         self.stop = threading.Event()
@@ -98,7 +99,7 @@ class Bench:
         self.records: list[dict[str, object]] = []
         self.loop = ReasoningLoop(
             language=self.language,  # type: ignore[arg-type]
-            policy=FakePolicy(),  # type: ignore[arg-type]
+            policy=self.policy,  # type: ignore[arg-type]
             ring=self.ring,
             slot=self.slot,
             instruction="go",
@@ -543,3 +544,31 @@ def test_every_generation_is_in_the_statistics(bench: Bench, clock: Clock) -> No
         bench.frame(float(second))
         bench.loop.step()
     assert {len(bench.loop.generation_ms), len(bench.loop.anchor_to_ready_ms), len(bench.loop.late_anchor_ms)} == {3}
+
+
+def test_a_policy_that_reads_waypoints_keeps_the_last_ones_when_a_text_has_none(bench: Bench, clock: Clock) -> None:
+    bench.policy.guided_by_waypoints = True
+    bench.frame(2.0)
+    bench.loop.step()
+    good = bench.slot.state
+    assert good is not None and good.waypoints is not None
+    bench.language.text = "no waypoints here"
+    bench.frame(3.0)
+    assert not bench.loop.step()
+    assert bench.slot.state is good
+    assert (bench.loop.invalid_texts, bench.loop.failed) == (1, 0)
+
+
+def test_the_time_spent_computing_is_counted(bench: Bench, clock: Clock) -> None:
+    seen: list[tuple[bool, int]] = []
+
+    def think(_run: FakeRun) -> None:
+        clock.s += 0.7
+        seen.append((bench.loop.busy, bench.loop.busy_ns))
+
+    bench.language.during_finish = think
+    bench.frame(2.0)
+    bench.loop.step()
+    clock.s += 5.0
+    assert seen == [(True, 700_000_000)]
+    assert (bench.loop.busy, bench.loop.busy_ns) == (False, 700_000_000)

@@ -34,10 +34,11 @@ def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
     """Tensors of the semantic context: a layer's keys lie as its product reads them, [1, H, d, T]."""
     c = config.action
     head_dim = c.hidden // c.heads
+    tokens = guidance_input(config)[1][1]
     shapes: dict[str, tuple[int | str, ...]] = {}
     for i in range(c.layers):
-        shapes[f"context.{i}.key"] = (1, c.heads, head_dim, TOKENS)
-        shapes[f"context.{i}.value"] = (1, c.heads, TOKENS, head_dim)
+        shapes[f"context.{i}.key"] = (1, c.heads, head_dim, tokens)
+        shapes[f"context.{i}.value"] = (1, c.heads, tokens, head_dim)
     return shapes
 
 
