@@ -20,6 +20,7 @@ from edge.cli import (
 )
 from edge.manifest import load_artifacts
 from edge.prompt import InstructionError
+from edge.signature import KeyFileError
 from edge.unit_text import UnitError
 from firmware_bridge.config import ConfigError
 
@@ -72,7 +73,7 @@ def main(
     except (ArtifactError, engines.EngineError) as error:
         _say(str(error))
         return EXIT_REFUSED
-    except (OSError, ConfigError, InstructionError, UnitError) as error:
+    except (OSError, ConfigError, InstructionError, KeyFileError, UnitError) as error:
         _say(str(error))
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:

@@ -17,11 +17,12 @@ from typing import Any, Final
 import psutil
 
 from edge import engines, units
-from edge.artifact_files import ArtifactError, read_manifest
+from edge.artifact_files import ArtifactError, read_manifest, read_manifest_bytes
 from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.device_nodes import device_nodes
 from edge.manifest import Artifacts, load_artifacts
 from edge.prompt import check_instruction
+from edge.signature import STATE_DIRECTORY, Trust
 from edge.target_facts import TargetFacts, target_facts
 from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
 from edge.unit_text import UnitError
@@ -78,6 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
     parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
     parser.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
+    parser.add_argument("--trust", type=Path, metavar="KEY.pub", help="run only artifacts that this key has signed")
     parser.add_argument(
         "--user", default=units.DEFAULT_USER, metavar="NAME", help=f"who runs both (default: {units.DEFAULT_USER})"
     )
@@ -95,7 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None = None) -> int:
     """Write the units and check them; the exit code.
 
-    Raises UnitError, ConfigError, InstructionError or OSError for bad input, ArtifactError for artifacts to be refused.
+    Raises UnitError, ConfigError, InstructionError, KeyFileError or OSError for bad input, ArtifactError for artifacts
+    to be refused.
     """
     host = host or Host()
     inputs = gather(args, host)
@@ -106,6 +109,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{lacking}: run this on the device itself before you use the runner's unit")
     # An emergency stop's input may appear at start-up only; a calibration that is not there is refused here.
     needed = [inputs.robot, inputs.artifacts, *(path for path in inputs.robot_files if not path.is_relative_to("/sys"))]
+    needed += [] if inputs.trust is None else [inputs.trust]
     if inputs.engines is not None and inputs.engines.is_dir():
         needed.append(inputs.engines)
     elif inputs.engines is not None:
@@ -142,6 +146,10 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     """Everything that the units say, from the arguments, the artifacts, the robot file and the machine."""
     robot = load_robot_config(args.robot, socket=units.SOCKET)
     artifacts = load_artifacts(args.artifacts.resolve())
+    if args.trust is not None:
+        Trust(args.trust, STATE_DIRECTORY / "release.json").check(
+            artifacts.directory, read_manifest_bytes(artifacts.directory)
+        )
     facts = target_facts(read_manifest(artifacts.directory))
     if facts is None:
         raise ArtifactError(f"{artifacts.directory}: its manifest has no target; export again")
@@ -164,6 +172,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         robot_files=tuple(path for path in (robot.odometry.calibration, robot.safety.estop_file) if path is not None),
         artifacts=artifacts.directory,
         engines=folder,
+        trust=None if args.trust is None else args.trust.resolve(),
         instruction=check_instruction(_instruction(args)),
         user=args.user,
         networks=robot_networks(robot.dds, args.network, host.addresses),

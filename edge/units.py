@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.device import CUDA, OPENVINO, TENSORRT
+from edge.signature import STATE_DIRECTORY
 from edge.unit_text import Setting, UnitError, argument, bound, render, word
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
@@ -22,7 +23,6 @@ RUNNER_UNIT: Final = "tic-vla-edge-runner.service"
 SYSUSERS_FILE: Final = "tic-vla-edge.conf"
 DEFAULT_USER: Final = "tic-vla-edge"
 SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
-STATE_DIRECTORY: Final = Path("/var/lib/tic-vla-edge")
 FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
 """systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
 BRIDGE_PRIORITY: Final = 60
@@ -52,6 +52,8 @@ class ServiceInputs:
     """Files that the robot file names."""
     artifacts: Path
     engines: Path | None
+    trust: Path | None
+    """Public key that has to have signed the artifacts."""
     instruction: str
     user: str
     networks: tuple[IPv4Network, ...]
@@ -146,12 +148,11 @@ def runner_unit(inputs: ServiceInputs) -> str:
     # One word with its text, so that a text that begins with a dash is no option.
     command.append(argument(f"--instruction={inputs.instruction}"))
     command += [argument("--record"), FLIGHT_LOG]
-    needed = (
-        inputs.robot,
-        *inputs.robot_files,
-        inputs.artifacts,
-        *(() if inputs.engines is None else (inputs.engines,)),
-    )
+    if inputs.trust is not None:
+        # The newest release that was run is remembered where the service may write.
+        command += [argument(text) for text in ("--trust", str(inputs.trust), "--state", str(STATE_DIRECTORY))]
+    optional = tuple(path for path in (inputs.engines, inputs.trust) if path is not None)
+    needed = (inputs.robot, *inputs.robot_files, inputs.artifacts, *optional)
     service: list[Setting | str] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),

@@ -16,6 +16,7 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.device_nodes import device_nodes
 from edge.install import main
 from edge.install_units import Host, robot_networks, unreadable
+from edge.signature import keygen
 from edge.unit_check import UnitVerdict
 from edge.unit_text import UnitError
 from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE
@@ -150,6 +151,12 @@ def test_what_systemd_finds_fault_with_is_a_failed_check(units: Units, host: Hos
 def test_artifacts_of_another_target_are_refused(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
     assert units("--target", "orin")[0] == EXIT_REFUSED
     assert "expected orin" in capsys.readouterr().err
+
+
+def test_artifacts_that_the_trusted_key_has_not_signed_are_refused(units: Units, tmp_path: Path) -> None:
+    keygen(tmp_path / "release.pem")
+    assert units("--trust", str(tmp_path / "release.pem.pub"))[0] == EXIT_REFUSED
+    assert units("--trust", str(tmp_path / "none.pub"))[0] == EXIT_BAD_INPUT
 
 
 @pytest.mark.parametrize("text", ["", "x" * 401, "a \u202e b"])

@@ -30,6 +30,7 @@ def inputs(**changes: object) -> ServiceInputs:
         robot_files=(),
         artifacts=Path("/opt/tic-vla/orin"),
         engines=None,
+        trust=None,
         instruction="walk to the vending machine",
         user="tic-vla-edge",
         networks=(IPv4Network("192.168.123.0/24"),),
@@ -107,6 +108,12 @@ def test_an_instruction_reaches_the_runner_unchanged(text: str) -> None:
 def test_every_start_writes_a_flight_log_of_its_own() -> None:
     (command,) = settings(runner_unit(inputs()))["ExecStart"]
     assert '"--record" "/var/lib/tic-vla-edge/flight-${INVOCATION_ID}.mcap"' in command
+
+
+def test_a_trusted_key_and_the_memory_of_releases_are_given_to_the_runner() -> None:
+    (command,) = settings(runner_unit(inputs(trust=Path("/etc/tic-vla/key.pub"))))["ExecStart"]
+    assert '"--trust" "/etc/tic-vla/key.pub" "--state" "/var/lib/tic-vla-edge"' in command
+    assert "--trust" not in runner_unit(inputs())
 
 
 def test_both_speak_over_a_socket_that_only_their_user_can_reach() -> None:
