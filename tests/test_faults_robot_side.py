@@ -91,6 +91,12 @@ def test_a_frozen_odometry_repeats_the_first_state_of_the_fault() -> None:
     assert faults.deliver(state(x_m=3.0), 0)[0].position[0] == 3.0
 
 
+def test_a_frozen_odometry_may_read_zero_velocity_and_an_old_stamp() -> None:
+    faults = faults_with("odometry-freeze", velocity="zero", stamp="frozen")
+    first, later = (faults.deliver(state(x_m=x, vx_mps=x), 0)[0] for x in (1.0, 2.0))
+    assert later.velocity == [0.0, 0.0, 0.0] and later.stamp == first.stamp
+
+
 def test_a_biased_velocity_grows_along_the_heading() -> None:
     faults = faults_with("odometry-bias", dv_mps=1.0)
     (out,) = faults.deliver(state(yaw_rad=math.pi / 2), 0)

@@ -60,7 +60,10 @@ def _kinds() -> dict[str, FaultKind]:
             once=True,
         ),
         "odometry-freeze": FaultKind(
-            "state", "pose and velocity stay what they are", {}, {"stamp": ("runs", "frozen")}
+            "state",
+            "the pose stays what it is, the velocity too or reads zero, the robot's stamp runs on or not",
+            {},
+            {"velocity": ("held", "zero"), "stamp": ("runs", "frozen")},
         ),
         "odometry-nan": FaultKind(
             "state", "a field is not a number, or the quaternion zero", {}, {"field": ("position", "velocity", "rpy")}

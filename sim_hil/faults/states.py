@@ -169,6 +169,8 @@ class StateFaults:
         held = self._frozen
         message.position, message.velocity, message.yaw_speed = held["position"], held["velocity"], held["yaw_speed"]
         imu.rpy, imu.quaternion = held["rpy"], held["quaternion"]
+        if self._on["odometry-freeze"].text("velocity") == "zero":
+            message.velocity, message.yaw_speed = [0.0] * 3, 0.0
         if self._on["odometry-freeze"].text("stamp") == "frozen":
             message.stamp = held["stamp"]
 

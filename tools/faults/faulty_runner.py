@@ -3,8 +3,9 @@
     python -m tools.faults.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
 
 The product has no hook for faults: this program replaces methods of its classes in its own process and then calls the
-unchanged `edge.runner.main` with the arguments after SOCKET. Besides, the plan that `Policy.act` returns (`circle.py`)
-and the language model's text are exchanged for what a trained model would give; both networks run all the same.
+unchanged `edge.runner.main` with the arguments after SOCKET. Besides, untrained weights pass for trained ones: the plan
+that `Policy.act` returns (`circle.py`) and the language model's text are exchanged for what those would give. Both
+networks run all the same.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,13 @@ class UnexpectedError(Exception):
     """A defect that no code of the runner knows."""
 
 
+def _trained(original: Callable[..., Any]) -> Callable[..., Any]:
+    def load_artifacts(*args: Any, **kwargs: Any) -> Any:
+        return replace(original(*args, **kwargs), trained=True)
+
+    return load_artifacts
+
+
 def _seconds(values: Mapping[str, Any], default: float) -> float:
     return float(values.get("seconds_s", default))
 
@@ -71,9 +80,8 @@ class Faults:
 
     def __init__(self, switches: Switches) -> None:
         self._on = switches.hit
-        self._calls = itertools.count()
+        self._calls, self._swings = itertools.count(), itertools.count()
         self._held: np.ndarray[Any, Any] | None = None
-        self._moved_s = 0.0
 
     def install(self) -> None:
         """Replace the methods, for this process only."""
@@ -81,6 +89,7 @@ class Faults:
         Policy.encode = self._encode(Policy.encode)  # type: ignore[method-assign]
         LanguageModel.run = self._language(LanguageModel.run)  # type: ignore[method-assign]
         LanguageModel.text_of = self._text(LanguageModel.text_of)  # type: ignore[method-assign]
+        runner.load_artifacts = _trained(runner.load_artifacts)
         PartFile.write = self._disk(PartFile.write)  # type: ignore[method-assign]
         PartFile.sync = self._disk(PartFile.sync)  # type: ignore[method-assign]
         time.time = self._clock(time.time)  # noqa: TID251 - the very thing that must not matter
@@ -112,7 +121,7 @@ class Faults:
         else:
             self._held = None
         if self._on("oscillating-output") is not None:
-            side = 1.0 if next(self._calls) % 2 else -1.0
+            side = 1.0 if next(self._swings) % 2 else -1.0
             plan = plan * np.array([1.0, 0.0, 0.0], dtype=np.float32)
             plan[:, 1] = side * plan[:, 0]
             plan[:, 2] = side * np.linspace(0.0, 1.5, len(plan), dtype=np.float32)

@@ -70,7 +70,10 @@ def _awaited(rig: Rig, row: Row, effect_ns: int, known: frozenset[int], host: Ho
     if first is None:
         return Sample(None, host.between_ns(effect_ns, end_ns) / 1e6)
     # The very command under way when the fault struck may already be what was to come.
-    return Sample(max(first - effect_ns, 0) / 1e6, host.between_ns(effect_ns, first) / 1e6)
+    sample = Sample(max(first - effect_ns, 0) / 1e6, host.between_ns(effect_ns, first) / 1e6)
+    if row.judged_by is Judge.LIMIT and not (rig.drives_on(RESUME_S) and _first(rig, row, first, known) is not None):
+        sample.wrong.append("stopped, not limited")
+    return sample
 
 
 def _first(rig: Rig, row: Row, effect_ns: int, known: frozenset[int]) -> int | None:
