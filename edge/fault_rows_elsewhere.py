@@ -169,8 +169,8 @@ START: tuple[Fault, ...] = (
     ),
     Fault(
         "restart-storm", 59, Action.STOP, 0, "start",
-        "The runner failed five times within 60 s and is not started again.",
-        "Look at its journal: journalctl -u edge-runner.",
+        "The runner failed five times in a row and is not started again.",
+        "Look at its journal: journalctl -u tic-vla-edge-runner.",
         "tests/test_units.py::test_slow_failing_starts_of_the_runner_are_counted_within_one_window",
     ),
     Fault(

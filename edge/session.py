@@ -51,6 +51,8 @@ HISTORY_MARGIN_S = 6.0
 CAMERA_LEAD = 0.5
 """Share of a tick period by which a frame is asked for before the tick that uses it."""
 READY_TIMEOUT_S = 10.0
+OPEN_S = 60.0
+"""As a service: the most that hashing, opening and warming up a large model's graphs takes."""
 STOP_CONFIRM_S = 1.0
 POLL_S = 0.05
 JOIN_S = 5.0
@@ -98,6 +100,7 @@ class RunSession:
         self._activity = TickActivity(self._period_ns)
         self._notifier = Notifier(os.environ)
         self._notifier.status("opening the graphs")
+        self._notifier.extend(OPEN_S)
         if artifacts.guided_by_waypoints and options.mode is Mode.NO_REASONING:
             raise InstructionError(
                 f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
@@ -127,6 +130,8 @@ class RunSession:
         refusal = None if self._options.record is None else space_refusal(self._options.record)
         if refusal is not None:
             raise RefusedError(refusal)
+        self._notifier.status("waiting for the robot")
+        self._notifier.extend(READY_TIMEOUT_S + self._robot.bridge.arm_timeout_s + OPEN_S)
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
@@ -163,7 +168,6 @@ class RunSession:
                 recorder.put("/run", started_ns, self._run_record(started_ns))
                 inputs.recorder = recorder
             self._drive(control, reasoning, inputs, bridge)
-            self._notifier.stopping(self._faults[0] if self._faults else "the run has ended")
             status = self._halt(bridge)
             result = run_result(
                 control,
@@ -351,6 +355,7 @@ class RunSession:
             finally:
                 # At once, not after the reasoning thread has been waited for.
                 bridge.stop()
+                self._notifier.stopping(self._faults[0] if self._faults else "the run has ended")
 
         # Daemons: a thread that hangs in a driver must not keep the process from ending.
         threads = [

@@ -11,7 +11,16 @@ import pytest
 
 from edge.cli import EXIT_BAD_INPUT, check_result_target, run_with_extra, write_result
 
-COMMANDS = ["export.entry", "edge.runner", "firmware_bridge.bridge", "sim_hil.entry"]
+COMMANDS = [
+    "calib.cli",
+    "edge.doctor",
+    "edge.install",
+    "edge.replay",
+    "edge.runner",
+    "export.entry",
+    "firmware_bridge.bridge",
+    "sim_hil.entry",
+]
 
 
 @pytest.mark.parametrize("module", COMMANDS)

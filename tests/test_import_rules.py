@@ -38,3 +38,12 @@ def test_the_bridge_knows_neither_the_runner_nor_any_machine_learning(path: Path
 def test_importing_it_pulls_in_neither_torch_nor_pybullet(module: str) -> None:
     code = f"import {module}, sys; sys.exit(bool({{'torch', 'pybullet'}} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("module", ["edge.runner", "export.gate_run", "calib.power", "tools.bench.tick"])
+def test_onnx_runtime_is_told_to_keep_no_telemetry_before_it_is_imported(module: str) -> None:
+    code = (
+        f"import os, sys; os.environ.pop('ORT_DISABLE_TELEMETRY', None); import {module}; names = list(sys.modules); "
+        "assert names.index('edge') < names.index('onnxruntime') and os.environ['ORT_DISABLE_TELEMETRY'] == '1'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
