@@ -110,7 +110,7 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> Non
     if row.undo is not None:
         row.undo(rig)
     if row.latches:
-        if not row.thaw:
+        if row.judged_by is not Judge.UNCHANGED and not row.thaw:
             _stays(rig, sample, known, "moved although the stop latches")
         rig.kill_runner()
         if row.kills_bridge:

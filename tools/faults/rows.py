@@ -200,7 +200,11 @@ def rows() -> tuple[Row, ...]:
         _robot("camera blinded", "frames-refused", "camera-saturated"),
         _robot("camera pictures torn", "frames-refused", "camera-torn"),
         _with(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=10.5, share=0.4),
-        _robot("odometry freezes at zero speed", "odometry-frozen", "odometry-freeze", velocity="zero"),
+        # Its end is a jump of the pose, and two of those within 10 s end the run.
+        _with(
+            _robot("odometry freezes at zero speed", "odometry-frozen", "odometry-freeze", velocity="zero"),
+            spacing_s=10.5, share=0.4,
+        ),
         _robot("odometry is NaN", "odometry-not-finite", "odometry-nan"),
         _robot("orientation is not one", "odometry-not-finite", "odometry-nan", field="rpy"),
         _robot("odometry 200 ms late", "odometry-late", "odometry-lag", delay_s=0.2),
@@ -208,7 +212,8 @@ def rows() -> tuple[Row, ...]:
         _robot("robot's state silent", "odometry-stale", "state-silent"),
         _robot("half of the states lost", "link-lossy", "state-loss", percent=50.0),
         _harmless("every tenth state lost", "state-loss", percent=10.0),
-        _harmless("states change places", "state-reorder"),
+        # Of two states that change places the older one is dropped: half of them are lost.
+        _robot("states change places", "link-lossy", "state-reorder"),
         _harmless("states come twice", "state-duplicate"),
         _with(_robot("battery at 15 %", "battery-low", "low-battery", soc_percent=15.0), share=0.4),
         _inside("plan is NaN", "output-not-finite", "nan-output"),
