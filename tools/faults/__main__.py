@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, default=Path("out/faults"), metavar="DIR", help="default: out/faults")
     p.add_argument("--rows", action="append", metavar="GLOB", help="only rows whose name matches (may be repeated)")
     p.add_argument(
-        "--per-row", type=int, default=6, metavar="N", help="injections a row; slow rows get fewer (default: 6)"
+        "--per-row", type=int, default=5, metavar="N", help="injections a row; slow rows get fewer (default: 5)"
     )
     p.add_argument("--seed", type=int, default=0, help="of the moments of injection (default: 0)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
