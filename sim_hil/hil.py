@@ -52,6 +52,8 @@ EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
   edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
+with --faults, one JSON object a datagram switches a fault on or off, such as {"fault": "camera-stop", "on": true}; the
+answer says when it took effect, and an unknown name is answered with all that there are
 exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
 is written all the same, or trace or result could not be written; 2 bad arguments"""
 
@@ -312,7 +314,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
     )
-    parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults to inject at this local socket")
+    parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults at this local datagram socket")
     parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     parser.add_argument("--gui", action="store_true", help="show the physics in a window")

@@ -20,6 +20,7 @@ from sim_hil.faults.commands import KINDS, FaultCommand, FaultCommandError, pars
 from sim_hil.faults.injector import FaultInjector
 from sim_hil.faults.states import StateFaults
 from sim_hil.odometry_noise import LEVELS, NoiseLevel, OdometryNoise
+from sim_hil.sensor_noise import SensorNoise
 from sim_hil.unitree.drifting import DriftingOdometry
 from sim_hil.unitree.remote import Remote
 from sim_hil.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
@@ -238,6 +239,30 @@ def test_a_camera_fault_goes_to_the_camera_and_is_answered_by_its_effect(injecto
     assert server.sent == [command("camera-black").line()]
     server.took_effect("camera-black", 9 * MS)
     assert json.loads(client.recv(500))["effect_ns"] == 9 * MS
+
+
+def test_a_path_that_is_taken_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "taken").touch()
+    with pytest.raises(OSError, match="expected a free path") as refused:
+        FaultInjector(tmp_path / "taken", remote=Remote(), camera=lambda line: None)
+    assert "\n" not in str(refused.value)
+
+
+def test_keys_held_on_the_remote_are_in_both_messages_and_let_go_by_clear(injector) -> None:
+    server, client = injector
+    client.send(command("remote-keys", keys=0x220).line())
+    server.poll(1)
+    assert server._remote.keys == 0x220 and server._remote.as_bytes()[2:4] == b"\x20\x02"
+    client.send(b'{"fault": "clear"}')
+    server.poll(2)
+    assert server._remote.as_bytes() == bytes(40)
+
+
+def test_no_two_pictures_of_the_same_scene_are_alike() -> None:
+    picture, noise = np.full((18, 32, 3), 128, np.uint8), SensorNoise(32, 18, seed=0)
+    first, second = noise.add(picture), noise.add(picture)
+    assert (first != second).any() and abs(float(first.mean()) - 128.0) < 0.2
+    assert noise.add(np.zeros((18, 32, 3), np.uint8)).max() < 10
 
 
 def test_without_the_flag_the_code_that_injects_is_not_even_loaded() -> None:
