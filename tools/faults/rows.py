@@ -164,10 +164,13 @@ def _two_jumps(rig: Rig) -> int:
     return _jump(rig)
 
 
-def _wall_clock(rig: Rig) -> int:
-    # Nobody may ever ask for the date, so there is no effect to wait for.
-    rig.inside.ask("wall-clock", seconds_s=3600.0)
-    return time.monotonic_ns()
+def _wall_clock(seconds_s: float) -> Callable[[Rig], int]:
+    def inject(rig: Rig) -> int:
+        # Nobody may ever ask for the date, so there is no effect to wait for.
+        rig.inside.ask("wall-clock", seconds_s=seconds_s)
+        return time.monotonic_ns()
+
+    return inject
 
 
 def _late_move(rig: Rig) -> int:
@@ -225,7 +228,8 @@ def rows() -> tuple[Row, ...]:
         _with(_inside("reasoning hangs", "semantic-expired", "reasoning-hang"), share=0.25),
         _with(_inside("reasoning's third bad text", "semantic-text-invalid", "garbage-text", after=3.0), share=0.4),
         _with(_inside("flight log's disk stalls", "log-disk-stalled", "disk-stall", seconds_s=3.0), share=0.4),
-        _with(Row("date jumps by an hour", "wall-clock-moved", _wall_clock, _clear), share=0.4),
+        _with(Row("date jumps an hour ahead", "wall-clock-moved", _wall_clock(3600.0), _clear), share=0.4),
+        _with(Row("date jumps an hour back", "wall-clock-moved", _wall_clock(-3600.0), _clear), share=0.4),
     )  # fmt: skip
     over = (
         Row("runner SIGKILL", "runner-killed", lambda rig: rig.send(rig.runner, signal.SIGKILL)),
