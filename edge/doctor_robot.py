@@ -52,6 +52,8 @@ def bridge(robot: RobotConfig, ask: Callable[[RobotConfig], BridgeStatus | None]
     if status is None:
         return Check(name, Level.FAIL, "it says nothing", "a bridge that answers", "restart edge-bridge")
     found = f"{status.state}: {status.reason}" if status.reason else status.state
+    if status.blocked_by == "operator":  # comes last: nothing else is in the way
+        return Check(name, Level.OK, f"{found}; waits for `edge-bridge arm`", "ready to arm")
     if status.blocked_by != "none":
         advice = f"arming is refused because of {status.blocked_by}; edge-bridge status says more"
         return Check(name, Level.FAIL, f"{found}; blocked by {status.blocked_by}", "ready to arm", advice)

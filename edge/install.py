@@ -31,6 +31,8 @@ EXAMPLES = """examples:
   sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
        --instruction-file /etc/tic-vla/instruction.txt --system
 
+units wants a robot file with operator_arm = true in [safety], or --arm-at-start.
+
 exit codes: 0 done, 1 systemd finds fault with the units, 2 bad arguments or input, 3 refused (artifacts, device),
             130 interrupted
 """

@@ -90,6 +90,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CIDR",
         help="the robot's network, may be repeated (default: that of the robot file's interface, and its peers)",
     )
+    parser.add_argument(
+        "--arm-at-start",
+        action="store_true",
+        help="a robot file without operator_arm is meant: the runner drives as soon as it starts",
+    )
     parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
@@ -114,6 +119,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         needed.append(inputs.engines)
     elif inputs.engines is not None:
         say(f"{inputs.engines}: not there yet; build it before the runner starts: edge-install engines")
+    if inputs.operator_arm and args.arm_at_start:
+        say(f"{inputs.robot}: says operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
     closed = unreadable(needed)
     for path in closed:
         say(f"{path}: {inputs.user} cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
@@ -123,8 +130,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{path}: {'written' if path in written else 'is up to date'}")
     verdict = host.check([path for path in contents if path.suffix == ".service"])
     _report(verdict, say)
-    commands = _commands(contents, system=args.system)
-    say("nothing was enabled or started. To do so; the last command arms the robot and drives:")
+    commands = _commands(contents, inputs, system=args.system)
+    say("nothing was enabled or started. To do so; the last command lets the robot stand up and drive:")
     for command in commands:
         say(f"  {command}")
     result: dict[str, Any] = {
@@ -145,6 +152,11 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
 def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     """Everything that the units say, from the arguments, the artifacts, the robot file and the machine."""
     robot = load_robot_config(args.robot, socket=units.SOCKET)
+    if not robot.safety.operator_arm and not args.arm_at_start:
+        raise UnitError(
+            f"robot file {args.robot}: safety.operator_arm: expected true, found false: the service would drive as "
+            f"soon as it starts; set it to true, or give --arm-at-start if you want that"
+        )
     artifacts = load_artifacts(args.artifacts.resolve())
     if args.trust is not None:
         Trust(args.trust, STATE_DIRECTORY / "release.json").check(
@@ -182,6 +194,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         groups=tuple(sorted({node.group for node in nodes if node.group is not None})),
         memory_bytes=facts.available_bytes,
         control_priority=artifacts.runtime.control_priority,
+        operator_arm=robot.safety.operator_arm,
         bridge_cores=_bridge_cores(artifacts, facts),
     )
 
@@ -292,16 +305,24 @@ def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
         say(f"skipped: {line}")
 
 
-def _commands(contents: Mapping[Path, str], *, system: bool) -> list[str]:
+def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, system: bool) -> list[str]:
     """Commands that make the services run, for the operator to give."""
     prepare = [] if system else [f"sudo cp {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
     prepare += ["sudo systemd-sysusers"] if any(path.suffix == ".conf" for path in contents) else []
+    # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before somebody has
+    # looked at it.
+    drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
+    if inputs.operator_arm:
+        bridge, robot = shlex.quote(str(inputs.programs / "edge-bridge")), shlex.quote(str(inputs.robot))
+        drive = [
+            f"sudo systemctl enable --now {units.RUNNER_UNIT}",
+            f"sudo {bridge} arm --robot {robot} --socket {units.SOCKET}",
+        ]
     return [
         *prepare,
         "sudo systemctl daemon-reload",
         f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
-        # Not enabled: a machine that starts again after a brown-out must not drive before somebody has looked at it.
-        f"sudo systemctl start {units.RUNNER_UNIT}",
+        *drive,
     ]
 
 

@@ -13,6 +13,7 @@ from types import FrameType
 import cv2
 
 from edge import engines
+from edge.arming import RefusedError, StoppedEarlyError
 from edge.artifact_files import ArtifactError
 from edge.cli import (
     EXIT_BAD_INPUT,
@@ -29,7 +30,7 @@ from edge.prompt import InstructionError, check_instruction
 from edge.reasoning_loop import Mode
 from edge.recording import parts
 from edge.release import ReleaseDelayError, parse_release_delay
-from edge.session import RefusedError, RunOptions, RunSession, StoppedEarlyError
+from edge.session import RunOptions, RunSession
 from edge.signature import STATE_DIRECTORY, KeyFileError, Trust
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
@@ -40,7 +41,8 @@ EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot firmware_bridge/robots/go2_sim.toml --duration 60 \\
            --release-delay 2 --record flight.mcap --json - --instruction "go down the corridor"
 
-edge-bridge must be running. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
+edge-bridge must be running; where the robot file says operator_arm, the robot stays where it is until
+`edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
 exit codes: 0 done (also after SIGTERM), 1 a fault ended the run, 2 bad arguments or input, 3 refused to drive,
             130 interrupted (SIGINT)
 """

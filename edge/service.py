@@ -1,4 +1,7 @@
-"""The runner as a service: ready once it drives on time, a status line, watchdog, stopping; nothing without systemd."""
+"""The runner as a service: ready, a status line, watchdog, stopping; nothing without systemd.
+
+Ready is a runner that drives on time, or one that waits for an operator who may take hours.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,10 @@ STATUS_PERIOD_NS: Final = 5_000_000_000
 class ServiceReporter:
     """Thin shell around `WatchdogFeeder` and `Notifier`; every call returns at once and raises nothing.
 
-    Order of use: `starting` before each long step of start-up, `on_tick` from the control thread after every tick,
-    `stopping` once. Ready is said when the control thread has been on time for a whole window, so what systemd counts
-    as started is a runner that drives.
+    Order of use: `starting` before each long step of start-up, `on_wait` while the runner waits for an operator and
+    until it drives, `on_tick` from the control thread after every tick, `stopping` once. Ready is said when the control
+    thread has been on time for a whole window or the waiting begins, so what systemd counts as started is a runner that
+    drives, or will do so when somebody says it may.
     """
 
     def __init__(
@@ -35,11 +39,27 @@ class ServiceReporter:
         self._clock = clock
         self._ready = False
         self._said_ns: int | None = None
+        self._fed_ns = 0
+        self._waited = ""
 
     def starting(self, text: str, at_most_s: float) -> None:
         """Start-up goes on with a step that takes at most this long; more than that and systemd ends the start."""
         self._notifier.extend(at_most_s)
         self._notifier.status(text)
+
+    def on_wait(self, text: str) -> None:
+        """One turn of the loop that waits to be armed; `text`: what for. Called several times a second."""
+        if not self._notifier.enabled:
+            return
+        now_ns, period_ns = self._clock(), self._notifier.watchdog_period_ns
+        if not self._ready:
+            self._ready, self._fed_ns, self._waited = self._notifier.ready(text), now_ns, text
+            return
+        if text != self._waited and self._notifier.status(text):
+            self._waited = text
+        # Twice as often as need be: at the change to driving, the first ticks feed nothing yet.
+        if period_ns is not None and now_ns - self._fed_ns >= period_ns // 2 and self._notifier.watchdog():
+            self._fed_ns = now_ns
 
     def on_tick(self, on_time: bool) -> None:
         """Account for one tick of the control thread."""

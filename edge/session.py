@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from edge.arming import POLL_S, RefusedError, StoppedEarlyError, arm
 from edge.artifact_files import ArtifactError
 from edge.command_tap import CommandTap
 from edge.control_loop import ControlLoop
@@ -54,19 +55,10 @@ READY_TIMEOUT_S = 10.0
 OPEN_S = 60.0
 """As a service: the most that hashing, opening and warming up a large model's graphs takes."""
 STOP_CONFIRM_S = 1.0
-POLL_S = 0.05
 JOIN_S = 5.0
 """How long a thread may take to end; a call of a graph is interrupted."""
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
-
-
-class RefusedError(RuntimeError):
-    """The robot must not be driven now; one line for the operator."""
-
-
-class StoppedEarlyError(RuntimeError):
-    """A stop was asked for before the robot had been armed."""
 
 
 @dataclass(frozen=True)
@@ -152,14 +144,14 @@ class RunSession:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
-            power, control, reasoning = self._loops(inputs, sink, recorder)
+            power, control, reasoning, reporter = self._loops(inputs, sink, recorder)
             power.start()
             # After everything that lives as long as the process has been made.
             refused = lock_memory()
             if refused is not None:
                 self._lines.append(refused)
             freeze_garbage()
-            control.last_seq = self._arm(bridge)
+            control.last_seq = self._arm(bridge, reporter)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()
             process = psutil.Process()
@@ -195,13 +187,14 @@ class RunSession:
 
     def _loops(
         self, inputs: RobotInputs, sink: CommandTap, recorder: Recorder | None
-    ) -> tuple[PowerMonitor, ControlLoop, ReasoningLoop]:
+    ) -> tuple[PowerMonitor, ControlLoop, ReasoningLoop, ServiceReporter]:
         runtime, options = self._artifacts.runtime, self._options
         seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
         slot = SemanticSlot()
         ring = TokenRing(math.ceil(seconds * 1e9 / self._period_ns), self._policy.tokens_shape)
         # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
         loops: list[tuple[ControlLoop, ReasoningLoop]] = []
+        reporter = self._reporter(loops)
 
         def activity() -> Activity:
             control, reasoning = loops[0]
@@ -274,11 +267,11 @@ class RunSession:
                 ),
             ),
             supervisor=Supervisor(),
-            on_tick=self._reporter(loops).on_tick,
+            on_tick=reporter.on_tick,
             offset_covariance=inputs.offset_covariance,
         )
         loops.append((control, reasoning))
-        return power, control, reasoning
+        return power, control, reasoning, reporter
 
     def _reporter(self, loops: list[tuple[ControlLoop, ReasoningLoop]]) -> ServiceReporter:
         def describe() -> str:
@@ -301,28 +294,20 @@ class RunSession:
                 raise RefusedError(f"no {missing} from the robot in {READY_TIMEOUT_S:.0f} s on {where}{why}: is it on?")
             time.sleep(POLL_S)
 
-    def _arm(self, bridge: BridgeClient) -> int:
-        """Arm and keep the bridge fed with zeros until it has the robot on its feet; returns the last sequence used."""
-        bridge.arm()
-        limit_s = self._robot.bridge.arm_timeout_s + 2.0
-        deadline_ns = time.monotonic_ns() + round(limit_s * 1e9)
-        seq = 0
-        asked = False
-        while True:
-            seq += 1
-            bridge.send_velocity(seq, time.monotonic_ns(), 0.0, 0.0, 0.0)
-            status = bridge.poll()
-            state = status.state if status is not None else "disarmed"
-            asked = asked or state in ("arming", "armed")
-            if state == "armed":
-                return seq
-            if asked and status is not None and state in ("stopped", "disarmed"):
-                raise RefusedError(f"the bridge refused to arm: {status.reason}")
-            if time.monotonic_ns() > deadline_ns:
-                raise RefusedError(f"the bridge did not arm in {limit_s:.0f} s (its state is {state})")
-            if self._stop_requested:
-                raise StoppedEarlyError("stopped while arming")
-            time.sleep(POLL_S)
+    def _arm(self, bridge: BridgeClient, reporter: ServiceReporter) -> int:
+        """Arm, after an operator where the robot file wants one; returns the last sequence number used."""
+
+        def on_wait(text: str) -> None:
+            reporter.on_wait(text)
+            self._print_lines()
+
+        return arm(
+            bridge,
+            limit_s=self._robot.bridge.arm_timeout_s + 2.0,
+            stop_requested=lambda: self._stop_requested,
+            say=self._print,
+            on_wait=on_wait,
+        )
 
     def _drive(self, control: ControlLoop, reasoning: ReasoningLoop, inputs: RobotInputs, bridge: BridgeClient) -> None:
         """Run both threads until the end; this thread only waits, and prints what the others have to say."""

@@ -69,6 +69,8 @@ class ServiceInputs:
     memory_bytes: int
     """Memory that the runner may take."""
     control_priority: int
+    operator_arm: bool
+    """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
     bridge_cores: tuple[int, ...]
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
 
@@ -153,9 +155,13 @@ def runner_unit(inputs: ServiceInputs) -> str:
         command += [argument(text) for text in ("--trust", str(inputs.trust), "--state", str(STATE_DIRECTORY))]
     optional = tuple(path for path in (inputs.engines, inputs.trust) if path is not None)
     needed = (inputs.robot, *inputs.robot_files, inputs.artifacts, *optional)
+    arms = "--arm-at-start was given: this stands the robot up and drives by itself whenever it starts."
+    if inputs.operator_arm:
+        arms = "Stands the robot up and drives after `edge-bridge arm` only, once for each; until then it waits."
     service: list[Setting | str] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),
+        arms,
         ("ExecStart", " ".join(command)),
         ("User", inputs.user),
         "ONNX Runtime 1.29 and later keeps a device id and reports to its maker, unless told not to before it starts.",

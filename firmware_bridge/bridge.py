@@ -40,7 +40,8 @@ _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE,
 EPILOG: Final = """examples:
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
   edge-bridge stop --robot go2.toml      emergency stop: the running bridge stops the robot and refuses to arm
-  edge-bridge arm --robot go2.toml       takes that stop back, so that the runner may arm again
+  edge-bridge arm --robot go2.toml       takes that stop back, so that the runner may arm again; where the robot file
+                                         says operator_arm, no runner arms without it, and it serves one arming
   edge-bridge status --robot go2.toml    what the running bridge is doing
 exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, status: done); 1 internal failure, robot stopped
 (stop: not confirmed); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop, arm, status: no

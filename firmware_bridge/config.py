@@ -91,7 +91,8 @@ class SafetyConfig(_Section):
 
     `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
     reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
-    `remote_deadband`: share of a stick's travel that is not yet a hand on it.
+    `remote_deadband`: share of a stick's travel that is not yet a hand on it. `operator_arm`: every arming needs an
+    operator's `edge-bridge arm` before it.
     """
 
     sport_version: str = "1.0.0.1"
@@ -100,6 +101,7 @@ class SafetyConfig(_Section):
     remote_estop_keys: tuple[str, ...] = ("L2", "B")
     remote_deadband: float = _within(0.01, 0.5, 0.1)
     estop_file: Path | None = None
+    operator_arm: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -228,6 +230,8 @@ def _convert(value: object, kind: str, where: str) -> object:
         return value
     if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
+    if kind == "bool" and isinstance(value, bool):
+        return value
     if kind == "str" and isinstance(value, str) and value:
         return value
     if kind in ("Path", "Path | None") and isinstance(value, str) and value and "\0" not in value:

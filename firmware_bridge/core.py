@@ -1,7 +1,9 @@
 """The bridge's rules, without clock, socket or DDS: `BridgeCore.step(inputs, now_ns) -> Outputs`.
 
 States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
-* disarmed: nothing is ever sent, but for one case: a robot found moving when the bridge starts is stopped.
+* disarmed: nothing is ever sent, but for one case: a robot found moving when the bridge starts is stopped. Where the
+  robot file says `operator_arm`, the runner's arm is refused until an operator has said `edge-bridge arm`, since this
+  process began and since the last stop: one of them serves one arming.
 * arming: the robot says what it is and is stood up call by call, each confirmed by the mode it reports; whatever
   forbids motion, or a time-out, refuses with a reason.
 * armed: the newest good command goes out at the bridge's own rate through limits and slew.
@@ -130,6 +132,7 @@ class BridgeCore:
         self._version: str | None = None
         self._foreign = ""
         self._writes_fail = self._estop = self._held = self._had_client = self._ever_armed = False
+        self._permitted = False  # an operator has said arm since the last stop
         self._asleep_ns: int | None = None
         self._first_report_ns: int | None = None
         # When it was last: somebody else's request, a hand on the remote, its emergency keys, motion, our StopMove ...
@@ -152,6 +155,7 @@ class BridgeCore:
         danger = self._danger(now_ns)
         if danger is not None:
             self._stop(*danger, now_ns)
+            self._permitted = self._permitted and danger[0] != "estop"  # who presses it means a disarmed robot too
         self._stop_if_found_moving(now_ns)
         for message in inputs.messages:
             if isinstance(message, Arm):
@@ -197,7 +201,9 @@ class BridgeCore:
         self._writes_fail, self._estop = report.writes_fail, inputs.estop
         for message in inputs.operator:
             if isinstance(message, (Arm, Stop)):
-                self._held = isinstance(message, Stop)
+                self._held, self._permitted = isinstance(message, Stop), isinstance(message, Arm)
+                if self._permitted and self._cause == "operator":
+                    self._cause, self._reason = "none", "permitted by an operator, waiting for a client to arm"
             else:
                 self._rejected += 1  # only the runner's socket commands
         if inputs.client and not self._had_client:
@@ -240,10 +246,16 @@ class BridgeCore:
             return "battery_low", f"the battery has {percent} %, at least {least} % are needed"
         if self._version not in (None, wanted):
             return "wrong_robot", f"the robot's sport service is {self._version}, the robot file expects {wanted}"
+        if self._safety.operator_arm and not self._permitted:
+            return "operator", "waiting for an operator's `edge-bridge arm`"
         return None
 
     def _arm(self, now_ns: int) -> None:
         if self._state in ("arming", "armed"):
+            return
+        if self._safety.operator_arm and not self._permitted:
+            # Before everything else and without a change of state: a runner may ask for hours.
+            self._cause, self._reason = "operator", "arm refused: waiting for an operator's `edge-bridge arm`"
             return
         self._state, self._cause, self._reason = "arming", "none", "waiting for the robot's state"
         self._arm_until_ns, self._good_until_ns = now_ns + self._arm_timeout_ns, 0
@@ -318,7 +330,7 @@ class BridgeCore:
             self._send_stop(now_ns)
         self._state = "disarmed" if refused and not self._ever_armed else "stopped"
         self._cause, self._reason = cause, f"arm refused: {reason}" if refused else reason
-        self._target, self._stopped_ns = _ZERO, now_ns
+        self._target, self._stopped_ns, self._permitted = _ZERO, now_ns, False
 
     def _stop_if_found_moving(self, now_ns: int) -> None:
         """A bridge that died while driving left a moving robot behind; its successor stops it before anything else."""

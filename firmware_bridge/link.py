@@ -22,7 +22,7 @@ CAUSES: Final = (
     *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
     *("estop", "remote_takeover", "second_commander", "link_down"),
     *("state_silent", "wrong_mode", "robot_error", "tipped", "robot_moving"),
-    *("not_standing", "battery_low", "wrong_robot"),
+    *("not_standing", "battery_low", "wrong_robot", "operator"),
 )
 """Why the bridge has stopped or would refuse to arm.
 
@@ -32,7 +32,8 @@ emergency keys; remote_takeover: a stick or key of the robot's remote; second_co
 are not ours; link_down: the network does not take our commands; state_silent: no usable report from the robot;
 wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
 robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
-than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or does not say.
+than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or does not say;
+operator: the robot file asks for an operator's `edge-bridge arm`, which has not come yet.
 """
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512

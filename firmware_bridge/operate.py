@@ -59,7 +59,7 @@ def _ask(command: str, client: BridgeClient) -> BridgeStatus | None:
 
 
 def _is_done(command: str, status: BridgeStatus) -> bool:
-    """A stop shows as the reason not to arm, with the robot stopped or never driven."""
+    """A stop shows as the reason not to arm, with the robot stopped or never driven; an arm as that reason's end."""
     if command == "stop":
         return status.blocked_by == "estop" and status.state in ("stopped", "disarmed")
-    return True
+    return command != "arm" or status.blocked_by != "operator"

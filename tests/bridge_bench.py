@@ -28,7 +28,8 @@ STILL = RobotState(
 class Bench:
     """A bridge core with a clock one turns by hand, a robot that reports `mode`, and everything that was written.
 
-    `robot`: what else the robot reports (fields of RobotState); `version`: what it answers when asked what it is.
+    `robot`: what else the robot reports (fields of RobotState); `version`: what it answers when asked what it is;
+    `safety`: that of the robot file.
     """
 
     mode: int | None = ids.MODE_BALANCE_STAND
@@ -39,10 +40,11 @@ class Bench:
     robot: dict[str, object] = field(default_factory=dict)
     estop: bool = False
     asleep_ns: int = 0
+    safety: SafetyConfig = SAFETY
     written: list[tuple[int, Move | Call]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.core = BridgeCore(BRIDGE, LIMITS, SAFETY, self.now_ns)
+        self.core = BridgeCore(BRIDGE, LIMITS, self.safety, self.now_ns)
         self.asked = False
 
     def step(

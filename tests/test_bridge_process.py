@@ -365,6 +365,33 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 
+def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
+    robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(GO2_SIM.read_text().replace("operator_arm = false", "operator_arm = true"))
+    robot.reset()
+    arguments = ("--robot", file, "--domain", dds_domain, "--socket", socket_path)
+    with running("firmware_bridge.bridge", *arguments, folder=tmp_path):
+        client = BridgeClient(socket_path)
+
+        def told(state: str, cause: str) -> bool:
+            status = client.poll()
+            return status is not None and (status.state, status.cause) == (state, cause)
+
+        client.arm()
+        wait_for(lambda: told("disarmed", "operator"), 10, "the refusal")
+        assert robot.heard == []
+        assert operate("arm", socket_path)[0] == 0
+        client.arm()
+        wait_for(lambda: told("armed", "none"), 20, "armed")
+        client.stop()
+        wait_for(lambda: told("stopped", "client_stop"), 10, "stopped")
+        client.arm()
+        wait_for(lambda: told("stopped", "operator"), 10, "the second refusal")
+        client.close()
+
+
 def test_the_status_of_a_running_bridge_is_json_on_request(
     bridge: Running, socket_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

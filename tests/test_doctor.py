@@ -137,6 +137,11 @@ def test_a_bridge_that_would_refuse_says_why(robot: RobotConfig) -> None:
     assert (check.level, "estop" in check.advice) == (Level.FAIL, True)
 
 
+def test_a_bridge_that_waits_for_its_operator_is_fine_and_says_so(robot: RobotConfig) -> None:
+    check = bridge(robot, lambda _robot: status("disarmed", "operator"))
+    assert (check.level, "edge-bridge arm" in check.found) == (Level.OK, True)
+
+
 def test_a_bridge_that_is_not_there_fails(robot: RobotConfig) -> None:
     assert bridge(robot).level is Level.FAIL
 

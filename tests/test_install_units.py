@@ -19,12 +19,12 @@ from edge.install_units import Host, robot_networks, unreadable
 from edge.signature import keygen
 from edge.unit_check import UnitVerdict
 from edge.unit_text import UnitError
-from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE
+from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SOCKET, SYSUSERS_FILE
 from export.target import load_target
 from firmware_bridge.config import DdsConfig
 from tests.processes import REPOSITORY
 
-GO2 = REPOSITORY / "firmware_bridge" / "robots" / "go2.toml"
+SHIPPED = REPOSITORY / "firmware_bridge" / "robots" / "go2.toml"
 ADDRESSES = {"lo": [("127.0.0.1", "255.0.0.0")], "eth0": [("192.168.123.99", "255.255.255.0")]}
 GOOD = UnitVerdict((), (), {BRIDGE_UNIT: 1.3, RUNNER_UNIT: 1.4}, ())
 
@@ -53,11 +53,16 @@ Units = Callable[..., tuple[int, dict[str, Any] | None]]
 def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
     """Runs the command; its exit code and its result."""
 
-    def run(*more: str, on: Host = host, artifacts: Path = artifacts_dir, text: str = "walk") -> Any:
+    robot = tmp_path / "go2.toml"
+    robot.write_text(SHIPPED.read_text().replace("operator_arm = false", "operator_arm = true"))
+
+    def run(
+        *more: str, on: Host = host, artifacts: Path = artifacts_dir, text: str = "walk", robot: Path = robot
+    ) -> Any:
         result = tmp_path / "result.json"
         result.unlink(missing_ok=True)
         place = [] if "--system" in more else ["--out", str(tmp_path / "units")]
-        words = ["--artifacts", str(artifacts), "--robot", str(GO2), "--json", str(result), *place, *more]
+        words = ["--artifacts", str(artifacts), "--robot", str(robot), "--json", str(result), *place, *more]
         if "--instruction-file" not in more:
             words += ["--instruction", text]
         code = main(["units", *words], host=on)
@@ -72,16 +77,42 @@ def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Uni
     assert {path.name for path in (tmp_path / "units").iterdir()} == {BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE}
     assert result is not None
     assert result["exposure"] == GOOD.exposure
-    assert result["commands"][-2:] == [
+    assert result["commands"][-3:-1] == [
         f"sudo systemctl enable --now {BRIDGE_UNIT}",
-        f"sudo systemctl start {RUNNER_UNIT}",
+        f"sudo systemctl enable --now {RUNNER_UNIT}",
     ]
+    arm = f"sudo {tmp_path}/bin/edge-bridge arm --robot {tmp_path}/go2.toml --socket {SOCKET}"
+    assert result["commands"][-1] == arm
 
 
-def test_a_machine_that_starts_again_does_not_drive_by_itself(units: Units) -> None:
-    _, result = units()
+def test_a_robot_that_would_drive_as_soon_as_its_service_starts_is_refused_in_one_line(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert units(robot=SHIPPED) == (EXIT_BAD_INPUT, None)
+    error = capsys.readouterr().err
+    assert "safety.operator_arm: expected true, found false" in error and error.count("\n") == 1
+    assert not (tmp_path / "units").exists()
+
+
+def test_with_consent_it_is_written_and_says_so_but_is_not_started_with_the_machine(
+    units: Units, tmp_path: Path
+) -> None:
+    code, result = units("--arm-at-start", robot=SHIPPED)
+    assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl start {RUNNER_UNIT}")
     assert result is not None
     assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])
+    assert "# --arm-at-start was given: " in (tmp_path / "units" / RUNNER_UNIT).read_text()
+
+
+def test_a_runner_that_waits_for_an_operator_says_so_in_its_unit(units: Units, tmp_path: Path) -> None:
+    units()
+    text = (tmp_path / "units" / RUNNER_UNIT).read_text()
+    assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
+
+
+def test_consent_that_the_robot_file_makes_useless_is_said(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
+    assert units("--arm-at-start")[0] == EXIT_DONE
+    assert "--arm-at-start changes nothing" in capsys.readouterr().err
 
 
 def test_a_user_that_exists_is_not_made_again(units: Units, host: Host, tmp_path: Path) -> None:

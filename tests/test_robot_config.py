@@ -57,6 +57,7 @@ def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
         ('["L2", "B"]', "[]", "safety.remote_estop_keys: expected one or more of R1"),
         ("remote_deadband = 0.1", "remote_deadband = 0", "safety.remote_deadband: expected 0.01..0.5, found 0.0"),
         ("remote_deadband = 0.1", 'estop_file = "gpio"', "safety.estop_file: expected an absolute path"),
+        ("operator_arm = false", "operator_arm = 1", "safety.operator_arm: expected bool, found 1"),
         ("accepted_error_codes = [0]", "accepted_error_codes = [true]", "expected int, found True"),
         ('socket = "bridge.sock"', 'socket = "a\\u0000b"', "bridge.socket: expected Path"),
     ],

@@ -40,6 +40,7 @@ def inputs(**changes: object) -> ServiceInputs:
         groups=(),
         memory_bytes=12 << 30,
         control_priority=50,
+        operator_arm=True,
         bridge_cores=(),
     )
     return dataclasses.replace(defaults, **changes)

@@ -134,6 +134,41 @@ def test_systemd_hears_nothing_of_a_control_thread_that_is_late(service: Service
     assert {"WATCHDOG": "1"} not in service.tick(100, on_time=False)
 
 
+def wait(service: Service, count: int, text: str = "waiting to be armed") -> list[dict[str, str]]:
+    """Turns of the waiting loop, two in the time of a tick."""
+    for _ in range(count):
+        service.reporter.on_wait(text)
+        service.now_ns += TICK_NS // 2
+    return service.manager.messages()
+
+
+def test_a_runner_that_waits_for_an_operator_is_ready_and_says_what_for(service: Service) -> None:
+    assert wait(service, 1) == [{"READY": "1", "STATUS": "waiting to be armed"}]
+    assert not any("READY" in message for message in [*wait(service, 1000), *service.tick(100)])
+
+
+def test_waiting_feeds_the_watchdog_in_time_from_ready_until_ticks_do(service: Service) -> None:
+    assert any("READY" in message for message in wait(service, 1))
+    fed = [service.now_ns]
+    for turn in (wait, lambda service, count: wait(service, count, "arming"), Service.tick):
+        for _ in range(200):
+            if {"WATCHDOG": "1"} in turn(service, 1):
+                fed.append(service.now_ns)
+        assert service.now_ns - fed[-1] <= PING_NS
+    assert max(later - earlier for earlier, later in itertools.pairwise(fed)) <= 1.5 * PING_NS, "of 2, WatchdogSec"
+
+
+def test_a_waiting_loop_that_stands_still_feeds_nothing(service: Service) -> None:
+    wait(service, 100)
+    service.now_ns += 10 * PING_NS
+    assert service.manager.messages() == []
+
+
+def test_what_is_waited_for_is_said_when_it_changes(service: Service) -> None:
+    wait(service, 1)
+    assert wait(service, 3, "arming") == [{"STATUS": "arming"}]
+
+
 def test_the_status_line_is_renewed_without_flooding(service: Service) -> None:
     service.tick(WINDOW_TICKS)
     said = [message for message in service.tick(150) if set(message) == {"STATUS"}]
