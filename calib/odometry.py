@@ -25,7 +25,7 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_
 from edge.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.drift_rate import Comparison, DriftMonitor
 from edge.geometry import SE2, interpolate, wrap_angle
-from edge.odometry_calibration import OdometryCalibration
+from edge.odometry_calibration import CalibrationError, OdometryCalibration
 from edge.odometry_gate import Increment, OdometryGate, OdometryInputs
 from edge.recording import RecordingError, jpeg_bytes, read_messages
 from edge.visual_odometry import VisualMotion, VisualOdometry, grey_frame
@@ -49,6 +49,10 @@ STILL_RADPS = math.radians(2.0)
 
 class LogError(ValueError):
     """A log that cannot be calibrated from; one line: what is missing, what to do."""
+
+
+class NoFitError(ValueError):
+    """The fit led to a calibration that no robot has; one line."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +220,7 @@ def _pose_at(stamps: Sequence[int], poses: Sequence[SE2], stamp_ns: int) -> SE2:
 
 
 def fit(drive: Drive, references: Sequence[Reference], prior: OdometryCalibration) -> Fit:
-    """Fit scales and drift to the references. Raises LogError when no interval of the drive has one."""
+    """Fit scales and drift to the references. Raises LogError when none can be compared, or NoFitError."""
     bias, bias_sigma = gyro_bias(drive, prior)
     has_gyro = drive.reports[0].gyro_wz_radps is not None
     model = OdometryModel(has_gyro, bias if has_gyro else 0.0, 0.0, 0.0, 1.0, 1.0, GYRO_NOISE_RADPS_RTHZ, 0.05, 0.05)
@@ -253,14 +257,26 @@ def fit(drive: Drive, references: Sequence[Reference], prior: OdometryCalibratio
         raise LogError(f"the robot moved {rate.distance_m:.1f} m in all: expected at least {MIN_DISTANCE_M:g} m")
     assert rate.m_per_m_sigma is not None and rate.rad_per_m_sigma is not None
     motion = math.sqrt(float((true**2).sum()))
-    return Fit(
-        calibration=replace(
+    try:
+        calibration = replace(
             prior,
-            scale_x=scale_x, scale_x_sigma=sigma_x[0], scale_y=scale_y, scale_y_sigma=sigma_y[0],
-            scale_yaw=scale_yaw, scale_yaw_sigma=sigma_yaw[0], sideways_m_per_m=sideways, sideways_sigma=sigma_y[1],
-            gyro_bias_radps=bias, gyro_bias_sigma_radps=bias_sigma,
-            drift_m_per_m=max(rate.m_per_m, 1e-3), drift_rad_per_m=max(rate.rad_per_m, 1e-4),
-        ),
+            scale_x=scale_x,
+            scale_x_sigma=sigma_x[0],
+            scale_y=scale_y,
+            scale_y_sigma=sigma_y[0],
+            scale_yaw=scale_yaw,
+            scale_yaw_sigma=sigma_yaw[0],
+            sideways_m_per_m=sideways,
+            sideways_sigma=sigma_y[1],
+            gyro_bias_radps=bias,
+            gyro_bias_sigma_radps=bias_sigma,
+            drift_m_per_m=max(rate.m_per_m, 1e-3),
+            drift_rad_per_m=max(rate.rad_per_m, 1e-4),
+        )
+    except CalibrationError as error:
+        raise NoFitError(f"odometry and reference do not describe the same drive ({error})") from error
+    return Fit(
+        calibration=calibration,
         intervals=len(pairs),
         distance_m=rate.distance_m,
         unexplained_before=math.sqrt(float(((raw - true) ** 2).sum())) / motion,
@@ -320,6 +336,9 @@ def run(args: argparse.Namespace) -> int:
             )
             write_whole(args.out, fitted.calibration.to_toml(comment))
         write_result(args.json, {"good": fitted.good, **asdict(fitted)})
+    except NoFitError as error:
+        sys.stderr.write(f"edge-calib odometry: {error}\n")
+        return EXIT_CHECK_FAILED
     except (LogError, RecordingError, ConfigError, OSError) as error:
         sys.stderr.write(f"edge-calib odometry: {error}\n")
         return EXIT_BAD_INPUT

@@ -274,8 +274,9 @@ def _table(summary: dict[str, Any]) -> str:
         s = summary[level]
         lines += [
             f"{level}: {s['runs']} walks, {s['windows']} windows of 5 s",
-            f"  position  {1e3 * s['raw_rms_m']:7.1f} mm raw {1e3 * s['fused_rms_m']:7.1f} mm fused ×{s['ratio_m']:.2f}",
-            f"  heading   {s['raw_rms_deg']:7.2f} °  raw {s['fused_rms_deg']:7.2f} °  fused ×{s['ratio_rad']:.2f}",
+            f"  position  {1e3 * s['raw_rms_m']:6.1f} mm raw {1e3 * s['fused_rms_m']:6.1f} mm fused"
+            f" ×{s['ratio_m']:.2f}",
+            f"  heading   {s['raw_rms_deg']:6.2f} °  raw {s['fused_rms_deg']:6.2f} °  fused ×{s['ratio_rad']:.2f}",
             f"  NEES      {s['nees_mean']:.2f} (95 % band {s['nees_band'][0]:.2f}..{s['nees_band'][1]:.2f}); "
             f"all windows {s['nees_all_windows']:.2f}, {100 * s['nees_below_95']:.0f} % below {CHI2_95_3}",
         ]
