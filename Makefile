@@ -8,10 +8,11 @@ SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
 
-.PHONY: help demo test lint clean
+.PHONY: help demo faults test lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
+	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
 	@echo "make test   lint, type-check and run the tests"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
@@ -32,6 +33,11 @@ help:
 
 demo: .venv/.demo-installed
 	@$(BIN)/python -m tools.demo --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
+
+# The demo's artifacts, if they are there; otherwise its own.
+faults: .venv/.demo-installed
+	@test -f out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
+	@$(BIN)/python -m tools.faults --artifacts out/demo/artifacts --out out/faults
 
 lint: .venv/.test-installed
 	$(BIN)/ruff check .
