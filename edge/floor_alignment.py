@@ -35,7 +35,7 @@ class AlignmentConfig:
     grey_sigma: float = 1.5
     """Of a pixel of a smoothed picture, at least."""
     smooth_px: float = 1.0
-    points: int = 700
+    points: int = 500
     min_points: int = 150
     min_gradient: float = 2.5
     """Grey levels a pixel: flatter floor says nothing."""
@@ -45,7 +45,7 @@ class AlignmentConfig:
     settle_m: float = 0.06
     settle_rad: float = math.radians(3.0)
     """How far the pictures may lead from where the corners pointed."""
-    correlation: float = 12.0
+    correlation: float = 8.5
     """By how much the covariance of independent pixels is too small: neighbours share blur, texture and sampling."""
 
     def __post_init__(self) -> None:
@@ -88,9 +88,14 @@ def fit_corners(
     outlier = 2 * config.inlier_px
     normal = np.eye(6)
     weight = np.zeros(len(before))
+    jacobian = np.zeros((len(before), 2, 6))
     for iteration in range(8):
-        r, jacobian = _pixels_of(projector, before, attitude, q)
-        r = r - seen
+        # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
+        if iteration in (0, 2):
+            at, jacobian = _pixels_of(projector, before, attitude, q)
+        else:
+            at = _project(projector, before, attitude, q)
+        r = at - seen
         size = np.abs(r).max(axis=1)
         close = size < outlier
         if np.count_nonzero(close) < 6:
@@ -103,7 +108,7 @@ def fit_corners(
         if step is None:
             return None
         q = q + step
-        if iteration >= 2 and np.abs(step[:3]).max() < 1e-5:
+        if iteration >= 2 and np.abs(step[:3]).max() < 1e-4:
             break
     inliers = int(np.count_nonzero(weight > 0.05))
     # The axes of one corner err together, and neighbouring corners share texture: count half of them as independent.
@@ -143,7 +148,6 @@ def align_pictures(
         )
 
     for iteration in range(10):
-        # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
         if iteration in (0, 2):
             at = reprojected(q)
             jacobian = np.stack([(reprojected(q + step) - at) / step.sum() for step in np.diag(_STEPS)], axis=-1)

@@ -28,7 +28,7 @@ from edge.visual_odometry import VisualMotion
 
 __all__ = ["DriftConfig", "DriftEstimator", "OdometryInputs", "OdometryOutputs"]
 
-_SHORT = 1.2
+_SHORT = 1.3
 """Error rate of a few decimetres over that of a metre, in which part of it has already averaged out."""
 
 
@@ -38,10 +38,11 @@ class DriftConfig:
 
     gyro_noise_radps_rthz: float = math.radians(0.08)
     """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
-    gyro_bias_walk_radps_rts: float = math.radians(0.002)
+    gyro_bias_walk_radps_rts: float = math.radians(0.008)
+    """A trotting body rolls and pitches, which its own vertical axis takes for a turn: 0.02 to 0.07 °/s, simulated."""
     scale_walk_rtm: float = 0.005
     """Change of the odometry's scales per square root of a metre."""
-    visual_scale_sigma: float = 0.008
+    visual_scale_sigma: float = 0.007
     """Error that all visual motions share: of the camera's height and mounting angle."""
     visual_gate: float = 25.0
     """Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""

@@ -42,7 +42,7 @@ def walk(seed: int, metres: float = 22.0) -> Walk:
 
 @pytest.fixture(scope="module")
 def runs() -> dict[str, list[drift.DriftRun]]:
-    walks = [walk(seed) for seed in range(4)]
+    walks = [walk(seed) for seed in range(2)]
     return {level: [drift.replay(w, level, 10 + w.seed) for w in walks] for level in drift.TESTED}
 
 
