@@ -253,6 +253,29 @@ def test_a_throttle_alert_is_throttling_and_a_fan_or_a_clock_cap_at_rest_is_not(
     assert not ThermalReader(TREES / "orin_nx_jp5").read(0).throttled
 
 
+def test_a_surface_too_hot_to_touch_slows_nothing_down(tmp_path: Path) -> None:
+    # At 71 °C a Jetson in an everyday mode has 28 °C left; its alert's own passive trip is at 70 °C.
+    root = copied(tmp_path, "orin_nx_jp6")
+    thermal = root / "class/thermal"
+    for zone in thermal.glob("thermal_zone*/temp"):
+        zone.write_text("71000\n")
+    (thermal / "cooling_device2/cur_state").write_text("0\n")
+    (thermal / "cooling_device3/cur_state").write_text("1\n")
+    state = ThermalReader(root).read(0)
+    assert state.throttling == ()
+    assert state.throttle_margin_c == pytest.approx(28.0)
+
+
+def test_a_passive_trip_that_slows_something_down_counts_whatever_else_it_does(tmp_path: Path) -> None:
+    root = copied(tmp_path, "orin_nx_jp6")
+    zone = root / "class/thermal/thermal_zone0"
+    (zone / "cdev1_trip_point").write_text("0\n")
+    assert ThermalReader(root).read(0).throttle_margin_c == pytest.approx(70.0 - 74.281)
+    for path in zone.glob("cdev*_trip_point"):
+        path.unlink()
+    assert ThermalReader(root).read(0).throttle_margin_c == pytest.approx(70.0 - 74.281)
+
+
 def test_a_throttle_counter_of_a_processor_counts_from_the_last_reading(tmp_path: Path) -> None:
     root = copied(tmp_path, "laptop_rapl")
     reader = ThermalReader(root)

@@ -20,8 +20,10 @@ LOWEST_C, HIGHEST_C = -40.0, 150.0
 """A disabled Jetson zone reads -256 °C."""
 LOWEST_TRIP_C: Final = 50.0
 """A passive trip below it is a user's trip that nobody has set."""
+WARNS_ONLY: Final = "hot-surface-alert"
+"""Jetson's cooling device that says "do not touch" from a passive trip at 70 °C on, and slows nothing down."""
 # A fan that turns is no throttling, and some boards cap devfreq at rest.
-_THROTTLES = re.compile(r"(.*-throttle-alert|hot-surface-alert|Processor|(thermal-)?cpufreq-(cpu)?\d+)")
+_THROTTLES = re.compile(r"(.*-throttle-alert|Processor|(thermal-)?cpufreq-(cpu)?\d+)")
 _GPU = (
     "devices/platform/17000000.gpu",
     "devices/platform/bus@0/17000000.gpu",
@@ -126,6 +128,14 @@ def _zone(path: Path) -> _Zone | None:
     for kind_file in sorted(path.glob("trip_point_*_type")):
         kind = read_text(kind_file)
         milli_c = read_int(kind_file.with_name(kind_file.name.replace("_type", "_temp")))
+        if kind == "passive" and _bound(path, kind_file.name.split("_")[2]) == {WARNS_ONLY}:
+            continue
         if kind in trips and milli_c is not None and LOWEST_TRIP_C <= milli_c / 1e3 <= HIGHEST_C:
             trips[kind].append(milli_c / 1e3)
     return _Zone(name, path / "temp", min(trips["passive"], default=None), min(trips["critical"], default=None))
+
+
+def _bound(zone: Path, trip: str) -> set[str]:
+    """Types of the cooling devices that a zone's trip point acts on."""
+    files = [path for path in zone.glob("cdev*_trip_point") if read_text(path) == trip]
+    return {name for path in files if (name := read_text(zone / path.name.partition("_")[0] / "type")) is not None}
