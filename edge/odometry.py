@@ -269,7 +269,7 @@ class DriftEstimator:
         innovation[2] = wrap_angle(float(innovation[2]))
         model = by - interval.gains
         total = model @ self._covariance @ model.T + visual + interval.white
-        if float(innovation @ np.linalg.solve(total, innovation)) > self._config.visual_gate:
+        if not float(innovation @ np.linalg.solve(total, innovation)) <= self._config.visual_gate:  # also for NaN
             return False
         gain = self._covariance @ model.T @ np.linalg.inv(total)
         change = gain @ innovation

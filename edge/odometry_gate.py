@@ -13,6 +13,9 @@ MAX_AGE_LIMIT_NS = 150_000_000
 MAX_AGE_ZERO_NS = 250_000_000
 """Row 11: older than 150 ms limits the speed, older than 250 ms stops."""
 
+MAX_NUMBER = 1e7
+"""A position, angle or speed beyond it is no measurement, and would break arithmetic."""
+
 
 @dataclass(frozen=True)
 class GateConfig:
@@ -113,7 +116,7 @@ class OdometryGate:
             self._last = report
             return Verdict(None, findings)
         dt_s = elapsed_s(last, report)
-        if dt_s <= 0:
+        if dt_s <= 0 or report.received_ns <= last.received_ns:
             self.rejected += 1
             return Verdict(None, findings)
         jumped = self._jump(last, report, dt_s)
@@ -241,7 +244,7 @@ def _finite(report: OdometryInputs, norm_tolerance: float) -> bool:
     gyro = report.gyro_wz_radps
     values = (*report.T_odom_base, report.vx_mps, report.vy_mps, report.wz_radps, 0.0 if gyro is None else gyro,
               report.roll_rad, report.pitch_rad)  # fmt: skip
-    if not all(map(math.isfinite, values)):
+    if not all(abs(value) <= MAX_NUMBER for value in values):  # False for NaN
         return False
     return report.quaternion_norm is None or abs(report.quaternion_norm - 1.0) <= norm_tolerance
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge.geometry import SE2, wrap_angle
 from edge.odometry import DriftEstimator, OdometryInputs
@@ -234,3 +236,27 @@ def test_camera_motions_that_come_twice_or_out_of_order_are_used_once() -> None:
     # Of the first second the robot stood: those tell nothing.
     assert estimator.visual_used <= len(motions) // 2
     assert estimator.visual_used > 0
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+reports = st.builds(
+    OdometryInputs,
+    received_ns=st.integers(0, 2**62),
+    T_odom_base=st.tuples(numbers, numbers, numbers),
+    vx_mps=numbers,
+    vy_mps=numbers,
+    wz_radps=numbers,
+    gyro_wz_radps=st.none() | numbers,
+    robot_stamp_ns=st.integers(0, 2**62),
+    foot_forces=st.none() | st.tuples(*[st.floats(-1e4, 1e4)] * 4),
+    commanded=st.none() | st.tuples(*[st.floats(-2, 2)] * 3),
+)
+
+
+@given(st.lists(reports, max_size=12))
+def test_whatever_a_robot_reports_nothing_raises_and_no_pose_is_garbage(garbage: list[OdometryInputs]) -> None:
+    path, estimator = drive(0.2), DriftEstimator()
+    for report in [*path.reports, *garbage]:
+        outputs = estimator.step(report, report.received_ns)
+        assert outputs.pose is None or all(map(math.isfinite, outputs.pose.T_odom_base.as_tuple()))
+        estimator.motion_offset(report.received_ns - SECOND_NS)
