@@ -20,6 +20,7 @@ from edge.artifact_files import (
     read_manifest_bytes,
 )
 from edge.external_data import ExternalDataError, external_data
+from edge.provider_options import wrong_option
 from edge.reasoning_text import WAYPOINT_TIMES_S
 from edge.signature import Trust
 
@@ -283,6 +284,9 @@ def _session(graph: str, entry: Any) -> SessionConfig:
     options = entry["options"]
     if wrong or not all(isinstance(value, str) for value in options.values()):
         raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session {[*wrong, 'options'][0]} is of the wrong type")
+    refused = wrong_option(entry["provider"], options)
+    if refused is not None:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session {refused}")
     threads = entry["threads"]
     if threads is not None and not 1 <= threads <= 256:
         raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session threads {threads}, expected 1 to 256")

@@ -301,7 +301,8 @@ def test_a_free_axis_without_a_profile_is_refused(directory: Path, engines: Path
 
 
 def test_a_provider_whose_engines_cannot_be_kept_is_refused(directory: Path, engines: Path) -> None:
-    edit(directory, lambda m: m["graphs"]["vision_encoder"]["session"].update(provider="CPUExecutionProvider"))
+    cpu = {"provider": "CPUExecutionProvider", "options": {}}
+    edit(directory, lambda m: m["graphs"]["vision_encoder"]["session"].update(cpu))
     with pytest.raises(EngineError, match="CPUExecutionProvider is not a provider whose engines can be kept"):
         build(load_artifacts(directory), engines, silent, FakeTensorRt().machine())
 

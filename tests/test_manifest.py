@@ -17,11 +17,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from edge.artifact_files import SCHEMA_VERSION, ArtifactError, seal
+from edge.engines import PROFILES
 from edge.graph import Graph
 from edge.language import LanguageModel
 from edge.manifest import load_artifacts
 from edge.policy import Policy
+from edge.provider_options import wrong_option
 from export.cli import main
+from export.target import load_target
 
 
 @pytest.fixture
@@ -375,6 +378,31 @@ def test_a_graph_without_a_whole_session_entry_is_refused(copy: Path, session: o
     edit(copy, lambda m: m["graphs"]["vision_encoder"].update(session=session))
     with pytest.raises(ArtifactError, match="session"):
         load_artifacts(copy)
+
+
+@pytest.mark.parametrize(
+    ("provider", "options"),
+    [
+        ("TensorrtExecutionProvider", {"trt_extra_plugin_lib_paths": "language_model.onnx.data"}),
+        ("TensorrtExecutionProvider", {"trt_engine_cache_path": "engines"}),
+        ("TensorrtExecutionProvider", {"trt_fp16_enable": "/tmp/plugin.so"}),
+        ("CUDAExecutionProvider", {"gpu_mem_limit": "../plugin"}),
+        ("CPUExecutionProvider", {"anything": "1"}),
+        ("QNNExecutionProvider", {"backend_path": "libQnnHtp.so"}),
+    ],
+    ids=str,
+)
+def test_a_session_option_that_could_load_a_file_is_refused(copy: Path, provider: str, options: dict[str, str]) -> None:
+    edit(copy, lambda m: m["graphs"]["vision_encoder"]["session"].update(provider=provider, options=options))
+    with pytest.raises(ArtifactError, match=rf"vision_encoder: session option .*{next(iter(options))}"):
+        load_artifacts(copy)
+
+
+@pytest.mark.parametrize("target", ["cpu", "orin", "rtx4060"])
+def test_the_session_options_of_the_shipped_targets_are_taken(target: str) -> None:
+    for provider in load_target(target).providers.values():
+        profile = {f"trt_profile_{kind}_shapes": "a.b:1x2,c:3x4" for kind in PROFILES} if provider.engine else {}
+        assert wrong_option(provider.name, {**provider.options, **profile}) is None
 
 
 def test_a_provider_that_this_machine_lacks_is_refused_by_name(copy: Path) -> None:
