@@ -50,6 +50,9 @@ _REMOTE_NS: Final = _NS_PER_S  # our choice: how long a remote that was touched 
 _YIELD_NS: Final = 200 * _NS_PER_MS  # zeros that go out before a person at the remote has the robot alone
 _COMMANDER_NS: Final = 2 * _NS_PER_S  # twice as long as a Go2 holds a Move
 _ASLEEP_NS: Final = 100 * _NS_PER_MS
+_BATTERY_NS: Final = 10 * _NS_PER_S  # our choice: ten of the bridge's own looks at it
+_NO_STATE: Final = ("state_silent", "the robot reports no state")
+_NO_BATTERY: Final = ("battery_low", "no battery report")
 
 
 @dataclass(frozen=True)
@@ -128,10 +131,11 @@ class BridgeCore:
         self._growth = tuple(a / bridge.rate_hz for a in (limits.accel_mps2, limits.accel_mps2, limits.alpha_radps2))
         self._state, self._cause, self._reason = "disarmed", "none", "waiting for a client to arm"
         self._robot: RobotState | None = None
-        self._battery_percent: int | None = None
+        self._battery_percent, self._battery_ns = 0, _NEVER_NS
         self._version: str | None = None
         self._foreign = ""
-        self._writes_fail = self._estop = self._held = self._had_client = self._ever_armed = False
+        self._held = ""  # why an operator's arm is needed before anything moves
+        self._writes_fail = self._estop = self._had_client = self._ever_armed = False
         self._permitted = False  # an operator has said arm since the last stop
         self._asleep_ns: int | None = None
         self._first_report_ns: int | None = None
@@ -196,16 +200,17 @@ class BridgeCore:
         if report.foreign is not None:
             self._foreign, self._foreign_ns = report.foreign, now_ns
         if report.battery_percent is not None:
-            self._battery_percent = report.battery_percent
+            self._battery_percent, self._battery_ns = report.battery_percent, now_ns
         self._version = report.version or self._version
         self._writes_fail, self._estop = report.writes_fail, inputs.estop
-        for message in inputs.operator:
-            if isinstance(message, (Arm, Stop)):
-                self._held, self._permitted = isinstance(message, Stop), isinstance(message, Arm)
-                if self._permitted and self._cause == "operator":
-                    self._cause, self._reason = "none", "permitted by an operator, waiting for a client to arm"
-            else:
-                self._rejected += 1  # only the runner's socket commands
+        if any(isinstance(message, Stop) for message in inputs.operator):  # an arm beside it does not undo it
+            self._held, self._permitted = "emergency stop by an operator", False
+        elif any(isinstance(message, Arm) for message in inputs.operator):
+            self._held, self._permitted = "", True
+            if self._cause == "operator":
+                self._cause, self._reason = "none", "permitted by an operator, waiting for a client to arm"
+        # Only the runner's socket commands.
+        self._rejected += sum(not isinstance(message, (Arm, Stop)) for message in inputs.operator)
         if inputs.client and not self._had_client:
             self._last_seq = -1  # numbering is per connection
         self._had_client = inputs.client
@@ -217,7 +222,7 @@ class BridgeCore:
         """(cause, reason) of what forbids motion now, in every state."""
         robot = self._fresh(now_ns, self._state_timeout_ns)
         if self._held:
-            return "estop", "emergency stop by an operator; `edge-bridge arm` takes it back"
+            return "estop", f"{self._held}; `edge-bridge arm` takes it back"
         if self._estop:
             return "estop", "emergency stop pressed at the local input"
         if now_ns - self._remote_estop_ns < _REMOTE_NS:
@@ -241,8 +246,10 @@ class BridgeCore:
         if (danger := self._danger(now_ns)) is not None:
             return danger
         if self._fresh(now_ns, self._state_timeout_ns) is None:
-            return "state_silent", "the robot reports no state"
-        if percent is not None and percent < least:
+            return _NO_STATE
+        if least > 0 and now_ns - self._battery_ns > _BATTERY_NS:
+            return _NO_BATTERY
+        if percent < least:
             return "battery_low", f"the battery has {percent} %, at least {least} % are needed"
         if self._version not in (None, wanted):
             return "wrong_robot", f"the robot's sport service is {self._version}, the robot file expects {wanted}"
@@ -277,22 +284,24 @@ class BridgeCore:
             self._target = (vx, vy, wz)
 
     def _stand_up(self, now_ns: int) -> None:
-        robot, blocked = self._fresh(now_ns, self._state_timeout_ns), self._blocked(now_ns)
-        if robot is not None and blocked is not None:
+        robot, blocked, late = self._robot, self._blocked(now_ns), now_ns >= self._arm_until_ns
+        waited = f"after {self._arm_timeout_ns / _NS_PER_S:g} s"
+        if robot is None or blocked in (_NO_STATE, _NO_BATTERY):  # may still come
+            cause, reason = blocked or _NO_STATE
+            if late:
+                self._stop(cause, f"{reason} {waited}", now_ns)
+        elif blocked is not None:
             self._stop(*blocked, now_ns)
-        elif now_ns >= self._arm_until_ns:
-            waited = f"after {self._arm_timeout_ns / _NS_PER_S:g} s"
-            if robot is None:
-                self._stop("state_silent", f"the robot reports no state {waited}", now_ns)
-            elif self._version is None:
+        elif late:
+            if self._version is None:
                 self._stop("wrong_robot", f"the robot's sport service does not answer {waited}", now_ns)
             else:
                 self._stop("not_standing", f"the robot is in mode {robot.mode}, not standing {waited}", now_ns)
-        elif robot is not None and self._version is None:
+        elif self._version is None:
             if now_ns - self._asked_ns >= _NS_PER_S:
                 self._asked_ns, self._reason = now_ns, "asking the robot what it is"
                 self._requests.append(Call(ids.API_VERSION))
-        elif robot is not None:
+        else:
             walks = robot.mode == ids.MODE_BALANCE_STAND and _moves(robot)
             self._stand_up_from(ids.MODE_LOCOMOTION if walks else robot.mode, now_ns)
 
@@ -328,6 +337,7 @@ class BridgeCore:
             self._next_ns = now_ns + self._period_ns
         if self._state == "armed" or self._called:  # an arming that has sent nothing stays silent
             self._send_stop(now_ns)
+            self._held = self._held or (reason if cause == "estop" else "")
         self._state = "disarmed" if refused and not self._ever_armed else "stopped"
         self._cause, self._reason = cause, f"arm refused: {reason}" if refused else reason
         self._target, self._stopped_ns, self._permitted = _ZERO, now_ns, False

@@ -29,7 +29,7 @@ class Bench:
     """A bridge core with a clock one turns by hand, a robot that reports `mode`, and everything that was written.
 
     `robot`: what else the robot reports (fields of RobotState); `version`: what it answers when asked what it is;
-    `safety`: that of the robot file.
+    `safety`: that of the robot file; `battery`: the charge it reports in every step, None for no report.
     """
 
     mode: int | None = ids.MODE_BALANCE_STAND
@@ -38,6 +38,7 @@ class Bench:
     seq: int = 0
     version: str | None = "1.0.0.1"
     robot: dict[str, object] = field(default_factory=dict)
+    battery: int | None = 80
     estop: bool = False
     asleep_ns: int = 0
     safety: SafetyConfig = SAFETY
@@ -54,6 +55,8 @@ class Bench:
         if self.mode is not None:
             state = replace(STILL, received_ns=self.now_ns, mode=self.mode, **self.robot)
             heard = {"state": state, **heard}
+        heard = {"battery_percent": self.battery, **heard}
+        self.battery = heard["battery_percent"]  # type: ignore[assignment]
         if self.asked:
             heard = {"version": self.version, **heard}
         inputs = Inputs(messages, self.client, Report(**heard), operator, self.estop, self.asleep_ns, shutdown)

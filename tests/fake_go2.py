@@ -12,11 +12,12 @@ from firmware_bridge.config import DdsConfig
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.idl import SportModeState_, WirelessController_
+from firmware_bridge.unitree.idl_low import LowState_
 from sim_hil.go2 import RobotTruth
 from sim_hil.sport import SportAction
 from sim_hil.unitree.service import ServiceServer
 from sim_hil.unitree.sport import handle_sport, parse_move
-from sim_hil.unitree.state import OdometryFrame, sport_mode_state
+from sim_hil.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
 
 _MODE_AFTER = {
     SportAction.STAND_UP: ids.MODE_JOINT_LOCK,
@@ -49,6 +50,8 @@ class FakeGo2:
         self.bus = Bus(DdsConfig(domain, "lo", ("127.0.0.1",)))
         self._server = ServiceServer(self.bus, ids.SPORT_SERVICE)
         self._state = self.bus.writer(ids.SPORT_STATE_TOPIC, SportModeState_)
+        self._low_state = self.bus.writer(ids.LF_LOW_STATE_TOPIC, LowState_)
+        self._low_message = LowStateMessage().message  # a full battery
         self._remote = self.bus.writer(ids.REMOTE_TOPIC, WirelessController_)
         self._waitset = self.bus.waitset(self._server.reader)
         self._closing = threading.Event()
@@ -82,7 +85,7 @@ class FakeGo2:
         self.bus.close()
 
     def _serve(self) -> None:
-        report_ns = 0
+        report_ns = low_report_ns = 0
         while not self._closing.is_set():
             self._waitset.wait(5_000_000)
             for request in self._server.requests():
@@ -98,6 +101,9 @@ class FakeGo2:
                 self._remote.write(WirelessController_(*self.remote))
                 truth = standing(self.mode, time_s=now_ns / 1e9, **self.truth)
                 self._state.write(sport_mode_state(truth, OdometryFrame((0.0, 0.0, 0.0))))
+            if self.reporting and now_ns - low_report_ns >= 200_000_000:
+                low_report_ns = now_ns
+                self._low_state.write(self._low_message)
 
 
 def standing(mode: int = ids.MODE_BALANCE_STAND, **changes: object) -> RobotTruth:

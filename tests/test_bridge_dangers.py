@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from firmware_bridge.core import Call, Move
 from firmware_bridge.link import Arm, Stop, Velocity
 from firmware_bridge.unitree import ids
-from tests.bridge_bench import MS, ZERO, Bench
+from tests.bridge_bench import MS, SAFETY, ZERO, Bench
 
 STOP_MOVE = Call(ids.STOP_MOVE)
 
@@ -121,11 +122,36 @@ class TestBattery:
         assert (bench.status.state, bench.status.cause) == ("disarmed", "battery_low")
         assert bench.status.reason == "arm refused: the battery has 9 %, at least 10 % are needed"
 
-    def test_at_the_minimum_and_when_it_is_not_known_it_arms(self) -> None:
-        Bench().arm()
+    def test_at_the_minimum_it_arms(self) -> None:
+        Bench(battery=10).arm()
+
+    def test_without_a_report_it_is_not_armed(self) -> None:
+        bench = Bench(battery=None)
+        bench.ask_to_arm()
+        assert bench.status.blocked_by == "battery_low"
+        bench.wait(10_100)
+        assert bench.status.reason == "arm refused: no battery report after 10 s"
+        assert bench.written == []
+
+    def test_a_first_report_that_comes_a_little_late_is_waited_for(self) -> None:
+        bench = Bench(battery=None)
+        bench.ask_to_arm()
+        bench.wait(900)
+        bench.step(battery_percent=80)
+        bench.wait(100)
+        assert bench.status.state == "armed"
+
+    def test_an_old_report_is_none(self) -> None:
         bench = Bench()
-        bench.step(battery_percent=10)
-        bench.arm()
+        bench.step()
+        bench.battery = None
+        bench.wait(9_900)
+        assert bench.status.blocked_by == "none"
+        bench.wait(200)
+        assert bench.status.blocked_by == "battery_low"
+
+    def test_a_robot_file_that_asks_for_no_charge_needs_no_report(self) -> None:
+        Bench(battery=None, safety=replace(SAFETY, battery_min_percent=0)).arm()
 
     def test_it_does_not_end_a_drive(self) -> None:
         bench = Bench().arm()
@@ -200,7 +226,7 @@ class TestRemote:
 
     def test_arming_is_refused_until_it_has_been_left_alone_for_a_second(self) -> None:
         bench = Bench().arm()
-        _remote_estop(bench)
+        _stick(bench)
         bench.wait(900)
         bench.ask_to_arm()
         assert bench.status.state == "stopped"
@@ -216,6 +242,36 @@ class TestOperator:
         bench.ask_to_arm()
         assert bench.status.cause == "estop"
         bench.step(operator=(Arm(),))
+        bench.arm()
+
+    def test_a_stop_beside_an_arm_in_one_step_stops_and_holds(self) -> None:
+        for said in ((Stop(), Arm()), (Arm(), Stop()), (Stop(), Arm(), Arm())):
+            bench = Bench().arm()
+            bench.drive(500)
+            bench.step(operator=said)
+            assert (bench.status.state, bench.status.blocked_by) == ("stopped", "estop")
+            assert bench.moves()[-1] == ZERO
+
+    @pytest.mark.parametrize("press", [_remote_estop, _local_estop])
+    def test_an_emergency_stop_that_ended_a_run_needs_an_operator_too(self, press) -> None:
+        bench = Bench().arm()
+        bench.drive(500)
+        press(bench)
+        bench.estop = False
+        bench.wait(60_000)
+        bench.ask_to_arm()
+        assert (bench.status.state, bench.status.cause) == ("stopped", "estop")
+        bench.step(operator=(Arm(),))
+        bench.arm()
+
+    @pytest.mark.parametrize("press", [_remote_estop, _local_estop])
+    def test_one_that_was_pressed_while_nothing_moved_ends_when_it_is_released(self, press) -> None:
+        bench = Bench()
+        press(bench)
+        bench.ask_to_arm()
+        assert bench.status.blocked_by == "estop"
+        bench.estop = False
+        bench.wait(1100)
         bench.arm()
 
     def test_taking_it_back_does_not_arm(self) -> None:
