@@ -11,9 +11,9 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 
@@ -29,6 +29,7 @@ from edge.cli import (
 )
 from edge.device import available_providers
 from edge.doctor_check import Check, Level, failed, skipped, table
+from edge.doctor_user import Whom, user_named
 from edge.graph import GraphError
 from edge.manifest import Artifacts, load_artifacts
 from edge.power.plan import PowerPlan, read_power_plan
@@ -41,6 +42,7 @@ from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 EXAMPLES = """examples:
   edge-doctor --artifacts out/orin --robot go2.toml
   edge-doctor --artifacts out/orin --target orin --json -
+  sudo edge-doctor --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --user tic-vla-edge
   edge-doctor
 
 What is not given is not looked at, and said so. It opens the graphs and runs ticks on a black picture; it asks the
@@ -52,6 +54,7 @@ TICK_BUDGET_S = 20.0
 LOOK_S = 0.5
 """Between two looks at what other programs use."""
 ROOT = Path("/")
+T = TypeVar("T")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -66,6 +69,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
     p.add_argument("--logs", type=Path, metavar="DIR", help=f"where flight logs go (default: {STATE_DIRECTORY} or .)")
+    p.add_argument("--user", metavar="NAME", help="whose rights are judged, e.g. the service's (default: yours)")
     p.add_argument("--ticks", type=int, default=TICKS, metavar="N", help=f"ticks to time (default: {TICKS}; 0: none)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
@@ -108,25 +112,39 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     """Every check, in the order in which they are shown; `root`: where Linux's files are looked for."""
+    whom = user_named(args.user)
     # Before anything of ours computes.
     busy = _busy(root / "proc")
     robot, robot_check = _robot(args)
     loaded, artifact_check = _artifacts(args)
+    yield artifact_check
     facts: TargetFacts | None = None
     plan: PlanFacts | None = None
     power: PowerPlan | None = None
-    yield artifact_check
+    refused: list[Check] = []
     if loaded is not None:
-        manifest = read_manifest(loaded.directory)
-        facts, plan, power = target_facts(manifest), plan_facts(manifest), read_power_plan(loaded)
+        directory, artifacts = loaded.directory, loaded
+        facts = _said(refused, "target in the manifest", lambda: target_facts(read_manifest(directory)))
+        plan = _said(refused, "plan in the manifest", lambda: plan_facts(read_manifest(directory)))
+        power = _said(refused, "power plan in the manifest", lambda: read_power_plan(artifacts))
+    yield from refused
     yield from _machine(args, root, loaded, facts, plan)
     yield busy
-    yield from _rights(root, loaded, power, robot)
+    yield from _rights(root, loaded, power, robot, whom)
     yield from _graphs(args, loaded, plan)
     yield robot_check
     if robot is not None:
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
+
+
+def _said(refused: list[Check], name: str, read: Callable[[], T]) -> T | None:
+    """What the artifacts say of something; None, and a check in `refused`, where they say nonsense."""
+    try:
+        return read()
+    except ArtifactError as error:
+        refused.append(Check(name, Level.FAIL, str(error), "what edge-export writes", "export the artifacts again"))
+        return None
 
 
 def _robot(args: argparse.Namespace) -> tuple[RobotConfig | None, Check]:
@@ -167,7 +185,7 @@ def _machine(
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)
-    yield doctor_machine.memory(plan, root)
+    yield doctor_machine.memory(plan, root, own_memory=facts is not None and facts.own_memory)
     logs = args.logs or (STATE_DIRECTORY if STATE_DIRECTORY.is_dir() else Path())
     yield doctor_machine.disk(logs.absolute(), _disk_usage)
     utc = datetime.timezone.utc
@@ -199,20 +217,21 @@ def _busy(proc: Path) -> Check:
 
 
 def _rights(
-    root: Path, artifacts: Artifacts | None, power: PowerPlan | None, robot: RobotConfig | None
+    root: Path, artifacts: Artifacts | None, power: PowerPlan | None, robot: RobotConfig | None, whom: Whom
 ) -> Iterator[Check]:
     if artifacts is None:
         yield skipped("real-time priority", "no artifacts")
         yield skipped("device nodes", "no artifacts")
     else:
-        yield doctor_rights.real_time(artifacts.runtime.control_priority)
+        yield doctor_rights.real_time(artifacts.runtime.control_priority, whom)
         providers = sorted({graph.session.provider for graph in artifacts.graphs.values()})
-        yield doctor_rights.device_access(providers, root)
-    yield doctor_rights.locked_memory(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], os.geteuid())
+        yield doctor_rights.device_access(providers, root, whom)
+    yield doctor_rights.locked_memory(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], whom)
     if robot is not None:
-        yield doctor_rights.socket_folder(robot.bridge.socket, os.geteuid())
+        yield doctor_rights.socket_folder(robot.bridge.socket, whom)
     kind, rail = ("auto", None) if power is None else (power.meter, power.rail)
-    yield doctor_rights.power_meter(kind, lambda: open_meter(kind, sysfs_root=root / "sys", rail=rail))
+    sysfs = root / "sys"
+    yield doctor_rights.power_meter(kind, lambda: open_meter(kind, sysfs_root=sysfs, rail=rail), sysfs, whom)
     yield doctor_rights.temperatures(root / "sys", time.monotonic_ns())
 
 

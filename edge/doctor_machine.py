@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +21,19 @@ BUSY_CORES: Final = 0.5
 STEADY_GOVERNORS: Final = ("performance",)
 _COARSE_CLOCKS: Final = ("jiffies", "acpi_pm", "hpet", "refined-jiffies")
 _GPU_NAMES: Final = ("ga10b", "gpu")
+MODULES: Final[Mapping[str, tuple[str, int]]] = {
+    "nvidia,p3701-0000": ("AGX Orin 32 GB, developer kit", 32),
+    "nvidia,p3701-0004": ("AGX Orin 32 GB", 32),
+    "nvidia,p3701-0005": ("AGX Orin 64 GB", 64),
+    "nvidia,p3767-0000": ("Orin NX 16 GB", 16),
+    "nvidia,p3767-0001": ("Orin NX 8 GB", 8),
+    "nvidia,p3767-0003": ("Orin Nano 8 GB", 8),
+    "nvidia,p3767-0004": ("Orin Nano 4 GB", 4),
+    "nvidia,p3767-0005": ("Orin Nano 8 GB, developer kit", 8),
+}
+"""Jetson modules and their GiB, by the names that NVIDIA's device trees and flash configurations use."""
+MEMORY_SHARE: Final = 0.85
+"""Firmware and kernel keep some of what is on the data sheet: of 16 GiB an Orin NX shows about 15.3."""
 
 Query = Callable[[], str | None]
 """Runs `nvpmodel -q`; None if there is no such program or it fails."""
@@ -135,19 +149,56 @@ def match(facts: TargetFacts, providers: Sequence[str], machine: str, available:
         expected += f", L4T {facts.min_l4t} or later"
         if release is None or _version(release) < _version(facts.min_l4t):
             return Check(name, Level.FAIL, found, expected, "install the JetPack that brings it")
+    size = _size(facts, root)
+    found, expected = ", ".join((found, *size.found)), f"{expected}, {size.expected}"
+    if size.less:
+        return Check(name, Level.FAIL, found, expected, f"export for this machine instead of {facts.name}")
     lacking = [provider for provider in providers if provider not in available]
     if lacking:
         advice = "install the ONNX Runtime package that brings it, or export for another target"
         return Check(name, Level.FAIL, f"ONNX Runtime has {', '.join(available)}", ", ".join(providers), advice)
+    if size.other:
+        advice = f"the plan was made for {facts.name}: export for this module, with figures of its own"
+        return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Cores and memory of the machine beside those of the target."""
+
+    found: tuple[str, ...]
+    expected: str
+    less: bool
+    other: bool
+    """Another Jetson module, with more of either."""
+
+
+def _size(facts: TargetFacts, root: Path) -> _Size:
+    """What cannot be read is not compared; a card's own memory is not compared with the machine's."""
+    # Those of the silicon: a power mode takes some away, which is looked at apart.
+    cores = len(core_numbers(_text(root / "sys/devices/system/cpu/present")))
+    total = re.search(r"^MemTotal:\s+(\d+) kB$", _text(root / "proc/meminfo"), re.MULTILINE)
+    compatible = _text(root / "proc/device-tree/compatible").split("\0")
+    module = next((MODULES[known] for known in compatible if known in MODULES), None)
+    found = ((module[0],) if module else ()) + ((f"{cores} cores",) if cores else ())
+    memory_bytes = 0 if total is None else int(total[1]) * 1024
+    expected = f"{facts.cores} cores"
+    less, other = 0 < cores < facts.cores, module is not None and cores > facts.cores
+    if not facts.own_memory:
+        expected += f", {facts.memory_bytes / GIB:g} GiB"
+        found += (f"{memory_bytes / GIB:.1f} GiB",) if memory_bytes else ()
+        less = less or 0 < memory_bytes < MEMORY_SHARE * facts.memory_bytes
+        other = other or (module is not None and module[1] * GIB != facts.memory_bytes)
+    return _Size(found, expected, less, other)
 
 
 def _version(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", text))
 
 
-def memory(plan: PlanFacts | None, root: Path) -> Check:
-    """Memory that is free now against what the plan takes."""
+def memory(plan: PlanFacts | None, root: Path, *, own_memory: bool = False) -> Check:
+    """Memory that is free now against what the plan takes; `own_memory`: the plan speaks of a graphics card's."""
     name = "memory"
     if plan is None:
         return skipped(name, "the artifacts have no plan")
@@ -155,6 +206,11 @@ def memory(plan: PlanFacts | None, root: Path) -> Check:
     if found is None:
         return skipped(name, "/proc/meminfo does not say what is available")
     free, need = int(found[1]) * 1024, plan.memory_bytes
+    if own_memory:
+        return skipped(
+            name,
+            f"the plan's {need / GIB:.2f} GiB are the graphics card's own; {free / GIB:.2f} GiB are free beside it",
+        )
     said, expected = f"{free / GIB:.2f} GiB available", f"{need / GIB:.2f} GiB by the plan"
     advice = "end other programs (see busy programs), or export with a smaller precision"
     if free < need:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import stat
 import threading
@@ -12,7 +11,10 @@ from pathlib import Path
 
 from edge.device_nodes import device_nodes
 from edge.doctor_check import Check, Level, skipped
+from edge.doctor_user import Whom
+from edge.power.limits import LimitsConfig
 from edge.power.meter import MeterError, PowerMeter, PowerSample
+from edge.power.rapl import ZONES
 from edge.power.thermal import ThermalReader
 from edge.scheduling import Role, enter
 from edge.units import NEED_DEVICES
@@ -31,44 +33,49 @@ def try_priority(priority: int) -> list[str]:
     return lines
 
 
-def real_time(priority: int, attempt: Callable[[int], list[str]] = try_priority) -> Check:
+def real_time(priority: int, whom: Whom, attempt: Callable[[int], list[str]] = try_priority) -> Check:
     """Whether the control thread would get the real-time priority that the target gives it."""
     name = "real-time priority"
     if priority == 0:
         return skipped(name, "the target asks for none")
+    if whom.other:
+        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
     if attempt(priority):
-        return Check(name, Level.WARN, "refused to this user", f"SCHED_FIFO {priority}", FROM_UNIT)
-    return Check(name, Level.OK, f"SCHED_FIFO {priority} granted", f"SCHED_FIFO {priority}")
+        return Check(name, Level.WARN, f"refused to {whom.name}", f"SCHED_FIFO {priority}", FROM_UNIT)
+    return Check(name, Level.OK, f"SCHED_FIFO {priority} granted to {whom.name}", f"SCHED_FIFO {priority}")
 
 
-def locked_memory(limit_bytes: int, euid: int) -> Check:
+def locked_memory(limit_bytes: int, whom: Whom) -> Check:
     """Whether the runner may keep its pages in memory."""
     name = "locked memory"
-    if limit_bytes == resource.RLIM_INFINITY or euid == 0:
-        return Check(name, Level.OK, "no limit", "no limit")
-    return Check(name, Level.WARN, f"at most {limit_bytes // 1024} KiB", "no limit", FROM_UNIT)
+    if whom.other and whom.uid != 0:
+        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
+    if limit_bytes == resource.RLIM_INFINITY or whom.uid == 0:
+        return Check(name, Level.OK, f"no limit for {whom.name}", "no limit")
+    return Check(name, Level.WARN, f"at most {limit_bytes // 1024} KiB for {whom.name}", "no limit", FROM_UNIT)
 
 
-def device_access(providers: Sequence[str], root: Path, access: Callable[[Path], bool] | None = None) -> Check:
-    """Whether the providers' device nodes are there and this user may open them."""
+def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
+    """Whether the providers' device nodes are there and the user may open them."""
     name = "device nodes"
     if not set(providers) & set(NEED_DEVICES):
         return Check(name, Level.OK, "none needed", "those of " + ", ".join(providers))
     nodes = device_nodes(providers, root)
     if not nodes:
         return Check(name, Level.FAIL, "none", "those of " + ", ".join(providers), "install the device's driver")
-    allowed = access or (lambda path: os.access(path, os.R_OK | os.W_OK))
-    closed = [node for node in nodes if not allowed(root / node.path.relative_to("/"))]
+    files = {node: root / node.path.relative_to("/") for node in nodes}
+    closed = [node for node in nodes if not whom.may(files[node], write=True)]
     if closed:
         groups = sorted({node.group for node in closed if node.group}) or ["video", "render"]
-        found = f"{closed[0].path} and {len(closed) - 1} more are closed to this user"
-        return Check(
-            name, Level.FAIL, found, "all open", f"sudo usermod -aG {','.join(groups)} $USER, then log in again"
-        )
-    return Check(name, Level.OK, f"{len(nodes)} found, all open", "all open")
+        found = f"{closed[0].path} and {len(closed) - 1} more are closed to {whom.name}"
+        advice = f"sudo usermod -aG {','.join(groups)} {whom.name}, then log in again"
+        if whom.other and all(node.group and whom.through_its_group(files[node]) for node in closed):
+            return Check(name, Level.WARN, found, "all open", f"{FROM_UNIT}; without it: {advice}")
+        return Check(name, Level.FAIL, found, "all open", advice)
+    return Check(name, Level.OK, f"{len(nodes)} found, all open to {whom.name}", "all open")
 
 
-def socket_folder(socket: Path, euid: int) -> Check:
+def socket_folder(socket: Path, whom: Whom) -> Check:
     """That only the robot's user can reach the bridge's socket."""
     name = "socket folder"
     folder = socket.parent
@@ -80,14 +87,17 @@ def socket_folder(socket: Path, euid: int) -> Check:
     said = f"{folder}, mode {mode:04o}, user {found.st_uid}"
     if mode & 0o077:
         return Check(name, Level.FAIL, said, "mode 0700", f"chmod 0700 {folder}: anybody could command the robot")
-    if found.st_uid != euid and euid != 0:
-        return Check(name, Level.FAIL, said, f"user {euid}", "run bridge and runner as one user")
-    return Check(name, Level.OK, said, "mode 0700")
+    if found.st_uid != whom.uid and whom.uid != 0:
+        expected = f"user {whom.uid} ({whom.name})"
+        return Check(name, Level.FAIL, said, expected, "run bridge and runner as one user, or name it with --user")
+    return Check(name, Level.OK, f"{said} ({whom.name})", "mode 0700")
 
 
 def power_meter(
     kind: str,
     open_it: Callable[[], PowerMeter],
+    sysfs_root: Path,
+    whom: Whom,
     *,
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
@@ -104,17 +114,30 @@ def power_meter(
         advice = "the governor has nothing to hold the budget by; see the message"
         return Check(name, Level.WARN, str(error), kind, advice)
     found = f"{sample.total_w:.1f} W, {meter.source}, {sample.tagged}"
+    # Of all that a meter reads, only these are commonly closed to everybody but root.
+    counters = sorted(sysfs_root.glob(f"{ZONES}/energy_uj")) if whom.other and meter.source.startswith("rapl") else []
+    if closed := [path for path in counters if not whom.may(path)]:
+        advice = f"for this boot: sudo chmod a+r {closed[0]}, and the others like it (a side channel, CVE-2020-8694)"
+        return Check(name, Level.WARN, f"{closed[0]} is closed to {whom.name}", kind, advice)
     return Check(name, Level.OK, found + (f" ({meter.caveat})" if meter.caveat else ""), kind)
 
 
 def temperatures(sysfs_root: Path, now_ns: int) -> Check:
-    """Temperatures, and whether clocks are held back because of them now."""
+    """Temperatures, and how far they are from where clocks are held back and where the board switches off."""
     name = "temperatures"
-    state = ThermalReader(sysfs_root).read(now_ns)
+    state, limits = ThermalReader(sysfs_root).read(now_ns), LimitsConfig()
     if state.hottest_c is None:
         return skipped(name, "this machine shows no thermal zone")
     found = f"hottest {state.hottest_c:.0f} °C of {len(state.zones_c)} zones"
+    advice = "let it cool down, look at fan and heat sink"
+    trip_c, passive_c = state.trip_margin_c, state.throttle_margin_c
+    if trip_c is not None and trip_c <= limits.trip_margin_c:
+        found += f", {trip_c:.1f} °C below where the board switches off"
+        return Check(name, Level.FAIL, found, f"more than {limits.trip_margin_c:g} °C", advice)
     if state.throttled:
         found += f", held back by {', '.join(state.throttling)}"
-        return Check(name, Level.WARN, found, "no throttling", "let it cool down, look at fan and heat sink")
+        return Check(name, Level.WARN, found, "no throttling", advice)
+    if passive_c is not None and passive_c < limits.throttle_clear_c:
+        found += f", {abs(passive_c):.1f} °C {'below' if passive_c >= 0 else 'above'} where clocks are held back"
+        return Check(name, Level.WARN, found, f"{limits.throttle_clear_c:g} °C or more below", advice)
     return Check(name, Level.OK, found, "no throttling")

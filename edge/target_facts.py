@@ -26,6 +26,8 @@ class TargetFacts:
     min_l4t: str | None
     power_mode: str
     budget_w: float | None
+    own_memory: bool = False
+    """The memory is a graphics card's own; the machine's is not known."""
 
     def __post_init__(self) -> None:
         if not self.name or not self.architectures or not self.power_mode:
@@ -79,6 +81,8 @@ def target_facts(manifest: Mapping[str, Any]) -> TargetFacts | None:
         min_l4t=_text(device, "min_l4t"),
         power_mode=_text(power, "mode") or "",
         budget_w=None if power.get("budget_w") is None else _number(power, "budget_w"),
+        # Jetsons are the only graphics processors here that compute in the machine's own memory.
+        own_memory=_text(device, "compute_capability") is not None and _text(device, "min_l4t") is None,
     )
 
 

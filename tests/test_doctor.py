@@ -244,6 +244,28 @@ def test_artifacts_that_do_not_verify_fail_and_the_rest_is_still_looked_at(tmp_p
     assert "clock" in by_name(result)
 
 
+def test_a_manifest_that_says_nonsense_of_its_device_is_a_failure_among_others(
+    artifacts_dir: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["provenance"]["target"]["device"]["cores"] = "two"
+    manifest["plan"]["tick_ms"] = -1
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    code, result = run(tmp_path, "--artifacts", str(copy), "--ticks", "0", "--logs", str(tmp_path))
+    checks = by_name(result)
+    assert code == EXIT_CHECK_FAILED
+    assert checks["target in the manifest"]["level"] == checks["plan in the manifest"]["level"] == "fail"
+    assert "clock" in checks
+
+
+def test_the_memory_of_a_graphics_card_is_known_from_that_of_a_machine() -> None:
+    for name, own in (("cpu", False), ("orin", False), ("rtx4060", True)):
+        facts = target_facts({"provenance": {"target": load_target(name).to_dict()}})
+        assert facts is not None
+        assert facts.own_memory is own
+
+
 def test_missing_engines_fail_with_the_command_that_builds_them(artifacts_dir: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "orin"))
     manifest = json.loads((copy / "manifest.json").read_text())
