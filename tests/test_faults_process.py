@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from tools.demo import socket_dir
-from tools.faults.measure import injection
-from tools.faults.report import RowResult
+from tools.faults.__main__ import run_row
 from tools.faults.rig import Rig
 from tools.faults.rows import rows
 from tools.host_stall import HostStall
@@ -47,5 +46,5 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
     ],
 )
 def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
-    result = RowResult(ROWS[name], [injection(rig, ROWS[name], random.Random(name), host)])
+    result = run_row(rig, ROWS[name], 1, random.Random(name), host)
     assert not result.problems, result.as_json()

@@ -32,7 +32,7 @@ from tools.faults.client import FaultError
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, result, show
 from tools.faults.rig import Rig
-from tools.faults.rows import Row, rows
+from tools.faults.rows import Judge, Row, rows
 from tools.host_stall import HostStall
 from tools.report.machine import machine_facts
 
@@ -81,23 +81,40 @@ def count(row: Row, per_row: int) -> int:
 def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
     """All injections of one row. Raises FaultError when the robot's side does not answer."""
     samples: list[Sample] = []
+    repeated = 0
     for index in range(times):
-        begun_ns = time.monotonic_ns()
-        try:
-            sample = injection(rig, row, rng, host)
-        except (FaultError, StepError) as error:
-            # A fault that did not strike or a runner that did not drive fails this injection, not those after it.
-            sample = Sample(None, 0.0, [str(error).splitlines()[0]])
-            rig.kill_runner()
-            rig.clear()  # raises when the robot's side has gone: that is the end
+        sample = attempt(rig, row, rng, host)
+        tell(row, f"{index + 1}/{times}", sample)
+        if sample.hindered:
+            repeated += 1
+            if row.judged_by is not Judge.UNCHANGED:
+                samples.append(sample)  # it stopped as it should
+            sample = attempt(rig, row, rng, host)
+            tell(row, f"{index + 1}/{times} again", sample)
+            sample.wrong += sample.hindered
         samples.append(sample)
-        shown = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
-        wrong = f" ({'; '.join(sample.wrong)})" if sample.wrong else ""
-        say(f"{row.name} {index + 1}/{times}: {shown} of {row.bound_ms:.0f} ms{wrong}")
-        left_s = row.spacing_s - (time.monotonic_ns() - begun_ns) / 1e9
-        if left_s > 0:
-            time.sleep(left_s)
-    return RowResult(row, samples)
+    return RowResult(row, samples, repeated)
+
+
+def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
+    """One injection, and then the row's own pause."""
+    begun_ns = time.monotonic_ns()
+    try:
+        sample = injection(rig, row, rng, host)
+    except (FaultError, StepError) as error:
+        # A fault that did not strike or a runner that did not drive fails this injection, not those after it.
+        sample = Sample(None, 0.0, [str(error).splitlines()[0]])
+        rig.kill_runner()
+        rig.clear()  # raises when the robot's side has gone: that is the end
+    time.sleep(max(0.0, row.spacing_s - (time.monotonic_ns() - begun_ns) / 1e9))
+    return sample
+
+
+def tell(row: Row, which: str, sample: Sample) -> None:
+    """Progress of one injection."""
+    shown = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
+    wrong = "; ".join(sample.wrong + sample.hindered)
+    say(f"{row.name} {which}: {shown} of {row.bound_ms:.0f} ms{wrong and f' ({wrong})'}")
 
 
 def say(line: str) -> None:

@@ -20,7 +20,7 @@ WATCH_S = 2.0
 """How long nothing may change."""
 STAY_S = 0.5
 """How long a latched stop is watched after its fault has gone."""
-RESUME_S = 8.0
+RESUME_S = 15.0
 LIMIT_TOLERANCE = 1.02
 _RECENT_NS = 1_000_000_000
 _POLL_S = 0.02
@@ -30,12 +30,15 @@ _ANY = float("inf")
 
 @dataclass
 class Sample:
-    """One injection's figure; None: what had to come did not come in time. `wrong` says what else was not right."""
+    """One injection's figure; None: what had to come did not come in time."""
 
     latency_ms: float | None
     stall_ms: float
     """For how much of that time the machine itself stood still."""
     wrong: list[str] = field(default_factory=list)
+    """What else was not right."""
+    hindered: list[str] = field(default_factory=list)
+    """The robot did not drive where it may: on a busy machine not only the fault can do that, so it is tried again."""
 
     def as_json(self) -> dict[str, object]:
         """For the result."""
@@ -72,7 +75,7 @@ def _awaited(rig: Rig, row: Row, effect_ns: int, known: frozenset[int], host: Ho
     # The very command under way when the fault struck may already be what was to come.
     sample = Sample(max(first - effect_ns, 0) / 1e6, host.between_ns(effect_ns, first) / 1e6)
     if row.judged_by is Judge.LIMIT and not (rig.drives_on(RESUME_S) and _first(rig, row, first, known) is not None):
-        sample.wrong.append("stopped, not limited")
+        sample.hindered.append("stopped, not limited")
     return sample
 
 
@@ -96,9 +99,9 @@ def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
     moving = moves(one for one in heard if one.moving)
     sample = Sample(longest_gap_ms(moving, effect_ns, end_ns), host.between_ns(effect_ns, end_ns) / 1e6)
     if any(not one.moving for one in heard if one.velocity is not None):
-        sample.wrong.append("a zero was sent")
+        sample.hindered.append("a zero was sent")
     if min((velocity[0] for _, velocity in moving), default=0.0) < 0.8 * before_mps:
-        sample.wrong.append("the speed fell")
+        sample.hindered.append("the speed fell")
     return sample
 
 
@@ -117,7 +120,7 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> Non
             rig.kill_bridge()
         rig.clear()
     elif not rig.drives_on(RESUME_S):
-        sample.wrong.append(f"did not drive on within {RESUME_S:g} s")
+        sample.hindered.append(f"did not drive on within {RESUME_S:g} s")
         rig.kill_runner()
         rig.clear()
 

@@ -26,11 +26,13 @@ class RowResult:
     """One row's samples and what they are worth.
 
     A bound holds when the 99.9th percentile is within it, no sample is above twice it, every sample came at all and
-    nothing else was wrong. A sample during which the machine itself stood still is granted that time, and counted.
+    nothing else was wrong. A sample during which the machine itself stood still is granted that time, and counted; so
+    is an injection that was `repeated` because the robot did not drive where it may, and did so the second time.
     """
 
     row: Row
     samples: Sequence[Sample]
+    repeated: int = 0
 
     @property
     def latencies_ms(self) -> list[float]:
@@ -69,6 +71,7 @@ class RowResult:
             "max_ms": max(values) if values else None,
             "bound_ms": self.row.bound_ms,
             "granted": self.granted,
+            "repeated": self.repeated,
             "problems": self.problems,
             "pass": not self.problems,
             "samples": [sample.as_json() for sample in self.samples],
@@ -103,7 +106,8 @@ def show(rows: Sequence[RowResult], console: Console) -> None:
     for row in rows:
         values = row.latencies_ms
         figures = [f"{percentile(values, share):.0f}" for share in (50, 99.9, 100)] if values else ["–"] * 3
-        verdict = "; ".join(row.problems) or ("pass" if not row.granted else f"pass, {row.granted} granted")
+        counted = [f"{n} {what}" for n, what in ((row.granted, "granted"), (row.repeated, "repeated")) if n]
+        verdict = "; ".join(row.problems) or ", ".join(["pass", *counted])
         what, count = _WHAT[row.row.judged_by], str(len(row.samples))
         bound = f"{row.row.bound_ms:.0f}"
         table.add_row(row.row.name, row.row.fault or "–", what, count, *figures, bound, verdict)
