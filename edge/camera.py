@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.jpeg import jpeg_refusal
 from edge.policy import fit_frame
 from firmware_bridge.unitree.client import CameraError
 
@@ -27,15 +28,21 @@ class Frame:
 
 
 def decode_frame(jpeg: bytes, image_px: int) -> npt.NDArray[np.uint8]:
-    """JPEG → encoder input [1, px, px, 3] RGB; raises CameraError when it is not a picture."""
-    bgr = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
+    """JPEG → encoder input [1, px, px, 3] RGB; raises CameraError when it is not a picture of a sensible size."""
+    refusal = jpeg_refusal(jpeg)
+    if refusal is not None:
+        raise CameraError(f"camera: {refusal}")
+    try:
+        bgr = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise CameraError(f"camera: {len(jpeg)} bytes cannot be decoded ({error.err or error.code})") from error
     if bgr is None:
         raise CameraError(f"camera: {len(jpeg)} bytes are not a JPEG picture")
     return fit_frame(cast(npt.NDArray[np.uint8], cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)), image_px)
 
 
 class CameraPoller:
-    """Asks `request(timeout_s)` for a JPEG every period, on absolute deadlines, `lead` before each control tick."""
+    """Asks `request(timeout_s)` for a JPEG every period, on absolute deadlines."""
 
     def __init__(
         self,
@@ -46,10 +53,15 @@ class CameraPoller:
         timeout_s: float,
         latency_ns: int,
         on_frame: Callable[[Frame], None] | None = None,
+        on_death: Callable[[str], None] = lambda why: None,
     ) -> None:
-        """`on_frame` is given every frame in the camera thread, after the control thread may see it."""
+        """`on_frame` is given every frame in the camera thread, after the control thread may see it.
+
+        `on_death` is told, once and in that thread, why it has ended although nobody closed it.
+        """
         self._request = request
         self._on_frame = on_frame
+        self._on_death = on_death
         self._image_px = image_px
         self._period_ns = period_ns
         self._timeout_s = timeout_s
@@ -76,6 +88,12 @@ class CameraPoller:
         self._thread.join(self._timeout_s + 1.0)
 
     def _run(self) -> None:
+        try:
+            self._poll()
+        except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
+            self._on_death(f"camera thread died: {type(error).__name__}: {error}")
+
+    def _poll(self) -> None:
         while not self._stop.is_set():
             wait_ns = self._period_ns - (time.monotonic_ns() - self._epoch_ns) % self._period_ns
             if self._stop.wait(wait_ns / 1e9):

@@ -6,6 +6,7 @@ from edge.fault_row import Action, Escalation, Fault
 
 _HERE = "runner"
 _LOOP = "tests/test_control_loop_faults.py::test_"
+_ROBOT = "tests/test_robot_inputs.py::test_"
 
 INPUTS: tuple[Fault, ...] = (
     Fault(
@@ -22,7 +23,7 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "camera-stale", 3, Action.ZERO, 300, _HERE,
-        "Pictures arrive too old to drive by.",
+        "Pictures are more than 300 ms old when they arrive, too old to drive by.",
         "Look for a queue or a slow network between camera and runner.",
         _LOOP + "pictures_that_arrive_old",
     ),
@@ -67,32 +68,39 @@ INPUTS: tuple[Fault, ...] = (
         "odometry-jump", 8, Action.ZERO, 100, _HERE,
         "The robot's pose jumped further than the robot can move; the sample was not used.",
         "Driving goes on by itself; a second jump stops the run.",
-        _LOOP + "one_jump_of_the_odometry",
+        _ROBOT + "one_jump_of_the_pose_stops_the_robot_for_a_second",
         escalation=Escalation("odometry-jumps", 2, 10_000),
     ),
     Fault(
         "odometry-jumps", 8, Action.STOP, 100, _HERE,
         "The robot's pose jumped twice within 10 s.",
         "Check the robot's feet, IMU and firmware before arming again.",
-        _LOOP + "two_jumps_of_the_odometry",
+        _ROBOT + "two_jumps_of_the_pose_within_ten_seconds_stop_the_run",
     ),
     Fault(
         "odometry-frozen", 9, Action.ZERO, 700, _HERE,
         "The robot is told to move and its pose does not change.",
-        "Check that the robot stands free and that its state is not frozen.",
-        _LOOP + "odometry_that_does_not_move",
+        "Check that the robot stands free and that its state is not frozen; a second time within 10 s stops the run.",
+        _ROBOT + "a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second",
+        escalation=Escalation("odometry-stays-frozen", 2, 10_000),
+    ),
+    Fault(
+        "odometry-stays-frozen", 9, Action.STOP, 700, _HERE,
+        "The robot was told to move twice within 10 s and its pose did not change.",
+        "Free the robot, or restart it if it is free and its pose stands still, before arming again.",
+        _ROBOT + "a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run",
     ),
     Fault(
         "odometry-not-finite", 10, Action.ZERO, 60, _HERE,
         "The robot reports a pose or velocity that is no number or cannot be.",
         "If it stays, restart the robot.",
-        _LOOP + "odometry_that_is_not_finite",
+        _ROBOT + "a_pose_that_is_not_finite_stops_the_robot_within_its_bound",
     ),
     Fault(
         "odometry-late", 11, Action.LIMIT, 300, _HERE,
         "The robot's pose arrives late.",
         "Look for load on the network to the robot; the robot drives at half speed.",
-        _LOOP + "odometry_that_is_late",
+        _ROBOT + "reports_that_stay_late_limit_the_speed_for_as_long_as_they_do",
         speed_scale=0.5,
     ),
     Fault(
@@ -103,15 +111,15 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "odometry-speed-mismatch", 12, Action.STOP, 300, _HERE,
-        "Two measurements of the robot's speed disagree.",
-        "Check for slipping feet and a wrong velocity frame in the robot file before arming again.",
-        _LOOP + "two_speeds_that_disagree",
+        "Two measurements of the robot's speed or of its turning disagree.",
+        "Check for slipping feet, a stuck gyro and a wrong velocity frame in the robot file before arming again.",
+        _ROBOT + "two_speeds_that_disagree_stop_the_run_within_their_bound",
     ),
     Fault(
         "link-lossy", 35, Action.LIMIT, 2000, _HERE,
         "Many of the robot's state messages are lost.",
         "Use the cable, not the radio; the robot drives at half speed.",
-        _LOOP + "half_of_the_state_messages_lost",
+        _ROBOT + "half_of_the_states_lost_from_the_start_limits_the_speed",
         speed_scale=0.5,
     ),
     Fault(
@@ -185,7 +193,7 @@ MODEL: tuple[Fault, ...] = (
     Fault(
         "semantic-expired", 17, Action.ZERO, 15_300, _HERE,
         "The last answer of the reasoning is too old to drive by.",
-        "If reasoning hangs, restart the runner; driving goes on with its next answer.",
+        "Driving goes on with its next answer; a call that hangs is interrupted.",
         _LOOP + "reasoning_that_hangs",
     ),
     Fault(
@@ -200,6 +208,12 @@ MODEL: tuple[Fault, ...] = (
         "Reasoning failed five times within 60 s.",
         "Verify the artifacts and look at the memory in use: edge-doctor.",
         _LOOP + "five_failures_of_the_reasoning",
+    ),
+    Fault(
+        "reasoning-hung", 17, Action.STOP, 30_300, _HERE,
+        "The reasoning hangs in a call that an interrupt does not end.",
+        "The runner ends and its service starts it again; look at the kernel log for the accelerator's driver.",
+        "tests/test_reasoning_watch.py::test_a_call_that_an_interrupt_does_not_end_is_given_up",
     ),
     Fault(
         "semantic-text-invalid", 19, Action.ZERO, 300, _HERE,

@@ -134,11 +134,6 @@ class DriftEstimator:
         """Hand over the camera's motion; it is used by the next `step`. Any thread, never waits."""
         self._visual.append(motion)
 
-    def check_age(self, now_ns: int) -> tuple[Finding, ...]:
-        """Findings for a newest report that is too old by now (row 11): for the control thread, which goes on alone."""
-        published = self._published
-        return () if published is None else age_findings(now_ns - published[1].stamp_ns)
-
     def motion_offset(self, anchor_ns: int) -> tuple[SE2, Array] | None:
         """Motion since an instant of the last 30 s, (Δx m, Δy m, Δθ rad), and the covariance [3, 3] of its error.
 

@@ -32,9 +32,13 @@ class GateConfig:
     frozen_m: float = 0.01
     frozen_rad: float = 0.02
     mismatch_mps: float = 0.5
+    mismatch_radps: float = 0.5
     mismatch_window_ns: int = 200_000_000
-    lag_window_ns: int = 5_000_000_000
-    """The quickest report of this long is taken as one without delay."""
+    clock_drift: float = 100e-6
+    """How fast the robot's clock may run away from ours; what goes beyond it is a delay, however long it lasts."""
+    clock_back_ns: int = 100_000_000
+    clock_step_ns: int = 5_000_000_000
+    """The robot's clock was set when its stamps go back by more than the first, or apart from ours by the second."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,11 @@ class OdometryGate:
         self._config = config or GateConfig()
         self._last: OdometryInputs | None = None
         self._suspect: OdometryInputs | None = None
-        self._speeds: deque[tuple[float, float, float, float, float]] = deque()
-        self._speed_sums = [0.0, 0.0, 0.0]
+        self._apart: deque[tuple[float, float, float, float]] = deque()
+        self._apart_sums = [0.0, 0.0, 0.0, 0.0]
         self._pushed_since_ns: int | None = None
         self._pushed_from = (0.0, 0.0, 0.0)
-        self._quickest: list[tuple[int, int]] = []
+        self._quickest: tuple[int, int, int] | None = None
         self.rejected = 0
 
     def step(self, report: OdometryInputs) -> Verdict:
@@ -150,6 +154,9 @@ class OdometryGate:
         mean_rate = report.gyro_wz_radps
         if mean_rate is not None and before.gyro_wz_radps is not None:
             mean_rate = 0.5 * (mean_rate + before.gyro_wz_radps)
+        mismatch, gyro_lies = self._mismatch((dx_m, dy_m, turn), dt_s, report, mean_rate)
+        if gyro_lies:
+            mean_rate = None
         increment = Increment(
             end_ns=report.received_ns,
             dt_s=dt_s + gap_s,
@@ -159,7 +166,6 @@ class OdometryGate:
             turn_rad=turn + gap_s * report.wz_radps if mean_rate is None else mean_rate * (dt_s + gap_s),
         )
         self._last, self._suspect = report, None
-        mismatch = self._mismatch(dx_m, dy_m, dt_s, report)
         frozen = self._frozen(report)
         return Verdict(increment, (*findings, *mismatch, *frozen))
 
@@ -169,30 +175,44 @@ class OdometryGate:
         far = math.hypot(x, y) > config.jump_m + config.max_speed_mps * dt_s
         return far or abs(turn) > config.jump_rad + config.max_turn_radps * dt_s
 
-    def _mismatch(self, dx_m: float, dy_m: float, dt_s: float, report: OdometryInputs) -> tuple[Finding, ...]:
-        """Row 12: speed from the change of position against the reported velocity, both over the same short time."""
+    def _mismatch(
+        self, moved: tuple[float, float, float], dt_s: float, report: OdometryInputs, gyro_radps: float | None
+    ) -> tuple[tuple[Finding, ...], bool]:
+        """Row 12: changes of the pose against the reported velocity and the gyro, all over the same short time.
+
+        Also whether the gyro disagrees: a stuck one shows nothing while the robot turns.
+        """
         config = self._config
-        entry = (dt_s, dx_m, dy_m, report.vx_mps * dt_s, report.vy_mps * dt_s)
-        self._speeds.append(entry)
-        sums = self._speed_sums
-        sums[0] += dt_s
-        sums[1] += entry[1] - entry[3]
-        sums[2] += entry[2] - entry[4]
+        dx_m, dy_m, turn_rad = moved
         window_s = config.mismatch_window_ns / 1e9
-        while len(self._speeds) > 1 and sums[0] - self._speeds[0][0] >= window_s:
-            old = self._speeds.popleft()
-            sums[0] -= old[0]
-            sums[1] -= old[1] - old[3]
-            sums[2] -= old[2] - old[4]
+        # Two readings of the gyro do not tell the turn over a long gap; a pose that does not change at all is row 9's.
+        told = gyro_radps is not None and dt_s <= 0.5 * window_s and any(moved)
+        turned_apart = turn_rad - gyro_radps * dt_s if told and gyro_radps is not None else 0.0
+        sums = self._apart_sums
+        self._apart.append((dt_s, dx_m - report.vx_mps * dt_s, dy_m - report.vy_mps * dt_s, turned_apart))
+        for index, value in enumerate(self._apart[-1]):
+            sums[index] += value
+        while len(self._apart) > 1 and sums[0] - self._apart[0][0] >= window_s:
+            for index, value in enumerate(self._apart.popleft()):
+                sums[index] -= value
         # Two reports could be an accident of their arrival; a full window is not.
-        if sums[0] < 0.7 * window_s or len(self._speeds) < 4:
-            return ()
-        apart_mps = math.hypot(sums[1], sums[2]) / sums[0]
-        if apart_mps <= config.mismatch_mps:
-            return ()
-        return (Finding("odometry-speed-mismatch", f"{apart_mps:.2f} m/s apart, at most {config.mismatch_mps} m/s"),)
+        if sums[0] < 0.7 * window_s or len(self._apart) < 4:
+            return (), False
+        apart_mps, apart_radps = math.hypot(sums[1], sums[2]) / sums[0], abs(sums[3]) / sums[0]
+        findings: tuple[Finding, ...] = ()
+        if apart_mps > config.mismatch_mps:
+            detail = f"{apart_mps:.2f} m/s apart, at most {config.mismatch_mps} m/s"
+            findings = (Finding("odometry-speed-mismatch", detail),)
+        if apart_radps > config.mismatch_radps:
+            detail = f"gyro and reported yaw {apart_radps:.2f} rad/s apart, at most {config.mismatch_radps} rad/s"
+            findings = (*findings, Finding("odometry-speed-mismatch", detail))
+        return findings, apart_radps > config.mismatch_radps
 
     def _frozen(self, report: OdometryInputs) -> tuple[Finding, ...]:
+        """Row 9, once for every try: the zero that follows ends the try, so that staying frozen shows in a second one.
+
+        Whether a robot at zero would move cannot be seen: the next command tries again, and the table counts.
+        """
         config, command = self._config, report.commanded
         if command is None or math.hypot(command[0], command[1]) <= config.frozen_command_mps:
             self._pushed_since_ns = None
@@ -206,28 +226,25 @@ class OdometryGate:
         held_ns = report.received_ns - self._pushed_since_ns
         if held_ns < config.frozen_ns:
             return ()
+        self._pushed_since_ns = report.received_ns
         return (
             Finding("odometry-frozen", f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),
         )
 
     def _lag_ns(self, report: OdometryInputs) -> int:
-        """How much later than the quickest report of the last seconds this one came, by the robot's own clock."""
-        if report.robot_stamp_ns <= 0:
+        """How much later than the quickest report so far this one came, by the robot's own clock."""
+        received_ns, stamp_ns, config = report.received_ns, report.robot_stamp_ns, self._config
+        if stamp_ns <= 0:
             return 0
-        offset = report.received_ns - report.robot_stamp_ns
-        half_ns = self._config.lag_window_ns // 2
-        buckets = self._quickest
-        if not buckets or report.received_ns - buckets[-1][0] > half_ns:
-            # Two buckets of half the window: the older one is dropped as a whole.
-            buckets.append((report.received_ns, offset))
-            del buckets[:-2]
-        elif offset < buckets[-1][1]:
-            buckets[-1] = (buckets[-1][0], offset)
-        lag_ns = offset - min(quickest for _, quickest in buckets)
-        if lag_ns > self._config.lag_window_ns:  # the robot's clock was set back: start over
-            self._quickest = [(report.received_ns, offset)]
-            return 0
-        return lag_ns
+        offset_ns = received_ns - stamp_ns
+        if self._quickest is not None:
+            at_ns, least_ns, last_ns = self._quickest
+            lag_ns = offset_ns - least_ns - round(config.clock_drift * (received_ns - at_ns))
+            if 0 < lag_ns <= config.clock_step_ns and stamp_ns > last_ns - config.clock_back_ns:
+                self._quickest = (at_ns, least_ns, max(stamp_ns, last_ns))
+                return lag_ns
+        self._quickest = (received_ns, offset_ns, stamp_ns)
+        return 0
 
 
 def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:

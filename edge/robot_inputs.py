@@ -19,6 +19,7 @@ from edge.camera import CameraPoller, Frame
 from edge.camera_geometry import Attitude, CameraGeometry
 from edge.findings import FindingQueue
 from edge.log_records import Throttle, battery_record, odometry_record
+from edge.monitors.robot import LinkMonitor
 from edge.odometry import DriftEstimator, OdometryInputs, OdometryOutputs
 from edge.odometry_calibration import OdometryCalibration, load_calibration
 from edge.pose_history import PoseHistory
@@ -42,8 +43,12 @@ class RobotInputs:
         period_ns: int,
         commanded: Callable[[], tuple[float, float, float] | None],
         say: Callable[[str], None],
+        on_death: Callable[[str], None] = lambda why: None,
     ) -> None:
-        """`commanded`: the velocity in force now; it must not wait."""
+        """`commanded`: the velocity in force now; it must not wait.
+
+        `on_death` is told why the thread of the reports or of the pictures has ended, in that thread.
+        """
         file = robot.odometry.calibration
         self.estimator = DriftEstimator(_calibration(file))
         self.history = PoseHistory()
@@ -56,12 +61,13 @@ class RobotInputs:
         self._say = say
         self._log_odometry, self._log_battery = Throttle(ODOMETRY_LOG_HZ), Throttle(BATTERY_LOG_HZ)
         self._newest: OdometryOutputs | None = None
+        self._link = LinkMonitor()
         mount = robot.mount
         self._eye: VisualOdometry | None = None
         if mount is not None:
             hfov_rad, pitch_rad = math.radians(mount.hfov_deg), math.radians(mount.pitch_deg)
             self._eye = VisualOdometry(CameraGeometry(hfov_rad, mount.height_m, pitch_rad, mount.forward_m))
-        self.reader = Go2Reader(robot)
+        self.reader = Go2Reader(robot, on_death=on_death)
         self.reader.set_state_listener(self._on_state)
         self.camera = CameraPoller(
             self.reader.request_frame,
@@ -70,6 +76,7 @@ class RobotInputs:
             timeout_s=robot.camera.timeout_ms / 1e3,
             latency_ns=round(robot.camera.latency_ms * 1e6),
             on_frame=self._see,
+            on_death=on_death,
         )
 
     @property
@@ -118,8 +125,9 @@ class RobotInputs:
         )
         if outputs.pose is not None:
             self.history.put(outputs.pose)
-        if outputs.findings:
-            self.findings.put(outputs.findings)
+        findings = (*outputs.findings, *self._link.step(state.robot_stamp_ns))
+        if findings:
+            self.findings.put(findings)
         if self.recorder is not None:
             self._log(self.recorder, state, outputs, commanded, now_ns)
 
@@ -142,13 +150,13 @@ class RobotInputs:
 
     def _see(self, frame: Frame) -> None:
         """The camera's motion from this picture; in the camera thread."""
-        eye, newest = self._eye, self.history.newest()
-        if eye is None or newest is None:
+        eye, attitude = self._eye, self.history.attitude_at(frame.stamp_ns)
+        if eye is None or attitude is None:
             return
         try:
             grey = grey_frame(frame.jpeg)
             if grey is not None:
-                motion = eye.step(grey, frame.stamp_ns, Attitude(newest.roll_rad, newest.pitch_rad))
+                motion = eye.step(grey, frame.stamp_ns, Attitude(*attitude))
                 if motion is not None:
                     self.estimator.add_visual(motion)
         except (cv2.error, ValueError, np.linalg.LinAlgError) as error:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from edge.camera_geometry import Array, Attitude, CameraGeometry, FloorProjector, seen_from
 from edge.floor_alignment import AlignmentConfig, Picture, Solution, align_pictures, fit_corners, smooth
 from edge.geometry import SE2
+from edge.jpeg import jpeg_refusal, jpeg_size
 
 Grey = npt.NDArray[np.uint8]
 Covariance = tuple[float, float, float, float, float, float, float, float, float]
@@ -86,30 +87,23 @@ class _Keyframe:
 
 
 def grey_frame(jpeg: bytes, width_px: int = 320) -> Grey | None:
-    """JPEG → grey picture [h, w] of about `width_px`; None when it is not a picture.
+    """JPEG → grey picture [h, w] of about `width_px`; None when it is not a picture of a sensible size.
 
     The decoder itself shrinks by 2, 4 or 8, which is cheaper than decoding the whole.
     """
-    data = np.frombuffer(jpeg, dtype=np.uint8)
-    if data.size == 0:
+    size = jpeg_size(jpeg)
+    if size is None or jpeg_refusal(jpeg) is not None:
         return None
-    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE if _jpeg_width(jpeg) < 2 * width_px else _reduced(jpeg, width_px))
+    try:
+        grey = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), _reduced(size[0] / width_px))
+    except cv2.error:
+        return None
     return None if grey is None else np.ascontiguousarray(grey, dtype=np.uint8)
 
 
-def _jpeg_width(jpeg: bytes) -> int:
-    """Width in the start-of-frame segment; 0 when there is none (the decoder then decides)."""
-    at = 2
-    while at + 9 < len(jpeg) and jpeg[at] == 0xFF:
-        marker = jpeg[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(jpeg[at + 7 : at + 9], "big")
-        at += 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
-    return 0
-
-
-def _reduced(jpeg: bytes, width_px: int) -> int:
-    ratio = _jpeg_width(jpeg) / width_px
+def _reduced(ratio: float) -> int:
+    if ratio < 2:
+        return int(cv2.IMREAD_GRAYSCALE)
     if ratio >= 8:
         return int(cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return int(cv2.IMREAD_REDUCED_GRAYSCALE_4 if ratio >= 4 else cv2.IMREAD_REDUCED_GRAYSCALE_2)

@@ -10,6 +10,7 @@ import pytest
 
 from edge.camera import CameraPoller, decode_frame
 from edge.policy import fit_frame
+from edge.visual_odometry import grey_frame
 from firmware_bridge.unitree.client import CameraError
 
 MS = 1_000_000
@@ -38,6 +39,52 @@ def test_a_frame_is_rgb_and_of_the_encoders_size() -> None:
 def test_bytes_that_are_no_picture_are_refused(bad: bytes) -> None:
     with pytest.raises(CameraError):
         decode_frame(bad, 64)
+
+
+def huge(width: int, height: int) -> bytes:
+    """A JPEG whose header says that it is larger than it is."""
+    picture = bytearray(jpeg())
+    at = picture.index(b"\xff\xc0") + 5
+    picture[at : at + 4] = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    return bytes(picture)
+
+
+@pytest.mark.parametrize("size", [(65500, 65500), (30000, 30000), (4097, 16), (0, 16)])
+def test_a_picture_of_a_size_that_no_camera_has_is_refused_before_it_is_decoded(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(CameraError, match="pixels"):
+        decode_frame(huge(*size), 64)
+    assert grey_frame(huge(*size)) is None
+
+
+def test_a_picture_of_too_many_bytes_is_refused() -> None:
+    with pytest.raises(CameraError, match="bytes, at most"):
+        decode_frame(jpeg() + bytes(8 * 1024 * 1024), 64)
+
+
+def test_a_decoder_that_fails_costs_a_frame_and_not_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_arguments: object) -> None:
+        raise cv2.error("out of memory")
+
+    monkeypatch.setattr(cv2, "imdecode", fail)
+    with pytest.raises(CameraError, match="cannot be decoded"):
+        decode_frame(jpeg(), 64)
+    assert grey_frame(jpeg()) is None
+
+
+def test_a_thread_that_dies_says_so_once() -> None:
+    deaths: list[str] = []
+
+    def request(_timeout_s: float) -> bytes:
+        raise RuntimeError("the bus is gone")
+
+    poller = CameraPoller(request, image_px=64, period_ns=10 * MS, timeout_s=0.2, latency_ns=0, on_death=deaths.append)
+    poller.start()
+    poller._thread.join(5)
+    poller.close()
+    assert deaths == ["camera thread died: RuntimeError: the bus is gone"]
 
 
 def test_an_image_of_another_kind_is_refused() -> None:

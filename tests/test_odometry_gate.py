@@ -139,3 +139,55 @@ def test_a_robots_clock_that_is_set_back_is_not_lag() -> None:
     verdicts = feed([*ahead, *back])
     assert all(not v.findings for v in verdicts)
     assert all(v.increment is not None for v in verdicts[1:])
+
+
+def test_a_delay_that_stays_is_found_for_as_long_as_it_does() -> None:
+    punctual = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(50)]
+    late = [
+        replace(r, robot_stamp_ns=r.received_ns, received_ns=r.received_ns + 300_000_000) for r in walking(6000)[50:]
+    ]
+    assert all(names(v) == ["odometry-stale"] for v in feed([*punctual, *late])[50:])
+
+
+@pytest.mark.parametrize("ppm", [-90, 90])
+def test_a_robots_clock_that_runs_a_little_fast_or_slow_is_no_delay(ppm: int) -> None:
+    reports = [
+        report(i, robot_stamp_ns=round((i + 1) * STEP_NS * (1 + ppm * 1e-6)) + 10**9) for i in range(0, 200000, 40)
+    ]
+    assert all(not v.findings for v in feed(reports))
+
+
+def test_a_robots_clock_that_is_set_back_a_little_is_not_lag() -> None:
+    before = [replace(r, robot_stamp_ns=r.received_ns + 2_000_000_000) for r in walking(50)]
+    after = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(60)[50:]]
+    assert all(not v.findings for v in feed([*before, *after]))
+
+
+def turning(count: int, yaw_radps: float, gyro_radps: float) -> list[OdometryInputs]:
+    return [report(i, theta=yaw_radps * i * 0.02, wz_radps=yaw_radps, gyro_wz_radps=gyro_radps) for i in range(count)]
+
+
+@pytest.mark.parametrize(("yaw", "gyro"), [(1.0, 0.0), (-1.0, 0.0), (0.1, 1.2)])
+def test_a_gyro_that_disagrees_with_the_reported_yaw_is_found_within_300_ms_and_not_followed(
+    yaw: float, gyro: float
+) -> None:
+    verdicts = feed(turning(60, yaw, gyro))
+    first = next(i for i, v in enumerate(verdicts) if "odometry-speed-mismatch" in names(v))
+    assert first <= 15
+    assert all(v.increment is not None and v.increment.turn_rad == v.increment.odometry_rad for v in verdicts[first:])
+
+
+def test_a_gyro_that_is_a_little_off_is_followed() -> None:
+    verdicts = feed(turning(60, 1.0, 0.7))
+    assert all(not v.findings for v in verdicts)
+    assert verdicts[-1].increment is not None and verdicts[-1].increment.turn_rad == pytest.approx(0.7 * 0.02)
+
+
+def test_a_gyro_is_not_judged_by_its_ends_of_a_long_silence() -> None:
+    before, after = turning(20, 1.0, 1.0), [report(i, theta=0.4, gyro_wz_radps=0.0) for i in range(100, 140)]
+    assert all("odometry-speed-mismatch" not in names(v) for v in feed([*before, *after]))
+
+
+def test_a_frozen_pose_is_found_once_for_every_half_second_that_it_is_pushed() -> None:
+    verdicts = feed([report(i, commanded=(0.3, 0.0, 0.0)) for i in range(80)])
+    assert sum("odometry-frozen" in names(v) for v in verdicts) == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 from edge.findings import Finding
@@ -13,7 +14,10 @@ from edge.pose_history import StampedPose
 TIPPED_RAD = math.radians(30.0)
 LINK_WINDOW_NS = 2_000_000_000
 LOSSY = 0.65
-"""Share of the state messages of the first seconds: 10 % lost is no fault, half of them is (fault matrix, row 35)."""
+"""Share of the state messages: 10 % lost is no fault, half of them is (fault matrix, row 35)."""
+ENOUGH_HZ = 50.0
+"""The rate of `rt/sportmodestate` (protocol facts, 49.5 Hz received): who sends more may lose what is above."""
+_JUDGE_NS = 250_000_000
 
 
 class Attitude(Protocol):
@@ -45,8 +49,43 @@ class RobotWatchConfig:
             raise ValueError(f"expected 0 < late_ms ≤ stale_ms, found {self.late_ms} and {self.stale_ms}")
 
 
+class LinkMonitor:
+    """How many of a robot's states are lost, by the gaps between its own stamps; for a robot with a clock.
+
+    Nobody has to know the robot's rate, nor has the link to be good at the start: its period is the shortest that a
+    quarter of its stamps have kept to.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=4096)
+        self._judged_ns = 0
+        self._period_ns = math.inf
+
+    def step(self, robot_stamp_ns: int) -> tuple[Finding, ...]:
+        """Take the stamp of a state as it is accepted; given again four times a second for as long as it is lossy."""
+        stamps = self._stamps
+        if robot_stamp_ns <= 0:
+            return ()
+        if stamps and not 0 < robot_stamp_ns - stamps[-1] <= LINK_WINDOW_NS:
+            stamps.clear()  # its clock was set, or nothing came at all, which is not this fault
+        stamps.append(robot_stamp_ns)
+        while len(stamps) > 1 and robot_stamp_ns - stamps[1] >= LINK_WINDOW_NS:
+            stamps.popleft()
+        span_ns = robot_stamp_ns - stamps[0]
+        if span_ns < LINK_WINDOW_NS or 0 <= robot_stamp_ns - self._judged_ns < _JUDGE_NS:
+            return ()
+        self._judged_ns = robot_stamp_ns
+        spacings = sorted(after - before for before, after in pairwise(stamps))
+        self._period_ns = min(self._period_ns, spacings[len(spacings) // 4])
+        came_hz = len(spacings) * 1e9 / span_ns
+        expected_hz = min(1e9 / self._period_ns, ENOUGH_HZ)
+        if came_hz >= LOSSY * expected_hz:
+            return ()
+        return (Finding("link-lossy", f"{came_hz:.0f} of {expected_hz:.0f} messages a second"),)
+
+
 class RobotMonitor:
-    """Remembers how many state messages came, and how many were dropped."""
+    """Remembers how many state messages came, and how many were dropped; the rate of the first seconds is expected."""
 
     def __init__(self, config: RobotWatchConfig) -> None:
         self._config = config

@@ -29,9 +29,18 @@ class CameraError(RuntimeError):
 class Go2Reader:
     """Newest robot state and camera frames of one robot. Raises DdsError when the bus cannot be joined."""
 
-    def __init__(self, config: RobotConfig, *, bus: Bus | None = None) -> None:
-        """`bus`: use an already open participant (DDS allows one per domain and process)."""
+    def __init__(
+        self, config: RobotConfig, *, bus: Bus | None = None, on_death: Callable[[str], None] = lambda why: None
+    ) -> None:
+        """`bus`: use an already open participant (DDS allows one per domain and process).
+
+        `on_death` is told, once and in the reading thread, why that has ended although nobody closed it.
+        """
         self.malformed = 0
+        """States that were dropped because something in them cannot be."""
+        self.malformed_battery = 0
+        """The same of battery reports, by which nobody drives."""
+        self._on_death = on_death
         self._velocity_frame = config.odometry.velocity_frame
         self._state: RobotState | None = None
         self._battery: BatteryState | None = None
@@ -45,7 +54,7 @@ class Go2Reader:
         self._low_reader = self._bus.reader(LF_LOW_STATE_TOPIC, LowState_)
         self._waitset = self._bus.waitset(self._reader)
         self._video = RpcClient(self._bus, VIDEO_SERVICE)
-        self._thread = threading.Thread(target=self._read_states, name="go2-state", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="go2-state", daemon=True)
         self._thread.start()
 
     def state(self) -> RobotState | None:
@@ -85,6 +94,12 @@ class Go2Reader:
         if self._owns_bus:
             self._bus.close()
 
+    def _run(self) -> None:
+        try:
+            self._read_states()
+        except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
+            self._on_death(f"robot state thread died: {type(error).__name__}: {error}")
+
     def _read_states(self) -> None:
         while not self._closing.is_set():
             self._waitset.wait(_WAIT_NS)
@@ -109,6 +124,6 @@ class Go2Reader:
         for sample in take_each(self._low_reader):
             battery = None if sample is None else battery_state(sample, now_ns)
             if battery is None:
-                self.malformed += 1
+                self.malformed_battery += 1
             else:
                 self._battery = battery
