@@ -62,6 +62,7 @@ class Host:
     user_exists: Callable[[str], bool] = user_exists
     check: Callable[[Sequence[Path]], UnitVerdict] = check_units
     programs: Path = field(default_factory=lambda: Path(sys.executable).parent)
+    python: Path = field(default_factory=lambda: Path(sys.executable))
     prefixes: tuple[Path, ...] = field(
         default_factory=lambda: (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[1])
     )
@@ -134,6 +135,9 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     say("nothing was enabled or started. To do so; the last command lets the robot stand up and drive:")
     for command in commands:
         say(f"  {command}")
+    stop = _bridge_command("stop", inputs)
+    say("emergency stop, at any time; only `edge-bridge arm` takes it back:")
+    say(f"  {stop}")
     result: dict[str, Any] = {
         "files": [str(path) for path in contents],
         "written": [str(path) for path in written],
@@ -144,6 +148,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         "not_checked": list(verdict.not_checked),
         "unreadable": [str(path) for path in closed],
         "commands": commands,
+        "stop": stop,
     }
     write_result(args.json, result)
     return EXIT_DONE if verdict.good else EXIT_CHECK_FAILED
@@ -179,6 +184,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         folder = (args.engines or engines.default_directory(artifacts.directory)).resolve()
     return units.ServiceInputs(
         programs=host.programs,
+        python=host.python,
         prefixes=host.prefixes,
         robot=args.robot.resolve(),
         robot_files=tuple(path for path in (robot.odometry.calibration, robot.safety.estop_file) if path is not None),
@@ -192,7 +198,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         providers=providers,
         devices=tuple(node.path for node in nodes),
         groups=tuple(sorted({node.group for node in nodes if node.group is not None})),
-        memory_bytes=facts.available_bytes,
+        memory_bytes=None if facts.own_memory else facts.available_bytes,
         control_priority=artifacts.runtime.control_priority,
         operator_arm=robot.safety.operator_arm,
         bridge_cores=_bridge_cores(artifacts, facts),
@@ -313,17 +319,18 @@ def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, syst
     # looked at it.
     drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
     if inputs.operator_arm:
-        bridge, robot = shlex.quote(str(inputs.programs / "edge-bridge")), shlex.quote(str(inputs.robot))
-        drive = [
-            f"sudo systemctl enable --now {units.RUNNER_UNIT}",
-            f"sudo {bridge} arm --robot {robot} --socket {units.SOCKET}",
-        ]
+        drive = [f"sudo systemctl enable --now {units.RUNNER_UNIT}", _bridge_command("arm", inputs)]
     return [
         *prepare,
         "sudo systemctl daemon-reload",
         f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
         *drive,
     ]
+
+
+def _bridge_command(word: str, inputs: units.ServiceInputs) -> str:
+    bridge, robot = shlex.quote(str(inputs.programs / "edge-bridge")), shlex.quote(str(inputs.robot))
+    return f"sudo {bridge} {word} --robot {robot} --socket {units.SOCKET}"
 
 
 def _home_of(path: Path) -> str:

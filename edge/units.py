@@ -1,8 +1,9 @@
 """systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
 
 Two services of one user. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
-at once and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot. Both
-are restarted by systemd within seconds; it is the bridge's deadman that keeps the promise in milliseconds.
+at once and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot. systemd
+restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that keeps the
+promise in milliseconds.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
 BRIDGE_PRIORITY: Final = 60
 """Above every priority that a target may give the control thread by default (50): the stop comes first."""
 BRIDGE_MEMORY: Final = "256M"
+RUNNER_MEMORY_SHARE: Final = "75%"
+"""Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
 MULTICAST: Final = IPv4Network("239.255.0.1/32")
 """Where DDS participants announce themselves (RTPS 2.5, section 9.6.1.4.1)."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
@@ -45,6 +48,8 @@ class ServiceInputs:
 
     programs: Path
     """Folder of `edge-bridge` and `edge-run`."""
+    python: Path
+    """The interpreter that they run in."""
     prefixes: tuple[Path, ...]
     """Folders that Python itself and its packages are read from."""
     robot: Path
@@ -66,8 +71,9 @@ class ServiceInputs:
     """Device nodes that those need, as found on the machine."""
     groups: tuple[str, ...]
     """Groups that may open them."""
-    memory_bytes: int
-    """Memory that the runner may take."""
+    memory_bytes: int | None
+    """Memory that the runner may take; None: the target knows its graphics card's only, and a share of the machine's
+    is taken."""
     control_priority: int
     operator_arm: bool
     """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
@@ -75,18 +81,18 @@ class ServiceInputs:
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
 
     def __post_init__(self) -> None:
-        for name in ("programs", "robot", "artifacts", *(("engines",) if self.engines else ())):
+        for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
             if not getattr(self, name).is_absolute():
                 raise UnitError(f"{name} {getattr(self, name)}: expected an absolute path")
-        if set(str(self.programs)) & set("'\"\\"):
-            raise UnitError(
-                f"{self.programs}: systemd takes no program with quotes or backslashes in its path; move it"
-            )
+        for program in (self.programs, self.python):
+            if not set(str(program)) & set("'\"\\"):
+                continue
+            raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
         if not _USER.fullmatch(self.user) or self.user == "root":
             raise UnitError(f"--user {self.user}: expected the name of an ordinary user, such as {DEFAULT_USER}")
         if not self.networks:
             raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
-        if self.memory_bytes <= 0 or not 0 <= self.control_priority <= 99:
+        if (self.memory_bytes is not None and self.memory_bytes <= 0) or not 0 <= self.control_priority <= 99:
             raise UnitError(
                 f"memory {self.memory_bytes} bytes, priority {self.control_priority}: expected > 0, 0 to 99"
             )
@@ -153,6 +159,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
     if inputs.trust is not None:
         # The newest release that was run is remembered where the service may write.
         command += [argument(text) for text in ("--trust", str(inputs.trust), "--state", str(STATE_DIRECTORY))]
+    cleaning = ("-I", "-m", "edge.flight_logs", str(STATE_DIRECTORY))
     optional = tuple(path for path in (inputs.engines, inputs.trust) if path is not None)
     needed = (inputs.robot, *inputs.robot_files, inputs.artifacts, *optional)
     arms = "--arm-at-start was given: this stands the robot up and drives by itself whenever it starts."
@@ -161,23 +168,22 @@ def runner_unit(inputs: ServiceInputs) -> str:
     service: list[Setting | str] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),
+        "A recording bounds itself, all of them together do not: the oldest are deleted; starting does not hang on it.",
+        ("ExecStartPre", "-" + " ".join([word(str(inputs.python)), *(argument(text) for text in cleaning)])),
         arms,
         ("ExecStart", " ".join(command)),
         ("User", inputs.user),
         "ONNX Runtime 1.29 and later keeps a device id and reports to its maker, unless told not to before it starts.",
         ("Environment", "ORT_DISABLE_TELEMETRY=1"),
         *_ending(watchdog_s=3, start_s=180, stop_s=10),
-        "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
-        "nobody but the operator starts the robot again after it.",
-        ("Restart", "on-abnormal"),
-        ("RestartSec", "2s"),
+        *_starting_again(inputs),
         "The control thread asks for real time by itself; the rest of the process stays ordinary.",
         ("LimitRTPRIO", str(inputs.control_priority)),
         ("LimitMEMLOCK", "infinity"),
         "Dies first, and never makes the bridge wait for memory.",
         ("OOMScoreAdjust", "500"),
         ("OOMPolicy", "kill"),
-        ("MemoryMax", str(inputs.memory_bytes)),
+        ("MemoryMax", RUNNER_MEMORY_SHARE if inputs.memory_bytes is None else str(inputs.memory_bytes)),
         ("MemorySwapMax", "0"),
         ("TasksMax", "512"),
         ("StateDirectory", STATE_DIRECTORY.name),
@@ -197,6 +203,20 @@ def runner_unit(inputs: ServiceInputs) -> str:
         *_restarts(900),
     ]
     return _render("runner", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
+    if not inputs.operator_arm:
+        return [
+            "A runner that arms by itself would drive on after a crash, before anybody has looked at the robot.",
+            ("Restart", "no"),
+        ]
+    return [
+        "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
+        "nobody but the operator starts the robot again after it.",
+        ("Restart", "on-abnormal"),
+        ("RestartSec", "2s"),
+    ]
 
 
 def sysusers(user: str) -> str:

@@ -42,6 +42,7 @@ def host(tmp_path: Path) -> Host:
         user_exists=lambda _name: False,
         check=lambda _paths: GOOD,
         programs=programs,
+        python=programs / "python",
         prefixes=(Path("/usr"),),
     )
 
@@ -83,6 +84,16 @@ def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Uni
     ]
     arm = f"sudo {tmp_path}/bin/edge-bridge arm --robot {tmp_path}/go2.toml --socket {SOCKET}"
     assert result["commands"][-1] == arm
+
+
+def test_the_emergency_stop_of_this_service_is_printed(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, result = units()
+    stop = f"sudo {tmp_path}/bin/edge-bridge stop --robot {tmp_path}/go2.toml --socket {SOCKET}"
+    assert result and result["stop"] == stop
+    assert stop in capsys.readouterr().err
+    assert stop not in result["commands"]  # which are given one after the other
 
 
 def test_a_robot_that_would_drive_as_soon_as_its_service_starts_is_refused_in_one_line(

@@ -25,6 +25,7 @@ PRINTABLE = st.text(st.characters(exclude_categories=("C", "Z"), include_charact
 def inputs(**changes: object) -> ServiceInputs:
     defaults = ServiceInputs(
         programs=Path("/opt/tic-vla/bin"),
+        python=Path("/opt/tic-vla/bin/python"),
         prefixes=(Path("/opt/tic-vla"), Path("/usr")),
         robot=Path("/etc/tic-vla/go2.toml"),
         robot_files=(),
@@ -111,6 +112,11 @@ def test_every_start_writes_a_flight_log_of_its_own() -> None:
     assert '"--record" "/var/lib/tic-vla-edge/flight-${INVOCATION_ID}.mcap"' in command
 
 
+def test_old_flight_logs_are_cleaned_up_before_every_start_which_does_not_hang_on_it() -> None:
+    (command,) = settings(runner_unit(inputs()))["ExecStartPre"]
+    assert command == '-"/opt/tic-vla/bin/python" "-I" "-m" "edge.flight_logs" "/var/lib/tic-vla-edge"'
+
+
 def test_a_trusted_key_and_the_memory_of_releases_are_given_to_the_runner() -> None:
     (command,) = settings(runner_unit(inputs(trust=Path("/etc/tic-vla/key.pub"))))["ExecStart"]
     assert '"--trust" "/etc/tic-vla/key.pub" "--state" "/var/lib/tic-vla-edge"' in command
@@ -142,6 +148,10 @@ def test_both_may_lock_their_memory_and_neither_may_take_all_of_it() -> None:
         assert "MemoryMax" in found
 
 
+def test_where_only_a_graphics_cards_memory_is_known_the_runner_gets_a_share_of_the_machines() -> None:
+    assert settings(runner_unit(inputs(memory_bytes=None)))["MemoryMax"] == ["75%"]
+
+
 def test_the_bridge_comes_before_the_control_thread_on_a_core() -> None:
     bridge, runner = settings(bridge_unit(inputs())), settings(runner_unit(inputs()))
     assert bridge["CPUSchedulingPolicy"] == ["fifo"]
@@ -160,6 +170,10 @@ def test_a_bridge_that_restarts_does_not_restart_the_runner() -> None:
 def test_a_runner_that_decided_to_end_is_not_started_again() -> None:
     assert settings(runner_unit(inputs()))["Restart"] == ["on-abnormal"]
     assert settings(bridge_unit(inputs()))["Restart"] == ["always"]
+
+
+def test_a_runner_that_arms_by_itself_is_not_started_again_after_a_crash_either() -> None:
+    assert settings(runner_unit(inputs(operator_arm=False)))["Restart"] == ["no"]
 
 
 @pytest.mark.parametrize("unit", [bridge_unit, runner_unit])
@@ -257,7 +271,8 @@ def programs(folder: Path) -> Path:
 @needs_systemd
 @pytest.mark.parametrize("folder", ["bin", "two words", "100%n", "$HOME", "a;b", "ü"])
 def test_systemd_finds_the_programs_whatever_their_folder_is_called(tmp_path: Path, folder: str) -> None:
-    verdict = check_units(written(tmp_path, inputs(programs=programs(tmp_path / folder))))
+    found = programs(tmp_path / folder)
+    verdict = check_units(written(tmp_path, inputs(programs=found, python=found / "edge-run")))
     assert verdict.complaints == ()
 
 
