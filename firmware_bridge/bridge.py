@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from firmware_bridge.client_link import ClientLink, SocketTakenError
-from firmware_bridge.config import OPERATOR_SUFFIX, ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
@@ -32,6 +32,7 @@ from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DdsError
 from firmware_bridge.unitree.robot_link import RobotLink
 
+_OPERATORS: Final = 4  # at a time
 _LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
@@ -39,13 +40,16 @@ _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE,
 
 EPILOG: Final = """examples:
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
-  edge-bridge stop --robot go2.toml      emergency stop: the running bridge stops the robot and refuses to arm
-  edge-bridge arm --robot go2.toml       takes that stop back, so that the runner may arm again; where the robot file
-                                         says operator_arm, no runner arms without it, and it serves one arming
+  edge-bridge stop --robot go2.toml      emergency stop: every running bridge stops the robot and refuses to arm
+  edge-bridge arm --robot go2.toml       takes that stop back, and one by the remote or the GPIO file that has ended a
+                                         drive, so that the runner may arm again; where the robot file says
+                                         operator_arm, no runner arms without it, and it serves one arming
   edge-bridge status --robot go2.toml    what the running bridge is doing
+stop, arm and status look for a bridge at the installed service's socket (run them with sudo then) and at the robot
+file's, or at --socket only.
 exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, status: done); 1 internal failure, robot stopped
-(stop: not confirmed); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop, arm, status: no
-bridge is running)"""
+(stop: not confirmed by every bridge); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop,
+arm, status: no bridge is running, or none that this user may reach; arm: more than one)"""
 
 
 class Bridge:
@@ -56,7 +60,7 @@ class Bridge:
         self._notifier = notifier
         self._robot = RobotLink(config, log.say)
         self._link = ClientLink(config.bridge.socket)
-        self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), newest_wins=True)
+        self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), places=_OPERATORS)
         self._estop_file = config.safety.estop_file
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns())
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
@@ -76,7 +80,9 @@ class Bridge:
                     time.sleep(self._period_ns / 1e9)
                     self._step(shutdown=True)
         except BaseException:
-            self._last_words()
+            if self._core.status(0).commands:
+                self._robot.write(Move(0.0, 0.0, 0.0))
+                self._robot.write(Call(ids.STOP_MOVE))
             raise
         finally:
             self._link.close()
@@ -125,11 +131,6 @@ class Bridge:
         if period_ns is not None and status.stamp_ns - self._pinged_ns >= period_ns and late_ns < _LATE_NS:
             self._pinged_ns = status.stamp_ns
             self._notifier.watchdog()
-
-    def _last_words(self) -> None:
-        if self._core.status(0).commands:
-            self._robot.write(Move(0.0, 0.0, 0.0))
-            self._robot.write(Call(ids.STOP_MOVE))
 
 
 def is_pressed(path: Path) -> bool:
@@ -199,7 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     commands = ("serve", "stop", "arm", "status")
     parser.add_argument("command", nargs="?", choices=commands, default="serve", help="default: serve")
     parser.add_argument("--robot", required=True, metavar="FILE.toml", help="robot file")
-    parser.add_argument("--socket", type=Path, metavar="PATH", help="socket to listen at, instead of the robot file's")
+    parser.add_argument("--socket", type=Path, metavar="PATH", help="socket of the bridge, instead of the robot file's")
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain, instead of the robot file's")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
@@ -210,13 +211,11 @@ def main(argv: list[str] | None = None) -> int:
         else:
             from firmware_bridge.operate import operate  # never part of the process that serves
 
-            code, result = operate(args.command, config.bridge.socket)
-    except SocketTakenError as error:
+            sockets = (config.bridge.socket,) if args.socket else (SERVICE_SOCKET, config.bridge.socket)
+            code, result = operate(args.command, *sockets)
+    except (SocketTakenError, ConfigError, DdsError) as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
-        return 3
-    except (ConfigError, DdsError) as error:
-        sys.stderr.write(f"edge-bridge: {error}\n")
-        return 2
+        return 3 if isinstance(error, SocketTakenError) else 2
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.config import ConfigError
+from firmware_bridge.config import ConfigError, runtime_dir
 from firmware_bridge.link import MAX_DATAGRAM_BYTES, BridgeStatus, LinkError, Message, decode, encode
 
 _STATUS_PERIOD_NS: Final = 100_000_000
@@ -27,18 +27,20 @@ def listen(path: Path) -> socket.socket:
 
     Raises SocketTakenError, or ConfigError when something else is in the way or the directory is not usable.
     """
-    if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
-        # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
-        raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
+        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+            # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
+            raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.parent == runtime_dir():  # under /tmp somebody else may have made it
+            check_is_ours(path.parent)
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
             answer = probe.connect_ex(str(path))
         if answer == 0:
             raise SocketTakenError(f"another bridge listens at {path}; stop it first, one process commands a robot")
         if answer == errno.ECONNREFUSED:
             path.unlink(missing_ok=True)  # left behind by a bridge that was killed
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         umask = os.umask(0o177)
         try:
             listener.bind(str(path))
@@ -52,62 +54,83 @@ def listen(path: Path) -> socket.socket:
     return listener
 
 
-class ClientLink:
-    """One socket with one client at a time."""
+def check_is_ours(folder: Path) -> None:
+    """Raise ConfigError unless `folder` is a directory of this user that nobody else can enter."""
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o077:
+        what = f"expected a folder of this user's alone, found {stat.filemode(found.st_mode)} of user {found.st_uid}"
+        raise ConfigError(f"{folder}: {what}; remove it or give another --socket")
 
-    def __init__(self, path: Path, *, newest_wins: bool = False) -> None:
-        """`newest_wins`: a new client replaces the present one instead of being turned away."""
+
+class ClientLink:
+    """One socket with one client at a time, or a few."""
+
+    def __init__(self, path: Path, *, places: int = 1) -> None:
+        """`places`: a client beyond one is turned away, a client beyond several replaces the oldest."""
         self.malformed = 0
         self._path = path
-        self._newest_wins = newest_wins
+        self._places = places
         self._listener = listen(path)
-        self._client: socket.socket | None = None
+        self._deaf = False
+        self._clients: list[socket.socket] = []
         self._told_ns = 0
         self._told: tuple[str, ...] = ()
 
     @property
     def connected(self) -> bool:
-        """Whether a runner is connected."""
-        return self._client is not None
+        """Whether a client is connected."""
+        return bool(self._clients)
 
     def files(self) -> list[socket.socket]:
         """What to poll."""
-        return [self._listener] if self._client is None else [self._listener, self._client]
+        return self._clients if self._deaf else [self._listener, *self._clients]
 
     def receive(self) -> list[Message]:
         """Datagrams that have arrived; notices connections and disconnections. Malformed ones are counted, ignored."""
         messages: list[Message] = []
-        if self._client is not None:
-            for data in self._datagrams(self._client):
+        present = list(self._clients)
+        for client in present:
+            for data in self._datagrams(client):
                 try:
                     messages.append(decode(data))
                 except LinkError:
                     self.malformed += 1
-        with contextlib.suppress(BlockingIOError):
-            fresh, _ = self._listener.accept()
-            if self._newest_wins:
-                self._drop_client()
-            if self._client is None:
-                fresh.setblocking(False)
-                self._client, self._told = fresh, ()
-            else:
-                fresh.close()  # without a greeting: its BridgeClient knows what that means
+        if self._clients == present:  # whoever looks at `connected` sees a client go before the next one is there
+            self._accept()
         return messages
 
     def tell(self, status: BridgeStatus) -> None:
         """Send the status when it says something new, and at 10 Hz; dropped when the client does not read."""
         news = (status.state, status.cause, status.blocked_by)
-        due = news != self._told or status.stamp_ns - self._told_ns >= _STATUS_PERIOD_NS
-        if self._client is not None and due:
+        if news != self._told or status.stamp_ns - self._told_ns >= _STATUS_PERIOD_NS:
             self._told_ns, self._told = status.stamp_ns, news
-            with contextlib.suppress(OSError):  # a closed connection is noticed by receive()
-                self._client.send(encode(status))
+            for client in self._clients:
+                with contextlib.suppress(OSError):  # a closed connection is noticed by receive()
+                    client.send(encode(status))
 
     def close(self) -> None:
-        """Disconnect the client and remove the socket file."""
-        self._drop_client()
-        self._listener.close()
+        """Disconnect the clients and remove the socket file."""
+        for file in (self._listener, *self._clients):
+            file.close()
         self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        self._deaf = False
+        try:
+            fresh, _ = self._listener.accept()
+        except BlockingIOError:
+            return
+        except OSError:  # no descriptor left, or the client has gone again: not to be polled before the next step
+            self._deaf = True
+            return
+        if len(self._clients) >= self._places > 1:
+            self._drop(self._clients[0])
+        if len(self._clients) < self._places:
+            fresh.setblocking(False)
+            self._clients.append(fresh)
+            self._told = ()
+        else:
+            fresh.close()  # without a greeting: its BridgeClient knows what that means
 
     def _datagrams(self, client: socket.socket) -> Iterator[bytes]:
         for _ in range(_MAX_DATAGRAMS_A_STEP):
@@ -118,11 +141,10 @@ class ClientLink:
             except OSError:
                 data = b""
             if not data:
-                self._drop_client()
+                self._drop(client)
                 return
             yield data
 
-    def _drop_client(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
+    def _drop(self, client: socket.socket) -> None:
+        client.close()
+        self._clients.remove(client)

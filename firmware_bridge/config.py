@@ -22,6 +22,7 @@ else:
 PROTOCOLS: Final = ("unitree",)
 VELOCITY_FRAMES: Final = ("odom", "body")
 OPERATOR_SUFFIX: Final = ".operator"  # of the second socket, for `edge-bridge stop`, `arm` and `status`
+SERVICE_SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")  # where `edge-install units` lets the service listen
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
 
 

@@ -180,7 +180,8 @@ class BridgeCore:
             self._watch(now_ns)
         if now_ns >= self._next_ns:
             self._tick(now_ns)
-        return Outputs(tuple(self._requests), self.status(now_ns), self._wake_ns())
+        wake_ns = min(self._next_ns, self._good_until_ns + 1) if self._state == "armed" else self._next_ns
+        return Outputs(tuple(self._requests), self.status(now_ns), wake_ns)
 
     def status(self, now_ns: int) -> BridgeStatus:
         """What a client is told."""
@@ -382,9 +383,6 @@ class BridgeCore:
     def _send_stop(self, now_ns: int) -> None:
         self._stop_sent_ns = now_ns
         self._requests.append(Call(ids.STOP_MOVE))
-
-    def _wake_ns(self) -> int:
-        return min(self._next_ns, self._good_until_ns + 1) if self._state == "armed" else self._next_ns
 
 
 def _moves(robot: RobotState) -> bool:

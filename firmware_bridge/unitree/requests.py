@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from firmware_bridge.unitree import idl
-from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
+from firmware_bridge.unitree.dds import DDS_ERRORS, MAX_SAMPLE_BYTES, Bus, take_each
 from firmware_bridge.unitree.ids import request_topic, response_topic
 
 MAX_DATA_CHARS: Final = 64 * 1024
@@ -82,10 +82,13 @@ class Requester:
         self.failing = 0
         return self._last_id
 
-    def responses(self) -> list[Response]:
-        """Answers that have arrived since the last look, other clients' included."""
+    def responses(self, limit: int = 64, max_bytes: int = MAX_SAMPLE_BYTES) -> list[Response]:
+        """Answers that have arrived since the last look, other clients' included; at most `limit` of them.
+
+        One of more than `max_bytes` counts as malformed without being decoded.
+        """
         answers = []
-        for sample in take_each(self._reader):
+        for sample in take_each(self._reader, limit, max_bytes):
             response = Response.checked(sample)
             if response is None:
                 self.malformed += 1

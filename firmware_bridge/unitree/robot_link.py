@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from cyclonedds.sub import DataReader
 
 from firmware_bridge.config import RobotConfig
 from firmware_bridge.core import Call, Move, Report
@@ -20,6 +22,9 @@ _MAX_VERSION_CHARS: Final = 40
 _FAILING_WRITES: Final = 3  # in a row: 60 ms at 50 Hz, inside the 100 ms of fault matrix row 46
 _BATTERY_PERIOD_NS: Final = 1_000_000_000  # decoding a low state costs as much as ten other messages
 _MAX_STICK: Final = 1.5  # full travel is 1
+_FEW: Final = 4  # samples of one topic a step: 200 a second, and none of them takes long
+_MAX_BYTES: Final = 4096  # a low state, the largest of what is read here, has 1180
+_MAX_KEPT_BYTES: Final = 256 * 1024  # beyond it not even the fact that it came is of use; bounds the memory
 
 
 class RobotLink:
@@ -31,7 +36,7 @@ class RobotLink:
         self._velocity_frame = config.odometry.velocity_frame
         self._deadband = config.safety.remote_deadband
         self._estop_keys = sum(1 << ids.REMOTE_KEYS.index(key) for key in config.safety.remote_estop_keys)
-        self._bus = bus = Bus(config.dds)
+        self._bus = bus = Bus(config.dds, max_sample_bytes=_MAX_KEPT_BYTES)
         self._sport = Requester(bus, ids.SPORT_SERVICE, allowed=ids.BRIDGE_ALLOWED)
         self._states = bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_)
         self._low_states = bus.reader(ids.LF_LOW_STATE_TOPIC, LowState_)
@@ -68,7 +73,7 @@ class RobotLink:
 
     def _newest_state(self) -> RobotState | None:
         newest = None
-        for sample in take_each(self._states):
+        for sample in _few(self._states):
             state = None if sample is None else robot_state(sample, time.monotonic_ns(), self._velocity_frame)
             if state is None:
                 self._malformed += 1
@@ -79,18 +84,21 @@ class RobotLink:
     def _remote(self) -> tuple[bool, bool]:
         """Whether a stick or key is in use, whether the emergency-stop keys are held."""
         in_use = estop = False
-        for sample in take_each(self._remotes):
-            if sample is None or not within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
+        for sample in _few(self._remotes):
+            if sample is None:
                 self._malformed += 1
                 continue
-            in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
-            estop |= sample.keys & self._estop_keys == self._estop_keys
+            estop |= sample.keys & self._estop_keys == self._estop_keys  # whatever the sticks say
+            if within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
+                in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
+            else:
+                self._malformed += 1
         return in_use, estop
 
     def _foreign(self) -> str | None:
         foreign = None
         for service, harmless, reader in self._requests:
-            for sample in take_each(reader):
+            for sample in _few(reader):
                 api_id = "unreadable request" if sample is None else sample.header.identity.api_id
                 if api_id not in harmless:
                     foreign = f"{service} {api_id}"
@@ -99,21 +107,25 @@ class RobotLink:
     def _battery_percent(self, now_ns: int) -> int | None:
         if now_ns < self._battery_due_ns:
             return None
-        self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
         percent = None
-        for sample in take_each(self._low_states):
+        for sample in _few(self._low_states):
             battery = None if sample is None else battery_state(sample, now_ns)
             self._malformed += battery is None
             percent = None if battery is None else battery.soc_percent
+            self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
         return percent
 
     def _answers(self) -> str | None:
         """The version the sport service has told us, if it has; errors go to the operator."""
         version = None
-        for answer in self._sport.responses():
+        for answer in self._sport.responses(_FEW, _MAX_BYTES):
             api_id = self._sent.pop(answer.request_id, None)
             if api_id is not None and answer.code != ids.OK:
                 self._say(f"the robot answered {ids.SPORT_API_NAMES[api_id]} with error {answer.code}")
             elif api_id == ids.API_VERSION:
                 version = answer.data[:_MAX_VERSION_CHARS] or "nothing"
         return version
+
+
+def _few(reader: DataReader[Any]) -> Iterator[Any]:
+    return take_each(reader, _FEW, _MAX_BYTES)
