@@ -24,7 +24,7 @@ _BATTERY_PERIOD_NS: Final = 1_000_000_000  # decoding a low state costs as much 
 _MAX_STICK: Final = 1.5  # full travel is 1
 _FEW: Final = 4  # samples of one topic a step: 200 a second, and none of them takes long
 _MAX_BYTES: Final = 4096  # a low state, the largest of what is read here, has 1180
-_MAX_KEPT_BYTES: Final = 256 * 1024  # beyond it not even the fact that it came is of use; bounds the memory
+_MAX_KEPT_BYTES: Final = 1024 * 1024  # times 43, the depth of all readers: far below the service's MemoryMax
 
 
 class RobotLink:
