@@ -15,6 +15,8 @@ ANSWER_NS: Final = 200_000_000
 """A status that is younger than the question by this much was made after it was read: ten steps of the bridge."""
 WAITING: Final = "waiting to be armed"
 ARMING: Final = "arming"
+LASTS_S: Final = 6.0
+"""What is in the way and goes by itself within this time is no reason to refuse."""
 
 
 class RefusedError(RuntimeError):
@@ -38,6 +40,35 @@ class Bridge(Protocol):
         """Newest status; raises BridgeUnavailable."""
 
 
+class _Gate:
+    """Whether the bridge may be asked: nothing must be in the way that would keep the robot from driving."""
+
+    def __init__(
+        self, in_the_way: Callable[[], str], operator: bool, clock: Callable[[], int], say: Callable[[str], None]
+    ) -> None:
+        self._in_the_way = in_the_way
+        self._operator = operator
+        self._clock = clock
+        self._say = say
+        self._since_ns: int | None = None
+        self._said = ""
+        self.why = ""
+
+    def look(self, status: BridgeStatus | None) -> bool:
+        """One look. Raises RefusedError when it is in the way for long and somebody wants the robot to be armed."""
+        now_ns, self.why = self._clock(), self._in_the_way()
+        permitted = not self._operator or (status is not None and status.blocked_by == "none")
+        if not self.why or not permitted or self._since_ns is None:
+            self._since_ns = now_ns
+        elif now_ns - self._since_ns > LASTS_S * 1e9:
+            # An operator's word is not kept for later: the robot would start when nobody expects it.
+            raise RefusedError(f"not armed: {self.why}")
+        if self.why and self.why != self._said:
+            self._said = self.why
+            self._say(f"not armed yet: {self.why}")
+        return not self.why
+
+
 def arm(
     bridge: Bridge,
     *,
@@ -45,14 +76,25 @@ def arm(
     stop_requested: Callable[[], bool],
     say: Callable[[str], None],
     on_wait: Callable[[str], None],
+    in_the_way: Callable[[], str] = lambda: "",
+    operator: bool = False,
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> int:
     """Arm, and keep the bridge fed with zeros until it has the robot on its feet; the last sequence number used.
 
     `limit_s`: for the arming itself; waiting for an operator has no limit. `on_wait(WAITING or ARMING)`: every 50 ms
-    from when that waiting began. Raises RefusedError, StoppedEarlyError or BridgeUnavailable.
+    from when that waiting began. `in_the_way()`: what would keep the robot from driving, looked at every 50 ms and
+    empty when the bridge is asked; for an `operator` it is waited for as long as there is none. Raises RefusedError,
+    StoppedEarlyError or BridgeUnavailable.
     """
+    gate = _Gate(in_the_way, operator, clock, say)
+    while not gate.look(bridge.poll()):
+        if stop_requested():
+            raise StoppedEarlyError("stopped before the robot was armed")
+        if operator:
+            on_wait(f"{WAITING} ({gate.why})")
+        sleep(POLL_S)
     seq, waits, waited = 0, False, False
     asked_ns, begun = _ask(bridge, clock), False
     while True:
@@ -75,12 +117,13 @@ def arm(
         if stop_requested():
             raise StoppedEarlyError("stopped while waiting to be armed" if waits else "stopped while arming")
         passed_s = (clock() - asked_ns) / 1e9
-        if waits and passed_s >= ASK_AGAIN_S:
+        clear = not waits or gate.look(status)
+        if waits and clear and passed_s >= ASK_AGAIN_S:
             asked_ns, begun = _ask(bridge, clock), False
         elif not waits and passed_s > limit_s:
             raise RefusedError(f"the bridge did not arm in {limit_s:.0f} s (its state is {state})")
         if waited:
-            on_wait(WAITING if waits else ARMING)
+            on_wait(ARMING if not waits else WAITING if clear else f"{WAITING} ({gate.why})")
         sleep(POLL_S)
 
 

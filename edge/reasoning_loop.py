@@ -26,6 +26,8 @@ from edge.stats import Samples
 IDLE_S = 0.02
 FRAME_POLL_S = 0.002
 """How often a generation whose older frames are prefilled looks for its newest."""
+ANCHOR_MARGIN_NS = 1_000_000_000
+"""How much longer than the latest frame that it could use a generation waits for it."""
 SYNC_DRIVE_S = 0.5
 """Paper, appendix D, synchronous inference: how long one generation is driven by."""
 PREFIXES = 3
@@ -147,6 +149,7 @@ class ReasoningLoop:
         self.invalid_texts = 0
         """Complete texts that were not of the grammar; one that the budget or the mode cuts short is not counted."""
         self.invalid_in_a_row = 0
+        self._busy = False
         self._computed_ns = 0
         self._computing_since_ns: int | None = None
         self.generation_ms = Samples(SAMPLES)
@@ -157,14 +160,19 @@ class ReasoningLoop:
 
     @property
     def busy(self) -> bool:
-        """Whether a generation is being computed; one that is finished and held back is not."""
-        return self._computing_since_ns is not None
+        """Whether a generation is under way; one that is finished and held back is not."""
+        return self._busy
 
     @property
     def busy_ns(self) -> int:
-        """Time for which generations have been computed so far; any thread."""
+        """Time for which generations have been computed so far, without what they waited for; any thread."""
         since_ns, done_ns = self._computing_since_ns, self._computed_ns
         return done_ns if since_ns is None else done_ns + max(0, self._clock() - since_ns)
+
+    @property
+    def gave_way_ns(self) -> int:
+        """Time for which reasoning has waited for ticks so far."""
+        return 0 if self._give_way is None else self._give_way.waited_ns
 
     def submit(self, instruction: str) -> None:
         """Follow another (checked) instruction from now on; the generation under way is ended. Never waits."""
@@ -238,9 +246,12 @@ class ReasoningLoop:
 
         def before_call(needs_ns: int) -> None:
             if self._give_way is not None:
+                self._pause()
                 self._give_way.wait(needs_ns, cancelled)
+                self._compute()
 
-        started_ns = self._computing_since_ns = self._clock()
+        self._busy = True
+        started_ns = self._compute()
         run = self._language.begin(cancelled, interrupt=interrupt, before_call=before_call)
         frames = self._prefill_older(run, job, cancelled)
         anchor, prompt = frames[-1], self._language.prompt
@@ -288,8 +299,18 @@ class ReasoningLoop:
             }
             self._recorder.put("/semantic", state.ready_ns, record)
 
+    def _compute(self) -> int:
+        """From now on something is being computed; now."""
+        now_ns = self._computing_since_ns = self._clock()
+        return now_ns
+
     def _rest(self) -> None:
-        """What is being computed, if anything, has ended."""
+        """The generation, if there was one, has ended."""
+        self._pause()
+        self._busy = False
+
+    def _pause(self) -> None:
+        """Nothing is being computed now."""
         since_ns, self._computing_since_ns = self._computing_since_ns, None
         if since_ns is not None:
             self._computed_ns += self._clock() - since_ns
@@ -313,17 +334,32 @@ class ReasoningLoop:
             frames.append(frame)
             run.feed([self._language.prompt.frame(len(frames), frame, job.instruction)])
         self._prefixes_ns.append(self._clock() - started_ns)
+        self._pause()
+        stamp_ns = self._await_anchor(plan, cancelled)
+        self._compute()
+        anchor = self._ring.nearest(stamp_ns)
+        if anchor is None or (frames and anchor.stamp_ns <= frames[-1].stamp_ns):
+            raise MissedFrameError
+        self.late_anchor_ms.add((anchor.stamp_ns - begun_ns) / 1e6)
+        return [*frames, anchor]
+
+    def _await_anchor(self, plan: Anchor, cancelled: Callable[[], bool]) -> int:
+        """Stamp of the newest frame to use, waited for until there is one; not for ever, should the camera stop."""
+        since_ns, limit_ns = self._clock(), 0
         while True:
             newest_ns = self._ring.newest_ns
-            stamp_ns = None if newest_ns is None else plan.choose(newest_ns)
-            if stamp_ns is not None:
-                anchor = self._ring.nearest(stamp_ns)
-                if anchor is None or (frames and anchor.stamp_ns <= frames[-1].stamp_ns):
-                    raise MissedFrameError
-                self.late_anchor_ms.add((anchor.stamp_ns - begun_ns) / 1e6)
-                return [*frames, anchor]
+            if newest_ns is not None:
+                stamp_ns = plan.choose(newest_ns)
+                if stamp_ns is not None:
+                    return stamp_ns
+                # Frames and this clock need not share their origin: by how much the newest is too early.
+                limit_ns = limit_ns or plan.planned_ns - newest_ns + plan.late_ns + ANCHOR_MARGIN_NS
             if cancelled():
                 raise CancelledError
+            if self._clock() - since_ns > (limit_ns or ANCHOR_MARGIN_NS):
+                # The next one begins with a frame that has not come yet.
+                self._last_anchor_ns = plan.begun_ns if newest_ns is None else newest_ns
+                raise MissedFrameError
             self._stop.wait(FRAME_POLL_S)
 
     def _hold_back(self, until_ns: int, job: Job) -> None:

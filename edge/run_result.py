@@ -44,6 +44,7 @@ def run_result(
             "generation_ms": percentiles(reasoning.generation_ms, "p50", "p99", "max"),
             "anchor_to_ready_ms": percentiles(reasoning.anchor_to_ready_ms, "p50", "p99", "max"),
             "late_anchor_ms": percentiles(reasoning.late_anchor_ms, "p50", "p99", "max"),
+            "gave_way_ms": reasoning.gave_way_ns / 1e6,
         },
         "delay_s": percentiles(ticks.delay_s, "p50", "p99", "max"),
         "delay_error_ms": percentiles(ticks.delay_error_ms, "max"),

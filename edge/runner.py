@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -15,6 +17,7 @@ import cv2
 from edge import engines
 from edge.arming import RefusedError, StoppedEarlyError
 from edge.artifact_files import ArtifactError
+from edge.assembly import RunOptions
 from edge.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
@@ -30,8 +33,9 @@ from edge.prompt import InstructionError, check_instruction
 from edge.reasoning_loop import Mode
 from edge.recording import parts
 from edge.release import ReleaseDelayError, parse_release_delay
-from edge.session import RunOptions, RunSession
+from edge.session import RunSession
 from edge.signature import STATE_DIRECTORY, KeyFileError, Trust
+from edge.terminal import operator_lines
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.unitree.dds import DdsError
@@ -44,9 +48,12 @@ EXAMPLES = """examples:
 edge-bridge must be running; where the robot file says operator_arm, the robot stays where it is until
 `edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
 exit codes: 0 done (also after SIGTERM), 1 a fault ended the run, 2 bad arguments or input, 3 refused to drive,
-            130 interrupted (SIGINT)
+            130 interrupted (SIGINT); a hang of reasoning that cannot be interrupted ends the process by SIGKILL,
+            so that its service starts it again
 """
 
+LINES_S = 1.0
+"""How long the terminal may take at the end for what has not been printed yet."""
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the control thread wants it (CPython's default is 5 ms)."""
 
@@ -95,11 +102,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-run: {line}\n")
-    sys.stderr.flush()
-
-
 def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
     """Everything that can be refused without looking at the robot or the artifacts."""
     if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0):
@@ -125,10 +127,22 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
+    lines = operator_lines("edge-run")
+    try:
+        sessions: list[RunSession] = []
+        code = _run(args, lines.say, sessions)
+    finally:
+        lines.close(LINES_S)
+    if any(session.hung for session in sessions):
+        # A thread that hangs in a driver can keep an orderly exit from ending. To systemd a signal is abnormal.
+        os.kill(os.getpid(), signal.SIGKILL)
+    return code
+
+
+def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[RunSession]) -> int:
     cv2.setNumThreads(1)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     received: list[int] = []
-    sessions: list[RunSession] = []
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
         received.append(number)
@@ -144,44 +158,44 @@ def main(argv: list[str] | None = None) -> int:
             folder = args.engines or engines.default_directory(artifacts.directory)
             engines.check(artifacts, folder)
             artifacts = engines.with_engines(artifacts, folder)
-        session = RunSession(artifacts, robot, options, _say)
+        session = RunSession(artifacts, robot, options, say)
     except (ConfigError, InstructionError, ReleaseDelayError, KeyFileError) as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_BAD_INPUT
     except (ArtifactError, engines.EngineError) as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_REFUSED
     except OSError as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted before anything was started")
+        say("interrupted before anything was started")
         return EXIT_INTERRUPTED
     if not artifacts.trained:
-        _say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
+        say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
     sessions.append(session)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     try:
         result = session.run()
     except StoppedEarlyError as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_INTERRUPTED if signal.SIGINT in received else EXIT_DONE
     except CalibrationError as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_BAD_INPUT
     except (RefusedError, ArtifactError, BridgeUnavailable, DdsError) as error:
-        _say(str(error))
+        say(str(error))
         return EXIT_REFUSED
     for fault in result["faults"]:
-        _say(fault)
+        say(fault)
     try:
         write_result(args.json, result)
     except OSError as error:
-        _say(f"the run ended, but its result could not be written: {error}")
+        say(f"the run ended, but its result could not be written: {error}")
         return EXIT_BAD_INPUT
     if args.json != "-":
-        _say(json.dumps({key: result[key] for key in ("control", "reasoning", "delay_s", "bridge")}))
+        say(json.dumps({key: result[key] for key in ("control", "reasoning", "delay_s", "bridge")}))
     if result["faults"]:
         return EXIT_CHECK_FAILED
     return EXIT_INTERRUPTED if signal.SIGINT in received else EXIT_DONE

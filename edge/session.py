@@ -2,74 +2,52 @@
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import psutil
 
 from edge.arming import POLL_S, RefusedError, StoppedEarlyError, arm
 from edge.artifact_files import ArtifactError
+from edge.assembly import Engines, Loops, RunOptions, assemble
 from edge.command_tap import CommandTap
-from edge.control_loop import ControlLoop
-from edge.controller import Controller, ControllerConfig
-from edge.geometry import SE2
+from edge.deadline import Deadline
+from edge.findings import Finding
 from edge.graph import GraphError
-from edge.guidance import STRAIGHT_AHEAD
 from edge.language import ContextOverflowError, LanguageModel
 from edge.manifest import Artifacts
-from edge.monitors.semantic import SemanticConfig
-from edge.monitors.watch import Sources, Watch, WatchConfig
 from edge.policy import Policy
-from edge.power.monitor import Activity, PowerMonitor
 from edge.prompt import InstructionError
-from edge.reasoning_loop import Mode, ReasoningLoop, SemanticSlot
+from edge.reasoning_loop import Mode
+from edge.reasoning_watch import Hang, ReasoningWatch
 from edge.recorder import Recorder, space_refusal
-from edge.release import ReleaseDelay
-from edge.ring import EncodedFrame, TokenRing
 from edge.robot_inputs import RobotInputs
-from edge.run_power import make_power_monitor
 from edge.run_result import run_result
-from edge.scheduling import GiveWay, TickActivity, enter, freeze_garbage, lock_memory, schedule_for
-from edge.semantic import SemanticState
+from edge.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
 from edge.service import ServiceReporter
-from edge.supervisor import Supervisor
+from edge.warm_up import check_tick, warm_up
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.config import RobotConfig
 from firmware_bridge.notify import Notifier
 
-FRAME_MAX_AGE_MS = 500.0
-"""Fault matrix row 1: zero velocity 500 ms after the camera's last good frame."""
-HISTORY_MARGIN_S = 6.0
-"""Older frames are prefilled before the newest is captured, with a slow model seconds before."""
 CAMERA_LEAD = 0.5
 """Share of a tick period by which a frame is asked for before the tick that uses it."""
 READY_TIMEOUT_S = 10.0
 OPEN_S = 60.0
 """As a service: the most that hashing, opening and warming up a large model's graphs takes."""
+END_S = 7.0
+"""How long everything may take to end, together; systemd kills a service after 10 s (TimeoutStopSec)."""
+JOIN_S = 3.0
+"""Of it, the most for both loops' threads: a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
-JOIN_S = 5.0
-"""How long a thread may take to end; a call of a graph is interrupted."""
+"""Of it, the most for the bridge's word that the robot has been told to stand."""
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What a run was asked for."""
-
-    instruction: str
-    mode: Mode
-    duration_s: float | None
-    release_delay: ReleaseDelay
-    record: Path | None
 
 
 class RunSession:
@@ -84,30 +62,36 @@ class RunSession:
         self._robot = robot
         self._options = options
         self._print = say
-        # Threads leave their lines here, the main thread prints them: a terminal that blocks holds up nobody else.
+        # Threads leave their lines here, the main thread hands them on.
         self._lines: deque[str] = deque(maxlen=LINES)
         self._period_ns = runtime.tick_period_ms * 1_000_000
         self._schedule = schedule_for(artifacts)
         self._lines.extend(self._schedule.notes)
-        self._activity = TickActivity(self._period_ns)
-        self._notifier = Notifier(os.environ)
-        self._notifier.status("opening the graphs")
-        self._notifier.extend(OPEN_S)
+        self._loops: Loops | None = None
+        self._reporter = ServiceReporter(Notifier(os.environ), tick_period_ns=self._period_ns, describe=self._describe)
+        self._reporter.starting("opening the graphs", OPEN_S)
         if artifacts.guided_by_waypoints and options.mode is Mode.NO_REASONING:
             raise InstructionError(
                 f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
                 f"writes; run it with {Mode.ASYNC.value} or {Mode.SYNC.value}"
             )
-        self._policy = Policy(artifacts, schedule=self._schedule, activity=self._activity)
-        self._language = LanguageModel(artifacts, schedule=self._schedule)
-        self._language.check_instruction(options.instruction, len(runtime.frame_offsets_s))
+        activity = TickActivity(self._period_ns)
+        policy = Policy(artifacts, schedule=self._schedule, activity=activity)
+        language = LanguageModel(artifacts, schedule=self._schedule)
+        language.check_instruction(options.instruction, len(runtime.frame_offsets_s))
         try:
-            warm_up(self._policy, self._language, runtime.image_px, len(runtime.frame_offsets_s))
+            tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
         except (GraphError, ContextOverflowError) as error:
             raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
+        check_tick(artifacts, tick_ms)
+        self._engines = Engines(artifacts, policy, language, self._schedule, activity)
         self._stop = threading.Event()
         self._stop_requested = False
         self._faults: list[str] = []
+        self._finished = threading.Event()
+        self._began = False
+        self.hung = False
+        """Whether reasoning hangs in a call that nothing but the end of the process ends."""
 
     def request_stop(self) -> None:
         """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
@@ -122,13 +106,12 @@ class RunSession:
         refusal = None if self._options.record is None else space_refusal(self._options.record)
         if refusal is not None:
             raise RefusedError(refusal)
-        self._notifier.status("waiting for the robot")
-        self._notifier.extend(READY_TIMEOUT_S + self._robot.bridge.arm_timeout_s + OPEN_S)
+        self._reporter.starting("waiting for the robot", READY_TIMEOUT_S + self._robot.bridge.arm_timeout_s + OPEN_S)
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
-        power: PowerMonitor | None = None
         result: dict[str, Any] | None = None
+        end: Deadline | None = None
         try:
             sink = CommandTap(bridge)
             inputs = RobotInputs(
@@ -137,36 +120,48 @@ class RunSession:
                 period_ns=self._period_ns,
                 commanded=lambda: sink.commanded,
                 say=self._lines.append,
+                on_death=self._end_by,
             )
             inputs.camera.start()
-            self._await_inputs(inputs)
+            self._await_inputs(inputs, bridge)
             if self._options.record is not None:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
-            power, control, reasoning, reporter = self._loops(inputs, sink, recorder)
-            power.start()
+            loops = self._loops = assemble(
+                self._engines,
+                self._robot,
+                self._options,
+                inputs,
+                sink,
+                recorder,
+                stop=self._stop,
+                say=self._lines.append,
+                on_tick=self._reporter.on_tick,
+            )
+            loops.power.start()
             # After everything that lives as long as the process has been made.
             refused = lock_memory()
             if refused is not None:
                 self._lines.append(refused)
             freeze_garbage()
-            control.last_seq = self._arm(bridge, reporter)
+            loops.control.last_seq = self._arm(bridge, loops)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()
             process = psutil.Process()
             process.cpu_percent()
+            self._began = True
             if recorder is not None:
                 recorder.put("/run", started_ns, self._run_record(started_ns))
                 inputs.recorder = recorder
-            self._drive(control, reasoning, inputs, bridge)
-            status = self._halt(bridge)
+            end = self._drive(loops, inputs, bridge)
+            status = self._halt(bridge, end)
             result = run_result(
-                control,
-                reasoning,
+                loops.control,
+                loops.reasoning,
                 inputs,
                 status,
-                power_w=power.statistics(),
+                power_w=loops.power.statistics(),
                 faults=list(self._faults),
                 duration_s=(time.monotonic_ns() - started_ns) / 1e9,
             )
@@ -176,130 +171,62 @@ class RunSession:
         finally:
             # Whatever ended the run: closing the connection makes the bridge stop the robot.
             bridge.close()
-            if power is not None:
-                power.close()
-            if inputs is not None:
-                inputs.close()
+            end = end or Deadline(END_S)
             if recorder is not None:
-                self._close_recorder(recorder, result)
+                self._close_recorder(recorder, result, end)
+            if self._loops is not None:
+                end.run("close-power", self._loops.power.close)
+            if inputs is not None:
+                end.run("close-inputs", inputs.close)
             self._print_lines()
         return result
 
-    def _loops(
-        self, inputs: RobotInputs, sink: CommandTap, recorder: Recorder | None
-    ) -> tuple[PowerMonitor, ControlLoop, ReasoningLoop, ServiceReporter]:
-        runtime, options = self._artifacts.runtime, self._options
-        seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
-        slot = SemanticSlot()
-        ring = TokenRing(math.ceil(seconds * 1e9 / self._period_ns), self._policy.tokens_shape)
-        # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
-        loops: list[tuple[ControlLoop, ReasoningLoop]] = []
-        reporter = self._reporter(loops)
+    def _end_by(self, why: str) -> None:
+        """A thread that the run cannot do without has died; any thread."""
+        self._faults.append(why)
+        self._finished.set()
 
-        def activity() -> Activity:
-            control, reasoning = loops[0]
-            return Activity(
-                ticks=control.statistics.ticks,
-                reasoning=reasoning.busy,
-                generations=reasoning.generations,
-                reasoning_s=reasoning.busy_ns / 1e9,
-            )
+    def _describe(self) -> str:
+        if self._loops is None:
+            return "starting"
+        supervision = self._loops.control.supervision
+        faults = f" ({', '.join(supervision.active)})" if supervision.active else ""
+        return f"{supervision.state.value}{faults}, {self._loops.reasoning.generations} generations"
 
-        power = make_power_monitor(
-            self._artifacts,
-            activity=activity,
-            battery=inputs.battery,
-            on_sample=lambda stamp_ns, record: None if recorder is None else recorder.put("/power", stamp_ns, record),
-            on_findings=inputs.findings.put,
-            say=self._lines.append,
-        )
-        reasoning = ReasoningLoop(
-            language=self._language,
-            policy=self._policy,
-            ring=ring,
-            slot=slot,
-            instruction=options.instruction,
-            frame_offsets_s=runtime.frame_offsets_s,
-            max_new_tokens=runtime.max_new_tokens,
-            release_delay_s=options.release_delay.sampler(),
-            recorder=recorder,
-            stop=self._stop,
-            mode=options.mode,
-            budget=power.budget,
-            give_way=GiveWay(self._activity) if self._schedule.shared else None,
-            role=self._schedule.reasoning,
-            say=self._lines.append,
-        )
-        config = ControllerConfig(
-            limits=self._robot.limits,
-            step_s=runtime.step_s,
-            frame_max_age_ms=FRAME_MAX_AGE_MS,
-            odometry_max_age_ms=float(self._robot.odometry.max_age_ms),
-        )
-        # What an untrained model writes is not in the agreed form, and is no fault of the robot's.
-        semantic = SemanticConfig(judge_text=self._artifacts.trained and options.mode is not Mode.NO_REASONING)
-        control = ControlLoop(
-            policy=self._policy,
-            controller=Controller(config),
-            newest_frame=lambda: inputs.camera.newest,
-            history=inputs.history,
-            ring=ring,
-            slot=slot,
-            sink=sink,
-            recorder=recorder,
-            period_ns=self._period_ns,
-            step_s=runtime.step_s,
-            stop=self._stop,
-            watch=Watch(
-                WatchConfig.standard(
-                    config,
-                    self._period_ns,
-                    image_px=runtime.image_px,
-                    camera_hz=self._robot.camera.rate_hz,
-                    semantic=semantic,
-                ),
-                Sources(
-                    findings=inputs.findings,
-                    attitude=inputs.reader.state,
-                    states=lambda: inputs.states,
-                    malformed=lambda: inputs.reader.malformed,
-                    failed_generations=lambda: reasoning.failed,
-                ),
-            ),
-            supervisor=Supervisor(),
-            on_tick=reporter.on_tick,
-            offset_covariance=inputs.offset_covariance,
-        )
-        loops.append((control, reasoning))
-        return power, control, reasoning, reporter
-
-    def _reporter(self, loops: list[tuple[ControlLoop, ReasoningLoop]]) -> ServiceReporter:
-        def describe() -> str:
-            control, reasoning = loops[0]
-            supervision = control.supervision
-            faults = f" ({', '.join(supervision.active)})" if supervision.active else ""
-            return f"{supervision.state.value}{faults}, {reasoning.generations} generations"
-
-        return ServiceReporter(self._notifier, tick_period_ns=self._period_ns, describe=describe)
-
-    def _await_inputs(self, inputs: RobotInputs) -> None:
-        deadline_ns = time.monotonic_ns() + round(READY_TIMEOUT_S * 1e9)
+    def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient) -> None:
+        """Until there is a picture and a pose: a robot that an operator arms may be switched on hours later."""
+        waits = self._robot.safety.operator_arm
+        deadline, said = Deadline(READY_TIMEOUT_S), False
         while not inputs.ready:
             if self._stop_requested:
                 raise StoppedEarlyError("stopped before the robot was armed")
-            if time.monotonic_ns() > deadline_ns:
-                missing = "state" if inputs.history.newest() is None else "camera frame"
+            if self._finished.is_set():
+                raise RefusedError(self._faults[0])
+            bridge.poll()  # raises when it has gone
+            missing = "state" if inputs.history.newest() is None else "camera frame"
+            if deadline.left_s() <= 0 and not waits:
                 why = f" ({inputs.camera.last_error})" if inputs.camera.last_error else ""
                 where = f"DDS domain {self._robot.dds.domain} on {self._robot.dds.interface}"
                 raise RefusedError(f"no {missing} from the robot in {READY_TIMEOUT_S:.0f} s on {where}{why}: is it on?")
+            if waits:
+                self._reporter.on_wait(f"waiting for the robot: no {missing} yet")
+                self._print_lines()
+                if deadline.left_s() <= 0 and not said:
+                    said = True
+                    self._print(f"waiting for the robot: no {missing} yet, is it on?")
             time.sleep(POLL_S)
 
-    def _arm(self, bridge: BridgeClient, reporter: ServiceReporter) -> int:
+    def _arm(self, bridge: BridgeClient, loops: Loops) -> int:
         """Arm, after an operator where the robot file wants one; returns the last sequence number used."""
 
         def on_wait(text: str) -> None:
-            reporter.on_wait(text)
+            self._reporter.on_wait(text)
             self._print_lines()
+
+        def in_the_way() -> str:
+            if self._finished.is_set():
+                raise RefusedError(self._faults[0])
+            return loops.pre_arm.in_the_way()
 
         return arm(
             bridge,
@@ -307,69 +234,91 @@ class RunSession:
             stop_requested=lambda: self._stop_requested,
             say=self._print,
             on_wait=on_wait,
+            in_the_way=in_the_way,
+            operator=self._robot.safety.operator_arm,
         )
 
-    def _drive(self, control: ControlLoop, reasoning: ReasoningLoop, inputs: RobotInputs, bridge: BridgeClient) -> None:
-        """Run both threads until the end; this thread only waits, and prints what the others have to say."""
+    def _drive(self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient) -> Deadline:
+        """Run both threads until the end; this thread only waits and looks on. Returns by when all must have ended."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
         epoch_ns = time.monotonic_ns() + self._period_ns // 2
         inputs.camera.align(epoch_ns - round(CAMERA_LEAD * self._period_ns))
         duration_s = self._options.duration_s
         end_ns = None if duration_s is None else epoch_ns + round(duration_s * 1e9)
-        finished = threading.Event()
-
-        def guard(name: str, body: Callable[[], None]) -> Callable[[], None]:
-            def target() -> None:
-                try:
-                    body()
-                except BridgeUnavailable as error:
-                    self._faults.append(f"bridge lost: {error}")
-                except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
-                    self._faults.append(f"{name} thread died: {type(error).__name__}: {error}")
-                finally:
-                    finished.set()
-
-            return target
+        control, reasoning = loops.control, loops.reasoning
 
         def drive() -> None:
-            try:
-                self._lines.extend(enter(self._schedule.control))
-                ended = control.run(epoch_ns, end_ns)
-                if ended is not None:
-                    self._faults.append(f"the {control.ended_by} ended the run: {ended}")
-            finally:
-                # At once, not after the reasoning thread has been waited for.
-                bridge.stop()
-                self._notifier.stopping(self._faults[0] if self._faults else "the run has ended")
+            self._lines.extend(enter(self._schedule.control))
+            ended = control.run(epoch_ns, end_ns)
+            if ended is not None:
+                self._faults.append(f"the {control.ended_by} ended the run: {ended}")
+
+        def stop_robot() -> None:
+            # At once, not after the reasoning thread has been waited for.
+            bridge.stop()
+            self._reporter.stopping(self._faults[0] if self._faults else "the run has ended")
 
         # Daemons: a thread that hangs in a driver must not keep the process from ending.
         threads = [
-            threading.Thread(target=guard("control", drive), name="control", daemon=True),
-            threading.Thread(target=guard("reasoning", reasoning.run), name="reasoning", daemon=True),
+            threading.Thread(target=self._guard("control", drive, stop_robot), name="control", daemon=True),
+            threading.Thread(target=self._guard("reasoning", reasoning.run), name="reasoning", daemon=True),
         ]
         for thread in threads:
             thread.start()
-        says = ""
-        while not finished.wait(POLL_S):
-            if self._stop_requested:
-                self._stop.set()
-            if control.supervision.says != says:
-                says = control.supervision.says
-                self._print(says or "all faults have cleared")
-            self._print_lines()
+        self._look_on(loops, inputs)
         self._stop.set()
+        end = Deadline(END_S)
         reasoning.cancel()
+        join = Deadline(JOIN_S)
         for thread in threads:
-            thread.join(JOIN_S)
+            thread.join(join.left_s())
             if thread.is_alive():
                 self._faults.append(f"the {thread.name} thread did not end within {JOIN_S:g} s")
+        return end
 
-    def _halt(self, bridge: BridgeClient) -> BridgeStatus | None:
+    def _guard(
+        self, name: str, body: Callable[[], None], after: Callable[[], None] | None = None
+    ) -> Callable[[], None]:
+        """The body of a thread whose end is the end of the run; `after` is told when the faults are known."""
+
+        def target() -> None:
+            try:
+                body()
+            except BridgeUnavailable as error:
+                self._faults.append(f"bridge lost: {error}")
+            except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
+                self._faults.append(f"{name} thread died: {type(error).__name__}: {error}")
+            finally:
+                if after is not None:
+                    after()
+                self._finished.set()
+
+        return target
+
+    def _look_on(self, loops: Loops, inputs: RobotInputs) -> None:
+        """Until a thread has ended or a stop is asked for: hand lines on, and see that reasoning gets anywhere."""
+        reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
+        while not self._finished.wait(POLL_S):
+            if self._stop_requested:
+                self._stop.set()
+            if loops.control.supervision.says != says:
+                says = loops.control.supervision.says
+                self._print(says or "all faults have cleared")
+            self._print_lines()
+            hang = watch.step(reasoning.last_progress_ns, reasoning.generation_ms.quantile(1.0), time.monotonic_ns())
+            if hang is Hang.INTERRUPT:
+                self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")
+                reasoning.cancel()
+            elif hang is Hang.GIVE_UP and not self.hung:
+                self.hung = True
+                inputs.findings.put((Finding("reasoning-hung", f"for {watch.stood_s:.0f} s"),))
+
+    def _halt(self, bridge: BridgeClient, end: Deadline) -> BridgeStatus | None:
         """Wait until the bridge has put zero on the wire (it does so in any case, within its deadman)."""
         status: BridgeStatus | None = None
         try:
-            deadline_ns = time.monotonic_ns() + round(STOP_CONFIRM_S * 1e9)
-            while time.monotonic_ns() < deadline_ns:
+            confirm = Deadline(end.left_s(STOP_CONFIRM_S))
+            while confirm.left_s() > 0:
                 status = bridge.poll()
                 if status is not None and status.state == "stopped" and status.zero_after_stop:
                     return status
@@ -380,13 +329,14 @@ class RunSession:
                 self._faults.append(f"bridge lost: {error}")
         return status
 
-    def _close_recorder(self, recorder: Recorder, result: dict[str, Any] | None) -> None:
-        recorder.close()
-        if result is None:
-            recorder.path.unlink(missing_ok=True)  # the run never began: an empty log would only mislead
+    def _close_recorder(self, recorder: Recorder, result: dict[str, Any] | None, end: Deadline) -> None:
+        recorder.close(end.left_s())
+        if not self._began:
+            recorder.path.unlink(missing_ok=True)  # an empty log would only mislead
             return
         dropped = sum(recorder.dropped.values())
-        result["recorder"] = recorder.statistics()
+        if result is not None:
+            result["recorder"] = recorder.statistics()
         if recorder.error is not None:
             self._print(f"the flight log is incomplete: {recorder.error}")
         elif dropped:
@@ -410,15 +360,3 @@ class RunSession:
     def _print_lines(self) -> None:
         while self._lines:
             self._print(self._lines.popleft())
-
-
-def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count: int) -> None:
-    """Run every graph once or more, so that no tick pays for first-time allocation."""
-    here = SE2(0.0, 0.0, 0.0)
-    frame = np.zeros((1, image_px, image_px, 3), dtype=np.uint8)
-    frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(frame_count)]
-    generation = language.generate(language.prompt.build(frames, "stop"), max_new_tokens=4, cancelled=lambda: False)
-    context = policy.semantic_context(generation.last_layer_kv)
-    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, "", STRAIGHT_AHEAD)
-    for _ in range(5):
-        policy.act(policy.encode(frame), (0.0, 0.0, 0.0), 0.0, here, semantic)

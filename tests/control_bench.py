@@ -103,6 +103,7 @@ class Bench:
         self.states = 0
         self.malformed = 0
         self.failed = 0
+        self.invalid_texts = 0
         self.asleep_ns = 0
         self.attitude = Attitude()
         self.findings = FindingQueue()
@@ -121,6 +122,7 @@ class Bench:
             states=lambda: self.states,
             malformed=lambda: self.malformed,
             failed_generations=lambda: self.failed,
+            invalid_texts=lambda: self.invalid_texts,
             asleep_ns=lambda: self.asleep_ns,
         )
         config = WatchConfig.standard(controller, PERIOD_NS, image_px=PX, semantic=semantic)

@@ -465,6 +465,27 @@ def test_three_invalid_texts() -> None:
     bench.drive()
 
 
+def test_three_invalid_texts_that_were_never_published() -> None:
+    """A policy that is guided by waypoints keeps the last good answer."""
+    bench = Bench(semantic=SemanticConfig(judge_text=True))
+    bench.drive()
+    bench.invalid_texts = 2
+    bench.see()
+    assert bench.tick()[1] == "ok"
+    bench.invalid_texts = 3
+    zero_in_time(bench, "semantic-text-invalid", bench.see)
+    bench.invalid_texts = 0
+    bench.drive()
+
+
+def test_invalid_texts_before_the_first_valid_one() -> None:
+    bench = Bench(semantic=SemanticConfig(judge_text=True))
+    bench.invalid_texts = 3
+    bench.see()
+    bench.tick()
+    assert found(bench, "semantic-text-invalid")
+
+
 def test_texts_are_not_judged_where_the_model_was_not_trained_to_write_them(bench: Bench) -> None:
     babble = babbling(bench)
     for _ in range(5):
@@ -559,7 +580,8 @@ def test_a_machine_that_slept(bench: Bench) -> None:
 
 def test_a_process_that_was_frozen(bench: Bench) -> None:
     bench.now_ns += 2 * 10**9
-    zero_in_time(bench, "suspended", bench.see)
+    zero_in_time(bench, "tick-overrun", bench.see)
+    assert not found(bench, "suspended"), "no clock says that the machine slept"
 
 
 def test_a_clock_that_runs_backwards(bench: Bench) -> None:

@@ -17,7 +17,7 @@ from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
 from edge.reasoning_text import Waypoints
 from edge.semantic import SemanticState
-from edge.session import warm_up
+from edge.warm_up import warm_up
 from export.model.config import PRESETS
 from export.model.network import build
 from tests.artifact_directory import write_artifacts

@@ -135,6 +135,7 @@ class Runner:
     bench: Bench = field(default_factory=bench_of)
     at_ms: dict[int, Callable[[], object]] = field(default_factory=dict)
     deaf: bool = False
+    in_the_way: str = ""
     asked_ms: list[int] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
     waited: list[str] = field(default_factory=list)
@@ -175,12 +176,17 @@ class Runner:
             stop_requested=lambda: self.stop,
             say=self.said.append,
             on_wait=self.waited.append,
+            in_the_way=lambda: self.in_the_way,
+            operator=self.bench.safety.operator_arm,
             clock=lambda: self.bench.now_ns,
             sleep=self.sleep,
         )
 
     def permit(self) -> None:
         self.bench.step(operator=(Arm(),))
+
+    def clear(self) -> None:
+        self.in_the_way = ""
 
 
 class TestRunner:
@@ -258,4 +264,41 @@ class TestRunner:
     def test_a_bridge_that_does_not_answer_is_given_up(self) -> None:
         runner = Runner(deaf=True)
         with pytest.raises(RefusedError, match="did not arm in 12 s"):
+            runner.run()
+
+
+class TestInTheWay:
+    """What the runner itself finds before arming; the bridge does not know of it."""
+
+    def test_what_lasts_is_a_refusal_before_the_bridge_is_asked(self) -> None:
+        runner = Runner(Bench(), in_the_way="There is no new picture to drive by.")
+        with pytest.raises(RefusedError, match="not armed: There is no new picture"):
+            runner.run()
+        assert runner.asked_ms == []
+        assert 6_000 <= runner.now_ms <= 6_500
+
+    def test_what_goes_by_itself_is_waited_for(self) -> None:
+        runner = Runner(Bench(), in_the_way="dark")
+        runner.at_ms[4_000] = runner.clear
+        runner.run()
+        assert runner.bench.status.state == "armed" and runner.asked_ms[0] >= 4_000
+
+    def test_while_no_operator_has_said_arm_it_may_last_for_hours(self) -> None:
+        runner = Runner(in_the_way="dark")
+        runner.at_ms = {3_600_000: runner.clear, 3_610_000: runner.permit}
+        runner.run()
+        assert runner.bench.status.state == "armed"
+        assert runner.waited[0] == f"{WAITING} (dark)"
+
+    def test_an_operators_word_is_not_kept_until_it_goes(self) -> None:
+        runner = Runner()
+        runner.at_ms = {60_000: lambda: setattr(runner, "in_the_way", "dark"), 90_000: runner.permit}
+        with pytest.raises(RefusedError, match="not armed: dark"):
+            runner.run()
+        assert runner.now_ms <= 97_000 and runner.bench.written == []
+
+    def test_a_signal_ends_the_waiting_for_it(self) -> None:
+        runner = Runner(in_the_way="dark")
+        runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
+        with pytest.raises(StoppedEarlyError, match="before the robot was armed"):
             runner.run()

@@ -572,3 +572,73 @@ def test_the_time_spent_computing_is_counted(bench: Bench, clock: Clock) -> None
     clock.s += 5.0
     assert seen == [(True, 700_000_000)]
     assert (bench.loop.busy, bench.loop.busy_ns) == (False, 700_000_000)
+
+
+class Waiting:
+    """Gives way for half a second before every call."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.waited_ns, self.busy_ns = clock, 0, -1
+        self.loop: ReasoningLoop | None = None
+
+    def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
+        assert self.loop is not None
+        self.clock.s += 0.5
+        self.waited_ns += 500_000_000
+        self.busy_ns = self.loop.busy_ns
+        assert self.loop.busy, "a generation is under way all the same"
+
+
+def test_giving_way_to_ticks_is_not_computing(clock: Clock) -> None:
+    way = Waiting(clock)
+    bench = Bench(clock=clock, give_way=way)
+    way.loop = bench.loop
+    bench.language.during_finish = lambda _run: setattr(clock, "s", clock.s + 0.7)
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert (way.busy_ns, bench.loop.busy_ns, bench.loop.busy) == (700_000_000, 700_000_000, False)
+    assert bench.loop.gave_way_ns == 500_000_000
+
+
+class Ticking(threading.Event):
+    """A stop that is never asked for; waiting for it lets the time pass."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self.clock = clock
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.clock.s += timeout or 0.0
+        return False
+
+
+def camera_stops(bench: Bench, clock: Clock) -> None:
+    """The older frames of the second generation take 2 s, and no newer frame comes."""
+
+    def prefill() -> None:
+        clock.s += 2.0
+
+    bench.language.during_feed = prefill
+    bench.frame(97.0)
+    bench.frame(100.0)
+    assert bench.loop.step()
+    bench.frame(102.0)
+    bench.frame(103.0)
+    bench.loop._stop = Ticking(clock)
+
+
+def test_a_frame_that_never_comes_is_not_waited_for_for_ever(bench: Bench, clock: Clock) -> None:
+    camera_stops(bench, clock)
+    started_s = clock.s
+    assert not bench.loop.step()
+    assert bench.loop.missed_frames == 1
+    assert clock.s - started_s == pytest.approx(2.0 + 2.0 + 0.5 + 1.0, abs=0.1)
+    assert not bench.loop.step(), "nothing to do until there is another frame"
+    assert bench.loop.missed_frames == 1
+
+
+def test_waiting_for_a_frame_is_not_computing(bench: Bench, clock: Clock) -> None:
+    camera_stops(bench, clock)
+    before_ns = bench.loop.busy_ns
+    bench.loop.step()
+    assert bench.loop.busy_ns - before_ns == pytest.approx(2e9, abs=1e6)

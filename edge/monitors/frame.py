@@ -52,7 +52,8 @@ class FrameConfig:
     stopped_ms: float = 300.0
     """Zero when the picture that is driven by is older."""
     stale_ms: float = 300.0
-    """A picture that is older when it is first seen is refused."""
+    """A picture that is older when it is first seen is refused. Fault matrix row 3 asks for 200 ms; one that comes just
+    after a tick waits a period for the next, which with 100 ms of the camera's own would be beyond that."""
     frozen_ms: float = 190.0
     """Zero when the content has been the same for so long while the robot moved: at 10 Hz the second repetition."""
     moved_m: float = 0.02

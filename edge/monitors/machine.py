@@ -11,7 +11,7 @@ LATE_TICKS = 3
 """Of the last ten: openpilot calls a model lagging when more than 20 % of its frames are dropped (facts, "Figures")."""
 OVERRUN_PERIODS = 2.0
 GAP_NS = 1_000_000_000
-"""Between two ticks: this process was frozen, or the machine slept on a clock that counts sleep."""
+"""Between two ticks: this process was frozen, or starved."""
 SLEPT_NS = 100_000_000
 """The clock that counts sleep and the one that does not part by less than this, unless the machine slept."""
 
@@ -36,8 +36,10 @@ class MachineMonitor:
             findings.append(Finding("clock-backwards", f"by {(self._last_ns - now_ns) / 1e6:.0f} ms"))
         gap_ns = 0 if self._last_ns is None else now_ns - self._last_ns
         slept_ns = 0 if self._asleep_ns is None else asleep_ns - self._asleep_ns
-        if gap_ns > GAP_NS or slept_ns > SLEPT_NS:
-            findings.append(Finding("suspended", f"for {max(gap_ns, slept_ns) / 1e9:.1f} s"))
+        if slept_ns > SLEPT_NS:
+            findings.append(Finding("suspended", f"for {slept_ns / 1e9:.1f} s"))
+        elif gap_ns > GAP_NS:
+            findings.append(Finding("tick-overrun", f"none for {gap_ns / 1e9:.1f} s"))
         self._last_ns = now_ns
         self._asleep_ns = asleep_ns if self._asleep_ns is None else max(self._asleep_ns, asleep_ns)
         if last_tick_ns is not None:

@@ -39,12 +39,19 @@ class SemanticMonitor:
         self._invalid = 0
         self._failed = 0
 
-    def step(self, semantic: SemanticState | None, failed: int, now_ns: int) -> tuple[Finding, ...]:
-        """Judge the newest semantic state; `failed` counts the runs of the reasoning that failed so far."""
+    def step(self, semantic: SemanticState | None, failed: int, now_ns: int, invalid: int = 0) -> tuple[Finding, ...]:
+        """Judge the newest semantic state; `failed` counts the runs of the reasoning that failed so far.
+
+        `invalid`: texts in a row, up to now, that were not in the agreed form. A policy that is guided by waypoints is
+        never given such a text, so it cannot be seen in the state.
+        """
         findings: list[Finding] = []
         for _ in range(min(failed - self._failed, _FAILURES_TOLD)):
             findings.append(Finding("reasoning-failed", f"{failed} in this run"))
         self._failed = max(self._failed, failed)
+        self._count(semantic)
+        if self._config.judge_text and max(self._invalid, invalid) >= INVALID_IN_A_ROW:
+            findings.append(Finding("semantic-text-invalid"))
         if semantic is None:
             return tuple(findings)
         delay_s = semantic.delay_s(now_ns)
@@ -55,12 +62,13 @@ class SemanticMonitor:
             findings.append(Finding("semantic-expired", f"{delay_s:.1f} s old"))
         elif over_s > 0:
             findings.append(Finding("semantic-old", f"{delay_s:.1f} s old", 1 - over_s / self._config.fade_s))
-        if semantic.generation != self._generation:
-            self._generation = semantic.generation
-            if semantic.waypoints is not None:
-                self._invalid = 0
-            elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
-                self._invalid += 1
-        if self._config.judge_text and self._invalid >= INVALID_IN_A_ROW:
-            findings.append(Finding("semantic-text-invalid"))
         return tuple(findings)
+
+    def _count(self, semantic: SemanticState | None) -> None:
+        if semantic is None or semantic.generation == self._generation:
+            return
+        self._generation = semantic.generation
+        if semantic.waypoints is not None:
+            self._invalid = 0
+        elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
+            self._invalid += 1

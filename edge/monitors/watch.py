@@ -42,6 +42,8 @@ class Sources:
     malformed: Callable[[], int] = lambda: 0
     """Of them, those that were dropped because something in them cannot be."""
     failed_generations: Callable[[], int] = lambda: 0
+    invalid_texts: Callable[[], int] = lambda: 0
+    """Complete texts in a row, up to the newest, that were not in the agreed form, also those never published."""
     asleep_ns: Callable[[], int] = asleep_ns
 
 
@@ -104,6 +106,16 @@ class Watch:
         sources = self._sources
         return (*sources.findings.take(), *self._robot.urgent(sources.attitude(), sources.malformed()))
 
+    def standing(self, picture: Picture | None, pose: StampedPose | None, now_ns: int) -> tuple[Finding, ...]:
+        """Before arming: what was found of the newest picture, the robot and by other threads."""
+        self.picture(picture, None if pose is None else pose.T_odom_base, now_ns)
+        return (
+            *self.urgent(),
+            *self._pictures.findings,
+            *self._frame.age(None if picture is None else picture.stamp_ns, now_ns),
+            *self._robot.step(pose, self._sources.states(), now_ns),
+        )
+
     def tick(
         self,
         trajectory: npt.NDArray[np.float32] | None,
@@ -123,7 +135,7 @@ class Watch:
             *self._pictures.findings,
             *self._frame.age(driven_ns, now_ns),
             *self._output.step(trajectory, self._pictures.content, now_ns),
-            *self._semantic.step(semantic, sources.failed_generations(), now_ns),
+            *self._semantic.step(semantic, sources.failed_generations(), now_ns, sources.invalid_texts()),
             *self._robot.step(pose, sources.states(), now_ns),
             *self._machine.step(last_tick_ns, sources.asleep_ns(), now_ns),
         )

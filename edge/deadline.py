@@ -1,0 +1,37 @@
+"""One deadline for everything that has to end, so that the sum of all waits is bounded."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+
+class Deadline:
+    """`seconds` from when it was made."""
+
+    def __init__(self, seconds: float, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._end_ns = clock() + round(seconds * 1e9)
+
+    def left_s(self, at_most_s: float | None = None) -> float:
+        """Time that is left, never negative."""
+        left_s = max(0.0, (self._end_ns - self._clock()) / 1e9)
+        return left_s if at_most_s is None else min(left_s, at_most_s)
+
+    def run(self, name: str, body: Callable[[], object]) -> bool:
+        """Run what may hang, for as long as is left; whether it ended in time. Raises what `body` raises."""
+        errors: list[BaseException] = []
+
+        def target() -> None:
+            try:
+                body()
+            except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+                errors.append(error)
+
+        thread = threading.Thread(target=target, name=name, daemon=True)
+        thread.start()
+        thread.join(self.left_s())
+        if errors:
+            raise errors[0]
+        return not thread.is_alive()
