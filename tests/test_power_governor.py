@@ -15,7 +15,7 @@ from edge.artifact_files import ArtifactError
 from edge.faults import FAULTS
 from edge.power.average import PowerHistory
 from edge.power.governor import LEVELS, Governor, GovernorConfig, GovernorInputs, GovernorOutputs
-from edge.power.levels import LevelEstimator, Levels, pause_for, worst_share
+from edge.power.levels import GenerationTimes, LevelEstimator, Levels, pause_for, worst_share
 from edge.power.plan import PowerModel, power_plan
 from edge.reasoning_budget import UNLIMITED
 from tools.bench.governor import LOADS, judge, orin, simulate
@@ -206,6 +206,22 @@ def test_a_long_gap_between_steps_neither_raises_nor_opens_the_budget() -> None:
     run.true_w.clear()
     run.step(60)
     assert run.worst_window_w(0) <= 20.0 * 1.02
+
+
+def test_the_time_of_an_abandoned_generation_is_not_the_next_ones() -> None:
+    times = GenerationTimes(1)
+    times.update(1, 2.0, 0)
+    times.update(1, 3.5, 0)  # under way
+    times.update(1, 3.5, 0, abandoned=1)
+    times.update(1, 4.5, 0, abandoned=1)
+    times.update(2, 5.5, 0, abandoned=1)
+    assert times.longest_s(0) == 2.0
+
+
+def test_a_generation_that_ends_as_another_is_abandoned_still_counts() -> None:
+    times = GenerationTimes(1)
+    times.update(1, 2.0, 0, abandoned=1)
+    assert times.longest_s(0) == 2.0
 
 
 def test_heat_takes_tokens_first_and_all_reasoning_when_it_lasts() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -190,6 +192,59 @@ def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
     found = {finding.name: finding.detail for finding in queue.take()}
     assert found["thermal-trip"] == "103 °C (gpu-throttle-alert)"
     assert "thermal-throttle" in found
+
+
+@dataclass(frozen=True)
+class Charge:
+    """A battery report."""
+
+    received_ns: int
+    soc_percent: float | None = 5.0
+    voltage_v: float | None = None
+    current_a: float | None = None
+
+
+def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
+    running = monitor(None, battery=lambda: Charge(SECOND))
+    assert running.step(12 * SECOND).outputs.findings == ()
+    assert running.step(10 * SECOND).outputs.findings == ("battery-empty", "battery-low")
+
+
+def heated(state: ThermalState, say: Callable[[str], object] = lambda _line: None) -> PowerMonitor:
+    """A monitor whose thermal source has given one state at 1 s; its thread is not started."""
+    running = PowerMonitor(
+        None, Governor(GovernorConfig(None, 48)), activity=Activity, thermal=ThermalReader(Path("/nowhere")), say=say
+    )
+    assert running._heat is not None
+    running._heat._newest = (SECOND, state)
+    return running
+
+
+HOT = ThermalState(0, {"tj": 102.0}, 102.0, -3.0, 2.5, ("gpu-throttle-alert",))
+
+
+def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
+    said: list[str] = []
+    running = heated(HOT, said.append)
+    for second in (1, 5, 60, 120):
+        outputs = running.step(second * SECOND).outputs
+        assert outputs.findings == ("thermal-trip", "thermal-throttle")
+        assert not outputs.budget.allowed
+    assert running.snapshot().thermal is None
+    assert sum("temperatures are not read" in line for line in said) == 1
+
+
+def test_a_zone_that_gives_no_value_any_more_keeps_its_last_distance() -> None:
+    running = heated(HOT)
+    running.step(SECOND)
+    assert running._heat is not None
+    for second in range(2, 60):
+        running._heat._newest = (second * SECOND, ThermalState(0))
+        assert running.step(second * SECOND).outputs.findings == ("thermal-trip", "thermal-throttle")
+    running._heat._newest = (60 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
+    assert running.step(60 * SECOND).outputs.findings == ("thermal-throttle",)
+    running._heat._newest = (71 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
+    assert running.step(71 * SECOND).outputs.findings == ()
 
 
 def test_generations_are_counted_from_what_the_program_does_where_it_does_not_count() -> None:

@@ -78,6 +78,8 @@ class GovernorInputs:
     throttle_margin_c: float | None = None
     trip_margin_c: float | None = None
     battery_percent: float | None = None
+    abandoned: int = 0
+    """Generations begun and not finished so far; the time that they took is in `reasoning_s` too."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ class Governor:
             if ended or missed:
                 self._ended_ns = now_ns
             self._shares.add(last_ns, share)
-        self._times.update(inputs.generations, inputs.reasoning_s, self._cap)
+        self._times.update(inputs.generations, inputs.reasoning_s, self._cap, inputs.abandoned)
         if not inputs.reasoning:
             self._cap = self._applied  # what the next generation starts with
         power_w = inputs.power_w

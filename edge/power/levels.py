@@ -72,9 +72,16 @@ class GenerationTimes:
         self._recent: tuple[deque[float], ...] = tuple(deque(maxlen=self.KEEP) for _ in range(caps))
         self._done = 0
         self._busy_s = 0.0
+        self._abandoned = 0
 
-    def update(self, generations: int, busy_s: float, cap: int) -> None:
-        """Counts so far, which only grow, and the cap under which the last generation was started."""
+    def update(self, generations: int, busy_s: float, cap: int, abandoned: int = 0) -> None:
+        """Counts so far, which only grow, and the cap under which the last generation was started.
+
+        `abandoned`: generations that were begun and not finished; their time is no length of one.
+        """
+        if abandoned > self._abandoned and generations == self._done:
+            self._busy_s = busy_s
+        self._abandoned = abandoned
         if generations > self._done:
             if cap < len(self._recent):
                 self._recent[cap].append((busy_s - self._busy_s) / (generations - self._done))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
 from edge.findings import Finding
@@ -25,6 +25,7 @@ from edge.reasoning_budget import ReasoningBudget
 PERIOD_S: Final = 0.1
 STALE_NS: Final = 500_000_000
 THERMAL_STALE_NS: Final = 2_000_000_000
+BATTERY_STALE_NS: Final = 10_000_000_000
 JOIN_S: Final = 0.5
 
 T = TypeVar("T")
@@ -41,6 +42,8 @@ class Activity:
     """Finished ones; None: counted from `reasoning`, which misses those shorter than a period."""
     reasoning_s: float | None = None
     """Time that generations have taken; None: counted from `reasoning`."""
+    abandoned: int = 0
+    """Generations that were begun and not finished, whatever the reason."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,8 @@ class PowerMonitor:
         self._events = (
             None if over_current is None else _Source("over-current", lambda _: over_current.read(), 1.0, clock)
         )
+        self._felt: ThermalState | None = None
+        self._heat_lost = False
         self._counted: tuple[int, bool, int, float] | None = None
         self._statistics = PowerStatistics()
         self._measured = True
@@ -201,18 +206,23 @@ class PowerMonitor:
         """One step of the stepping thread, without its clock."""
         sample = None if self._power is None else self._power.fresh(now_ns, STALE_NS)
         thermal = None if self._heat is None else self._heat.fresh(now_ns, THERMAL_STALE_NS)
+        felt = self._feel(thermal)
         events = None if self._events is None else self._events.fresh(now_ns, 10 * THERMAL_STALE_NS)
         battery = None if self._battery is None else self._battery()
-        reasoning, generations, reasoning_s = self._count(self._activity(), now_ns)
+        if battery is not None and now_ns - battery.received_ns > BATTERY_STALE_NS:
+            battery = None
+        activity = self._activity()
+        reasoning, generations, reasoning_s = self._count(activity, now_ns)
         outputs = self._governor.step(
             GovernorInputs(
                 power_w=None if sample is None else sample.total_w,
                 reasoning=reasoning,
                 reasoning_s=reasoning_s,
                 generations=generations,
-                throttled=thermal is not None and thermal.throttled,
-                throttle_margin_c=None if thermal is None else thermal.throttle_margin_c,
-                trip_margin_c=None if thermal is None else thermal.trip_margin_c,
+                abandoned=activity.abandoned,
+                throttled=felt is not None and felt.throttled,
+                throttle_margin_c=None if felt is None else felt.throttle_margin_c,
+                trip_margin_c=None if felt is None else felt.trip_margin_c,
                 battery_percent=None if battery is None else battery.soc_percent,
             ),
             now_ns,
@@ -223,6 +233,25 @@ class PowerMonitor:
         error = None if self._power is None else self._power.error
         self._snapshot = PowerSnapshot(now_ns, sample, outputs, thermal, battery, error, events or {})
         return self._snapshot
+
+    def _feel(self, thermal: ThermalState | None) -> ThermalState | None:
+        """What heat is judged by: a source that worked and stands still, or leaves a distance out, cools nothing."""
+        last, lost = self._felt, self._felt is not None and thermal is None
+        if lost != self._heat_lost and self._say is not None:
+            self._say(f"power: temperatures {'are not read: what heat limits stays as it is' if lost else 'are read'}")
+        self._heat_lost = lost
+        if thermal is not None:
+            passive_c, trip_c = thermal.throttle_margin_c, thermal.trip_margin_c
+            self._felt = (
+                thermal
+                if last is None
+                else replace(
+                    thermal,
+                    throttle_margin_c=last.throttle_margin_c if passive_c is None else passive_c,
+                    trip_margin_c=last.trip_margin_c if trip_c is None else trip_c,
+                )
+            )
+        return self._felt
 
     def _sources(self) -> list[_Source[Any]]:
         return [source for source in (self._power, self._heat, self._events) if source is not None]
