@@ -104,7 +104,6 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "output-unsteady": "a milder oscillation; the hard one is injected",
         "semantic-old": "the way to an expired semantic state, which is injected",
         "reasoning-hung": "the robot stands by then: its semantic state has expired, which is injected",
-        "reasoning-hung": "ends the run 30 s into a hang, which is injected until the robot stands; test on a fake clock",
         "semantic-delay-invalid": "needs a defect in our own stamps; test on a fake clock",
         "instruction-injected": "changes nothing by construction; test over a thousand texts",
         "tick-overrun": "a tick that takes so long ends the bridge's patience too (commands-late), which is injected",
