@@ -252,3 +252,14 @@ def test_whatever_a_robot_reports_nothing_raises_and_no_pose_is_garbage(garbage:
         outputs = estimator.step(report, report.received_ns)
         assert outputs.pose is None or all(map(math.isfinite, outputs.pose.T_odom_base.as_tuple()))
         estimator.motion_offset(report.received_ns - SECOND_NS)
+
+
+def test_motions_add_up_over_an_instant_in_between() -> None:
+    path, estimator = drive(12), DriftEstimator()
+    first_ns, middle_ns, first = path.stamp_ns(200), path.stamp_ns(400), None
+    for index, _ in play(path, estimator):
+        if index == 400:
+            first = estimator.motion_offset(first_ns)
+    whole, second = estimator.motion_offset(first_ns), estimator.motion_offset(middle_ns)
+    assert first is not None and second is not None and whole is not None
+    assert (first[0] @ second[0]).as_tuple() == pytest.approx(whole[0].as_tuple(), abs=1e-9)
