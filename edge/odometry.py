@@ -44,6 +44,8 @@ class DriftConfig:
     """Change of the odometry's scales per square root of a metre."""
     visual_scale_sigma: float = 0.007
     """Error that all visual motions share: of the camera's height and mounting angle."""
+    stamp_sigma_s: float = 0.01
+    """Error of a picture's stamp. A trot sways and yaws fast enough for 10 ms to matter more than the pixels."""
     visual_gate: float = 25.0
     """Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""
     prior_m: float = 5.0
@@ -255,7 +257,8 @@ class DriftEstimator:
         interval = integrate(inside, self._model)
         if interval.still:
             return False
-        visual = np.reshape(seen.covariance, (3, 3))
+        pictures = np.reshape(seen.covariance, (3, 3))
+        visual = pictures + self._mistimed(inside)
         by = np.zeros((3, pose_chain.PARAMETERS))
         by[0, VISUAL], by[1, VISUAL] = seen.T_start_end.x_m, seen.T_start_end.y_m
         observed = np.array(seen.T_start_end.as_tuple())
@@ -274,11 +277,29 @@ class DriftEstimator:
         motion = interval.motion - interval.gains @ change + share @ (innovation - model @ change)
         white = interval.white - share @ interval.white
         gains = -(interval.gains + share @ model)
-        self._compare(interval, observed, float(motion[2]), visual, white)
+        # Without the stamps' error: what one interval gains by it the next one loses, and here they are added up.
+        self._compare(interval, observed, float(motion[2]), pictures, white)
         walked = self._covariance - gain @ model @ self._covariance
         self._learn(change, walked + self._walk(interval, seen))
         self._replay(before, inside, after, seen, motion, 0.5 * (white + white.T), gains)
         return True
+
+    def _mistimed(self, inside: list[Increment]) -> Array:
+        """Covariance of what a robot in motion does between the stamps of two pictures and when they were taken."""
+        seconds = sum(increment.dt_s for increment in inside)
+        if seconds <= 0:
+            return np.zeros((3, 3))
+        shares = [
+            (
+                increment.dx_m**2 / increment.dt_s,
+                increment.dy_m**2 / increment.dt_s,
+                increment.turn_rad**2 / increment.dt_s,
+            )
+            for increment in inside
+            if increment.dt_s > 0
+        ]
+        mean_squares = np.sum(shares, axis=0) / seconds
+        return np.diag(2 * self._config.stamp_sigma_s**2 * mean_squares)
 
     def _walk(self, interval: Interval, seen: VisualMotion) -> Array:
         config = self._config

@@ -26,7 +26,7 @@ import numpy as np
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
 from edge.drift_rate import Comparison, DriftMonitor
 from edge.geometry import SE2, wrap_angle
-from edge.odometry import DriftEstimator, OdometryInputs
+from edge.odometry import DriftConfig, DriftEstimator, OdometryInputs
 from sim_hil.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.scene import load_scene
 from tools.bench.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
@@ -81,7 +81,7 @@ class DriftRun:
 def replay(walk: Walk, level: str, seed: int) -> DriftRun:
     """Let the odometry of a walk drift and the estimator work against it."""
     noise = OdometryNoise(LEVELS[level], seed, walk.samples[0].T_world_base)
-    estimator = DriftEstimator()
+    estimator = DriftEstimator(config=DriftConfig(stamp_sigma_s=SensorNoise().stamp_ns / 1e9))
     truth_monitor = _TrueDrift()
     raws: list[SE2] = []
     windows: list[Window] = []
