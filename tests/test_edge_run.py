@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -145,6 +147,25 @@ def test_a_signal_ends_the_run_with_the_robot_standing_still(robot: Robot, numbe
         assert runner.process.wait(20) == status
     assert json.loads(result.read_text())["bridge"]["zero_after_stop"] is True
     time.sleep(0.2)
+    assert robot.moves()[-1][1], "the last command on the wire is zero velocity"
+
+
+def test_a_terminal_that_takes_nothing_does_not_keep_a_signal_from_stopping_the_robot(robot: Robot) -> None:
+    """As with `edge-run 2>&1 | less` that nobody scrolls."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writer, b"x" * fcntl.fcntl(writer, fcntl.F_GETPIPE_SZ))
+    command = [sys.executable, "-m", "edge.runner", *map(str, robot.arguments())]
+    runner = subprocess.Popen(command, stderr=writer, cwd=REPOSITORY)
+    try:
+        wait_for(robot.is_moving, 30, "the robot to be told to move")
+        runner.send_signal(signal.SIGTERM)
+        assert runner.wait(20) == 0
+    finally:
+        runner.kill()
+        runner.wait()
+        os.close(reader)
+        os.close(writer)
     assert robot.moves()[-1][1], "the last command on the wire is zero velocity"
 
 
