@@ -70,15 +70,3 @@ class TokenRing:
             return nearest
         own = replace(nearest, tokens=nearest.tokens.copy())
         return own if any(slot is nearest for slot in self._slots) else None
-
-    def select(self, offsets_s: Sequence[float], newest_ns: int | None = None) -> list[EncodedFrame]:
-        """Frames at the newest stamp (or `newest_ns`) minus each offset, oldest first; those not there are left out.
-
-        Paper, Algorithm 3 (SAMPLEFRAMESAVAILABLE): offsets are {0, 3, 6, 9} s and fewer frames are used at the start.
-        """
-        newest_ns = self.newest_ns if newest_ns is None else newest_ns
-        if newest_ns is None:
-            return []
-        found = (self.nearest(newest_ns - round(offset_s * 1e9)) for offset_s in offsets_s)
-        chosen = {frame.stamp_ns: frame for frame in found if frame is not None}
-        return [chosen[stamp_ns] for stamp_ns in sorted(chosen)]

@@ -1,4 +1,4 @@
-"""The token ring gives the VLM the frames of the paper: now, and 3, 6 and 9 s before, as far as there are any."""
+"""The token ring gives the VLM the encoded frame nearest to an instant, whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 from edge.geometry import SE2
 from edge.ring import EncodedFrame, TokenRing
 
-OFFSETS_S = (0.0, 3.0, 6.0, 9.0)
 TOKENS = np.zeros((1, 4, 8), dtype=np.float32)
 
 
@@ -19,38 +18,29 @@ def filled(seconds: float, capacity: int = 120) -> TokenRing:
     return ring
 
 
-def stamps_s(frames: list[EncodedFrame]) -> list[float]:
-    return [frame.stamp_ns / 1e9 for frame in frames]
+def test_the_frame_nearest_to_an_instant_is_given() -> None:
+    ring = filled(20.0)
+    for wanted_s, found_s in ((11.0, 11.0), (14.04, 14.0), (14.06, 14.1), (20.4, 20.0)):
+        frame = ring.nearest(round(wanted_s * 1e9))
+        assert frame is not None and frame.stamp_ns == round(found_s * 1e9)
 
 
-def test_a_full_history_gives_four_frames_three_seconds_apart_oldest_first() -> None:
-    assert stamps_s(filled(20.0).select(OFFSETS_S)) == [11.0, 14.0, 17.0, 20.0]
+def test_a_frame_half_a_second_away_is_not_the_one_that_was_asked_for() -> None:
+    ring = filled(4.0)
+    assert ring.nearest(4_600_000_000) is None
+    assert ring.nearest(4_600_000_000, tolerance_s=1.0) is not None
 
 
-def test_at_the_start_fewer_frames_are_used() -> None:
-    assert stamps_s(filled(0.0).select(OFFSETS_S)) == [0.0]
-    assert stamps_s(filled(4.0).select(OFFSETS_S)) == [1.0, 4.0]
-
-
-def test_an_empty_ring_selects_nothing() -> None:
-    assert TokenRing(8).select(OFFSETS_S) == []
-
-
-def test_a_gap_in_the_frames_leaves_that_frame_out() -> None:
-    ring = TokenRing(120)
-    for second in (0.0, 7.0, 10.0):
-        ring.put(EncodedFrame(round(second * 1e9), SE2(0, 0, 0), TOKENS))
-    assert stamps_s(ring.select(OFFSETS_S)) == [7.0, 10.0]
-
-
-def test_a_frame_is_never_given_twice() -> None:
+def test_an_empty_ring_gives_nothing() -> None:
     ring = TokenRing(8)
-    ring.put(EncodedFrame(0, SE2(0, 0, 0), TOKENS))
-    assert len(ring.select((0.0, 0.1, 0.2))) == 1
+    assert (ring.newest_ns, ring.nearest(0)) == (None, None)
 
 
-def test_frames_can_be_counted_back_from_another_instant() -> None:
-    assert stamps_s(filled(20.0, 256).select(OFFSETS_S, 16_000_000_000)) == [7.0, 10.0, 13.0, 16.0]
+def test_a_full_ring_forgets_its_oldest_frame() -> None:
+    ring = filled(20.0, capacity=120)
+    assert ring.newest_ns == 20_000_000_000
+    assert ring.nearest(8_000_000_000, tolerance_s=0.05) is None
+    assert ring.nearest(8_100_000_000, tolerance_s=0.05) is not None
 
 
 def encoded(ring: TokenRing, number: int) -> EncodedFrame:
@@ -84,7 +74,8 @@ def test_a_frame_whose_buffer_is_being_written_is_not_given() -> None:
     encoded(ring, 1)
     encoded(ring, 2)
     ring.next_buffer()
-    assert stamps_s(ring.select((0.0,), newest_ns=1)) == [2e-9]
+    frame = ring.nearest(1)
+    assert frame is not None and frame.stamp_ns == 2
 
 
 def test_a_frame_that_was_overwritten_while_it_was_copied_is_not_given() -> None:
