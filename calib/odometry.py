@@ -21,7 +21,15 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.camera_geometry import Attitude, CameraGeometry
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result, write_whole
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_target,
+    write_result,
+    write_whole,
+)
 from edge.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.drift_rate import Comparison, DriftMonitor
 from edge.geometry import SE2, interpolate, wrap_angle
@@ -342,6 +350,9 @@ def run(args: argparse.Namespace) -> int:
     except (LogError, RecordingError, ConfigError, OSError) as error:
         sys.stderr.write(f"edge-calib odometry: {error}\n")
         return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        sys.stderr.write("edge-calib odometry: interrupted\n")
+        return EXIT_INTERRUPTED
     sys.stderr.write(_table(fitted))
     if fitted.good:
         return EXIT_DONE

@@ -39,9 +39,12 @@ EXAMPLES = """examples:
 
 On the machine and with the artifacts of the run, plans and texts are equal bit for bit. A log of a run that was killed
 is replayed as far as it is whole; further parts (flight.002.mcap ...) are read with the first.
-exit codes: 0 within the tolerance, 1 beyond it, 2 bad arguments or input, 3 refused (artifacts), 130 interrupted
+exit codes: 0 within the tolerance, 1 beyond it or less than 90 % of the plans could be made again, 2 bad arguments or
+input, 3 refused (artifacts), 130 interrupted
 """
 
+LEAST_SHARE = 0.9
+"""Of the ticks with a plan that must have been run again: agreement of a few says nothing of the run."""
 _SAY_EVERY_NS = 2_000_000_000
 
 
@@ -132,9 +135,14 @@ def verdict(found: Comparison, tolerance: Tolerance) -> tuple[str, ...]:
     if found.different_texts:
         some = ", ".join(map(str, found.different_texts[:5]))
         lines.append(f"{len(found.different_texts)} of {found.generations} texts differ (generation {some})")
+    reason = f": {found.skipped.most_common(1)[0][0]}" if found.skipped else ""
     if found.ticks == 0 and found.generations == 0:
-        reason = f": {found.skipped.most_common(1)[0][0]}" if found.skipped else ""
         lines.append(f"nothing in this part of the log could be run again{reason}")
+    elif found.ticks < LEAST_SHARE * found.driven:
+        lines.append(
+            f"only {found.ticks} of {found.driven} ticks with a plan could be run again{reason}; expected "
+            f"{LEAST_SHARE:.0%}; name a part of the log that is whole with --from and --to"
+        )
     return tuple(lines)
 
 
@@ -146,7 +154,13 @@ def as_result(found: Comparison, ticks: int, beyond: Sequence[str]) -> dict[str,
         return percentiles(finite, "p50", "p99", "max")
 
     return {
-        "ticks": {"recorded": ticks, "compared": found.ticks, "equal": found.ticks_equal, "worst": found.worst_tick},
+        "ticks": {
+            "recorded": ticks,
+            "driven": found.driven,
+            "compared": found.ticks,
+            "equal": found.ticks_equal,
+            "worst": found.worst_tick,
+        },
         "generations": {
             "compared": found.generations,
             "texts_equal": found.texts_equal,

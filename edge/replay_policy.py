@@ -54,6 +54,8 @@ class _Thought:
 class Comparison:
     """What was run again, and how far it lies from the log."""
 
+    driven: int = 0
+    """Ticks that had a plan, each of which could be run again if the log held all that it was made from."""
     ticks: int = 0
     ticks_equal: int = 0
     """Plans that are the same bit for bit."""
@@ -120,6 +122,7 @@ class Replayer:
             if event.pose is not None:
                 self._poses.put(StampedPose(event.now_ns, event.pose, *event.state))
             if self._from_ns <= event.now_ns <= self._to_ns:
+                self.comparison.driven += event.rows is not None
                 self._compare_command(event, self._counting_skips(lambda: self._act(event)))
 
     def _counting_skips(self, work: Callable[[], _Result]) -> _Result | None:

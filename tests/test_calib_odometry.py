@@ -112,6 +112,17 @@ def test_odometry_that_has_nothing_to_do_with_the_truth_is_not_explained(tmp_pat
     assert "do not describe the same drive" in capsys.readouterr().err
 
 
+def test_an_interrupted_calibration_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(_path: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(calib, "read_drive", interrupt)
+    assert main(["odometry", str(tmp_path / "d.mcap"), "--truth", "t.jsonl"]) == 130
+    assert capsys.readouterr().err == "edge-calib odometry: interrupted\n"
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
