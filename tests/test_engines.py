@@ -414,7 +414,7 @@ def test_another_mode_is_refused_with_the_command_that_sets_it() -> None:
 
 
 def test_a_runner_without_the_engines_refuses_before_anything_moves(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    artifacts_dir: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     from edge.runner import main as run
 
@@ -424,7 +424,7 @@ def test_a_runner_without_the_engines_refuses_before_anything_moves(
     (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
     robot = Path(__file__).parents[1] / "firmware_bridge/robots/go2_sim.toml"
     code = run(["--artifacts", str(copy), "--robot", str(robot), "--instruction", "go", "--duration", "1"])
-    error = capsys.readouterr().err
+    error = capfd.readouterr().err
     assert code == 3
     assert error.count("\n") == 1
     assert "vision_encoder" in error and "edge-install engines" in error
