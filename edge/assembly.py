@@ -96,6 +96,7 @@ def assemble(
             reasoning=reasoning.busy,
             generations=reasoning.generations,
             reasoning_s=reasoning.busy_ns / 1e9,
+            abandoned=reasoning.cancelled + reasoning.failed + reasoning.missed_frames,
         )
 
     power = make_power_monitor(
