@@ -12,9 +12,11 @@ from typing import Any
 
 import pytest
 
+from edge import assembly
 from edge import session as module
 from edge.arming import RefusedError, StoppedEarlyError
 from edge.deadline import Deadline
+from edge.reasoning_loop import Mode
 from edge.recorder import Recorder
 from edge.session import RunSession
 from firmware_bridge.client import BridgeUnavailable
@@ -155,3 +157,15 @@ def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_known_and_before
 def test_an_input_thread_that_dies_ends_the_run(session: Any) -> None:
     session._end_by("camera thread died: OSError: gone")
     assert session._finished.is_set() and session._faults == ["camera thread died: OSError: gone"]
+
+
+# What the monitors are told
+
+
+@pytest.mark.parametrize(("planned_s", "trained_s"), [(4.0, 4.0), (float("inf"), 10.0)])
+def test_an_answer_may_be_as_old_as_the_plan_says(
+    monkeypatch: pytest.MonkeyPatch, planned_s: float, trained_s: float
+) -> None:
+    monkeypatch.setattr(assembly, "read_power_plan", lambda artifacts: SimpleNamespace(max_delay_s=planned_s))
+    artifacts: Any = SimpleNamespace(trained=True)
+    assert assembly.semantic_config(artifacts, Mode.ASYNC).trained_delay_s == trained_s
