@@ -119,6 +119,8 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> Non
         if row.kills_bridge:
             rig.kill_bridge()
         rig.clear()
+        if row.operator_arms:
+            rig.operator_arms()
     elif not rig.drives_on(RESUME_S):
         sample.hindered.append(f"did not drive on within {RESUME_S:g} s")
         rig.kill_runner()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -156,6 +157,20 @@ class Rig:
             self.bridge.process.wait()
         self._forget(self.bridge)
         self.bridge = None
+
+    def operator_arms(self) -> None:
+        """Take an emergency stop back, as an operator does it. Raises StepError."""
+        command = [
+            *COMMANDS["edge-bridge"],
+            "arm",
+            "--robot",
+            str(ROBOT_FILE),
+            "--socket",
+            str(self.config.bridge.socket),
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+        if done.returncode != 0:
+            raise StepError(f"edge-bridge arm: exit code {done.returncode}: {done.stderr.strip()}")
 
     def forget_runner(self) -> None:
         """Stop watching a runner that has ended."""

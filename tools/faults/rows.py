@@ -47,6 +47,8 @@ class Row:
     """Beyond a latching fault's own end of the run: a new runner is started after it."""
     spacing_s: float = 0.0
     """Time between two injections, for faults that escalate when they come again."""
+    operator_arms: bool = False
+    """Afterwards an operator has to take it back (`edge-bridge arm`) before a runner may arm."""
     thaw: bool = False
     """Afterwards SIGCONT to the runner, which must not move the robot."""
 
@@ -252,7 +254,7 @@ def rows() -> tuple[Row, ...]:
         _with(_robot("battery at 3 %", "battery-empty", "low-battery", soc_percent=3.0), share=0.4),
         _robot("robot reports an error", "robot-error", "error-code"),
         _robot("robot reports damping", "robot-mode-left", "wrong-mode", mode=7.0),
-        _robot("remote: L2+B", "emergency-stop", "remote-keys"),
+        _with(_robot("remote: L2+B", "emergency-stop", "remote-keys"), operator_arms=True),
         _robot("remote: stick pushed", "emergency-stop", "remote-stick"),
         Row("second commander", "second-commander", lambda rig: rig.rogue(1.0)),
         Row("late Move overtakes StopMove", "late-motion", _late_move),
