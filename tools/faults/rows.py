@@ -206,11 +206,11 @@ def rows() -> tuple[Row, ...]:
         _robot("camera covered", "frames-refused", "camera-black"),
         _robot("camera blinded", "frames-refused", "camera-saturated"),
         _robot("camera pictures torn", "frames-refused", "camera-torn"),
-        _with(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=10.5, share=0.4),
+        _with(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=12.5, share=0.4),
         # Its end is a jump of the pose, and two of those within 10 s end the run.
         _with(
             _robot("odometry freezes at zero speed", "odometry-frozen", "odometry-freeze", velocity="zero"),
-            spacing_s=10.5, share=0.4,
+            spacing_s=12.5, share=0.4,
         ),
         _robot("odometry is NaN", "odometry-not-finite", "odometry-nan"),
         _robot("orientation is not one", "odometry-not-finite", "odometry-nan", field="rpy"),
