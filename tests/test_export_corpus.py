@@ -86,7 +86,7 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
     "a graph of another shape": (reshape, "action_expert.onnx: ONNX Runtime cannot open it"),
     "a contract of another shape": (lengthen, "trajectory is"),
     "a pickle in a graph's place": (lambda d: replace(d, "vision_encoder.onnx", b"\x80\x04."), "is a pickle"),
-    "a file that is no graph": (lambda d: replace(d, "vision_encoder.onnx", b"\x99not a graph"), "vision_encoder.onnx: "),
+    "a file that is no graph": (lambda d: replace(d, "vision_encoder.onnx", b"not a graph"), "not an ONNX model"),
     "a graph that is another": (
         lambda d: replace(d, "action_expert.onnx", (d / "semantic_context.onnx").read_bytes()),
         "not those of the manifest",
