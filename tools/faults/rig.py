@@ -24,6 +24,7 @@ _POLL_S = 0.01
 _STEADY_MOVES = 10  # 0.2 s of the bridge's commands
 _STEADY_SHARE = 0.9
 _ATTEMPTS = 4
+_COMMANDER_S = 2.2
 
 
 class Rig:
@@ -191,6 +192,12 @@ class Rig:
         finally:
             self._forget(rogue)  # it ends by itself
             self._rogues.append(rogue)
+
+    def wait_alone(self) -> None:
+        """Wait until no second commander has been heard for as long as the bridge remembers one."""
+        for rogue in self._rogues:
+            rogue.process.wait(30.0)
+        time.sleep(_COMMANDER_S)
 
     def robot_obeys_motion(self) -> list[tuple[int, bool]]:
         """(ns, whether) of each change of the robot's own commanded velocity from or to zero, from its trace."""

@@ -256,7 +256,7 @@ def rows() -> tuple[Row, ...]:
         _robot("robot reports damping", "robot-mode-left", "wrong-mode", mode=7.0),
         _with(_robot("remote: L2+B", "emergency-stop", "remote-keys"), operator_arms=True),
         _robot("remote: stick pushed", "emergency-stop", "remote-stick"),
-        Row("second commander", "second-commander", lambda rig: rig.rogue(1.0)),
+        Row("second commander", "second-commander", lambda rig: rig.rogue(1.0), Rig.wait_alone),
         Row("late Move overtakes StopMove", "late-motion", _late_move),
         _with(
             Row("StopMove unanswered for 10 s", "stop-call-blocked", _stop_unanswered, _clear),
