@@ -228,7 +228,7 @@ def rows() -> tuple[Row, ...]:
         _inside("plan never changes", "output-constant", "constant-output"),
         _inside("plan swings at every tick", "output-oscillating", "oscillating-output"),
         _inside("encoder fails", "camera-stopped", "encoder-error"),
-        _inside("action expert takes 0.13 s", "tick-late", "tick-slow", seconds_s=0.13),
+        _inside("action expert takes 0.1 s more", "tick-late", "tick-slow", seconds_s=0.1),
         _with(_inside("reasoning hangs", "semantic-expired", "reasoning-hang"), share=0.25),
         _with(_inside("reasoning's third bad text", "semantic-text-invalid", "garbage-text", after=3.0), share=0.4),
         _with(_inside("flight log's disk stalls", "log-disk-stalled", "disk-stall", seconds_s=3.0), share=0.4),
