@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import signal
 import sys
@@ -31,6 +32,8 @@ INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
 ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
 READY_LINE = "edge-hil: ready"
+DEMO_SPEED_MPS = 0.14
+"""8 m in a minute: untrained weights bend off the corridor and into its wall after 9 m."""
 
 # Run as modules of this interpreter, so that the demo works from any virtual environment, activated or not.
 COMMANDS: Mapping[str, Sequence[str]] = {
@@ -155,7 +158,7 @@ def _run_to_end(children: Children, child: Child, what: str) -> int:
 def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, socket: Path) -> None:
     """Robot, bridge, runner; then stop them in the order that lets each write its result."""
     files, domain = options.files, ["--domain", str(options.domain)]
-    common = ["--robot", str(ROBOT_FILE), "--socket", str(socket), *domain]
+    common = ["--robot", str(_slow_robot(options.out)), "--socket", str(socket), *domain]
     hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
     with Progress(lambda elapsed_s: f"demo: starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
@@ -185,6 +188,20 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     time.sleep(LAST_COMMANDS_S)
     children.check_others(None)
     _stop(children, hil)
+
+
+def _slow_robot(folder: Path) -> Path:
+    """The simulated robot's file with a lower speed limit: untrained weights do not keep to the corridor.
+
+    A robot that pushes against its wall is stopped for good, as it should be (`odometry-stays-frozen`).
+    """
+    line = f"vx_max_mps = {DEMO_SPEED_MPS}"
+    text, changed = re.subn(r"^vx_max_mps *=.*$", line, ROBOT_FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    if changed != 1:
+        raise StepError(f"{ROBOT_FILE}: expected one line with vx_max_mps, found {changed}")
+    file = folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
 
 
 def _stop(children: Children, child: Child) -> None:

@@ -2,15 +2,17 @@
 
     python -m tools.bench.contention --artifacts out/demo/artifacts --duration 600 --json out/bench/contention.json
 
-Real processes on loopback: edge-hil, edge-bridge and the runner, whose reasoning budget alone is replaced: allowed for
-a block of time, forbidden for the next, so that both are measured in one run. Generations follow one another without a
-pause while they are allowed. A tick is timed from its deadline to its command, in the flight log.
+Real processes on loopback: edge-hil, edge-bridge and the runner. Two things are replaced in it: its reasoning budget,
+allowed for a block of time and forbidden for the next, so that both are measured in one run; and the plan that an
+untrained network would walk into a wall with, by one that keeps the robot on a circle (the network runs all the same).
+Generations follow one another without a pause while they are allowed. A tick is timed from its deadline to its command.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import sys
 import time
 from collections.abc import Sequence
@@ -25,17 +27,26 @@ from rich.table import Table
 
 from edge import runner
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.geometry import SE2
+from edge.policy import Policy
 from edge.power.monitor import PowerMonitor
 from edge.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.recording import RecordingError, read_messages
+from edge.semantic import SemanticState
 from tools.children import Children, StepError
 from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from tools.faults import circle
 
-BLOCK_S = 20.0
+BLOCK_S = 8.0
+"""Shorter than a semantic state may grow old before the robot slows down."""
 SETTLE_S = 1.0
 """Left out after every change: a generation under way is being ended."""
 P999_MS = 100.0
 RATIO = 1.25
+STEP_S = 0.1
+RIPPLE_RAD = 0.7
+Floats = npt.NDArray[np.float32]
+State = tuple[float, float, float]
 DRIVE = "--drive"
 """First argument of the process that is the runner."""
 
@@ -61,7 +72,16 @@ def drive(arguments: Sequence[str]) -> int:
     def budget(_monitor: PowerMonitor) -> ReasoningBudget:
         return UNLIMITED if allowed(time.monotonic_ns()) else ReasoningBudget(allowed=False)
 
-    with mock.patch.object(PowerMonitor, "budget", budget):
+    act, calls = Policy.act, itertools.count()
+
+    def circling(
+        policy: Policy, tokens: Floats, state: State, delay_s: float, offset: SE2, semantic: SemanticState
+    ) -> Floats:
+        planned = act(policy, tokens, state, delay_s, offset, semantic)
+        pose = semantic.T_odom_anchor @ offset
+        return circle.plan(pose, len(planned), STEP_S, RIPPLE_RAD * next(calls))
+
+    with mock.patch.object(PowerMonitor, "budget", budget), mock.patch.object(Policy, "act", circling):
         return runner.main(list(arguments))
 
 
@@ -88,7 +108,7 @@ def block_ratios(ticks: Sequence[Tick]) -> list[float]:
     for tick in ticks:
         if tick.reasoning is not None:
             blocks.setdefault(int(tick.start_ns / 1e9 / BLOCK_S), []).append(tick.tick_ms)
-    medians = {number: float(np.median(values)) for number, values in blocks.items() if len(values) >= 50}
+    medians = {number: float(np.median(values)) for number, values in blocks.items() if len(values) >= 40}
     pairs = [(n, n + 1) if n % 2 == 0 else (n + 1, n) for n in medians if n + 1 in medians]
     return [medians[on] / medians[off] for on, off in pairs]
 
@@ -140,7 +160,7 @@ def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], 
         children = stack.enter_context(Children(folder))
         domain = ["--domain", str(free_domain())]
         link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
-        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "4"]
+        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
         hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *domain])
         children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
         children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
