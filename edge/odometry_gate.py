@@ -185,8 +185,13 @@ class OdometryGate:
         config = self._config
         dx_m, dy_m, turn_rad = moved
         window_s = config.mismatch_window_ns / 1e9
-        # Two readings of the gyro do not tell the turn over a long gap; a pose that does not change at all is row 9's.
-        told = gyro_radps is not None and dt_s <= 0.5 * window_s and any(moved)
+        if dt_s > 0.5 * window_s:
+            # Two readings do not tell the motion over a long gap: the robot may have been stopped in it.
+            self._apart.clear()
+            self._apart_sums = [0.0] * len(self._apart_sums)
+            return (), False
+        # A pose that does not change at all is row 9's.
+        told = gyro_radps is not None and any(moved)
         turned_apart = turn_rad - gyro_radps * dt_s if told and gyro_radps is not None else 0.0
         sums = self._apart_sums
         self._apart.append((dt_s, dx_m - report.vx_mps * dt_s, dy_m - report.vy_mps * dt_s, turned_apart))
