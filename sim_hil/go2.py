@@ -13,27 +13,24 @@ from numpy.typing import NDArray
 from sim_hil.gait import GRAVITY_MPS2, BodyMotion
 from sim_hil.go2_urdf import BASE_COM_M, JOINT_FRICTION_NM, JOINT_NAMES, LEGS, write_go2_urdf
 from sim_hil.kinematics import Vec3, foot_position, foot_velocity
-from sim_hil.sport import LYING_RAD, Measured, SportController
+from sim_hil.robot import BaseTruth
+from sim_hil.sport import LYING_RAD, Measured, SportAction, SportController
 
 Array = NDArray[np.float64]
 LYING_HEIGHT_M = 0.075
+# From the table of sim_hil/go2_urdf.py: the head's corner, and a foot in mid-stride, reach this far from the origin.
+RADIUS_M = 0.33
+HALF_LENGTH_M = 0.345
+RENDER_FIELDS = 19
 
 
 @dataclass(frozen=True)
-class RobotTruth:
-    """Ground truth of one instant; joints in the order FR, FL, RR, RL x hip, thigh, calf.
+class RobotTruth(BaseTruth):
+    """Ground truth of one instant of the Go2; joints in the order FR, FL, RR, RL x hip, thigh, calf.
 
-    velocity in the world frame; gyro and accel in the body frame, accel as an IMU measures it (9.81 up at rest);
-    feet relative to the base in the body frame; mode and gait_type are SportModeState's numbers.
+    Feet are relative to the base in the body frame; mode and gait_type are SportModeState's numbers.
     """
 
-    time_s: float
-    position_m: Array
-    quaternion_wxyz: Array
-    rpy_rad: Array
-    velocity_world_mps: Array
-    gyro_radps: Array
-    accel_mps2: Array
     joint_q_rad: Array
     joint_dq_radps: Array
     joint_tau_nm: Array
@@ -43,7 +40,6 @@ class RobotTruth:
     mode: int
     gait_type: int
     body_height_m: float
-    commanded: tuple[float, float, float]
 
 
 def _cross(a: Vec3, b: Vec3) -> Vec3:
@@ -89,7 +85,11 @@ def load_go2(client: int, folder: Path, position: tuple[float, float, float], ya
 
 
 class Go2:
-    """The robot's body in one physics client. `step` must run right before every stepSimulation."""
+    """The robot's body in one physics client; implements sim_hil.robot.Robot."""
+
+    radius_m = RADIUS_M
+    half_length_m = HALF_LENGTH_M
+    render_fields = RENDER_FIELDS
 
     def __init__(self, client: int, folder: Path, start: tuple[float, float, float], dt_s: float) -> None:
         self._client = client
@@ -169,7 +169,30 @@ class Go2:
         """Base position, m, and heading, rad."""
         return self._position, self.measured().body.yaw_rad
 
+    def up(self) -> float:
+        """World z of the base's up axis: 1 upright, -1 on its back."""
+        x, y, _, _ = self._quaternion
+        return 1.0 - 2.0 * (x * x + y * y)
+
+    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
+        """Take a velocity of the body frame, kept for 1 s; without effect unless `ready`."""
+        self.sport.request_move(vx_mps, vy_mps, wz_radps)
+
+    def stand(self) -> None:
+        """Get up and balance, turning over first where it must (about 2 s from lying); may be repeated."""
+        if self.sport.request(SportAction.BALANCE_STAND) != 0:
+            self.sport.request(SportAction.RECOVERY_STAND)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it stands balanced, so that a velocity would be obeyed."""
+        return self.sport.ready
+
     def base_and_joints(self) -> tuple[float, ...]:
+        """`render_state` by its former name."""
+        return self.render_state()
+
+    def render_state(self) -> tuple[float, ...]:
         """Position, quaternion xyzw and joint angles: 19 numbers for a renderer."""
         return (*self._position, *self._quaternion, *self._q)
 

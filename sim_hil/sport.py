@@ -127,9 +127,14 @@ class SportController:
     def commanded(self) -> Vec3:
         """The velocity command in force, (vx m/s, vy m/s, wz rad/s): zero unless the robot may move."""
         expired = self._time_s - self._command_s >= HOLD_S - 1e-9
-        if expired or self._mode not in _BALANCED or self._bound_for is not None:
+        if expired or not self.ready:
             return (0.0, 0.0, 0.0)
         return self._command
+
+    @property
+    def ready(self) -> bool:
+        """Whether a velocity command would be obeyed: it stands balanced and no motion is running or awaited."""
+        return self._mode in _BALANCED and self._bound_for is None
 
     @property
     def _bound_for(self) -> int | None:
@@ -139,7 +144,7 @@ class SportController:
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
         """Take a velocity; kept one second, clipped to the robot's range, without effect unless it stands balanced."""
-        if self._mode not in _BALANCED or self._bound_for is not None:
+        if not self.ready:
             return
         self._command = (
             _clip(vx_mps, *VX_RANGE_MPS),
