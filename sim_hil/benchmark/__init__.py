@@ -1,0 +1,1 @@
+"""The DynaNav benchmark: episodes as data, how they are run, and what is measured."""
