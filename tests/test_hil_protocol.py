@@ -406,6 +406,10 @@ def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_pat
     ("arguments", "complaint"),
     [
         (["--scene", "moon"], "moon"),
+        (["--scene", "nowhere/moon.toml"], "moon.toml"),
+        (["--start", "1,2"], "X,Y,DEG"),
+        (["--start", "1000,0,0"], "--start"),
+        (["--link", "udp:1"], "--link"),
         (["--people", "100000"], "people"),
         (["--people", "-1"], "--people"),
         (["--seed", "-1"], "--seed"),
@@ -446,10 +450,10 @@ def test_bad_arguments_leave_an_earlier_trace_alone(
 @pytest.mark.parametrize(
     ("where", "failure"),
     [
-        ("hil.Simulation.step", "pybullet.disconnect(args[0]._client)"),  # what closing the window does
-        ("hil.Simulation.render_state", 'raise pybullet.error("the window was closed")'),
-        ("hil.CameraProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
-        ("hil.ServiceServer.serve", 'raise ValueError("the window was closed")'),
+        ("Simulation.step", "pybullet.disconnect(args[0]._client)"),  # what closing the window does
+        ("Simulation.render_state", 'raise pybullet.error("the window was closed")'),
+        ("CameraProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
+        ("ServiceServer.serve", 'raise ValueError("the window was closed")'),
     ],
 )
 def test_a_run_that_fails_is_one_line_a_result_an_end_line_and_exit_status_1(
@@ -459,7 +463,9 @@ def test_a_run_that_fails_is_one_line_a_result_an_end_line_and_exit_status_1(
 import sys
 import pybullet
 from sim_hil import hil
-from sim_hil.unitree.camera_process import CameraProcessError
+from sim_hil.simulation import Simulation
+from sim_hil.unitree.camera_process import CameraProcess, CameraProcessError
+from sim_hil.unitree.service import ServiceServer
 calls = []
 before = {where}
 def fails(*args, **kwargs):

@@ -1,0 +1,138 @@
+"""What `edge-hil`'s loop and a protocol's robot half agree on, and which robot speaks which protocol.
+
+A protocol is a package sim_hil/<protocol>/ whose module `front_end` has `open_front_end(simulation, options) -> FrontEnd`;
+the loop (`hil_loop.py`) knows nothing else of it. It commands the robot and reads its truth through the simulation. A front end keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that
+`publish` is given, so that it can be tested without waiting; only `received_ns` is the real monotonic clock.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from sim_hil.scene import Scene
+    from sim_hil.simulation import Simulation
+
+
+class FrontEndError(ValueError):
+    """A protocol cannot be spoken as asked; one line for the operator: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class FrontEndOptions:
+    """What a front end may need to know of the command line.
+
+    `scene_source` is what `load_scene` takes (a name or a file) and `scene` what it made of that, with the start that
+    was asked for. `link` is the protocol's address, in a form of its own; `domain` and `interface` are DDS's.
+    """
+
+    robot: str
+    scene_source: str
+    scene: Scene
+    people: int
+    seed: int
+    camera_size: tuple[int, int]
+    odometry_noise: str
+    faults: Path | None
+    link: str | None
+    domain: int
+    interface: str
+
+
+@dataclass(frozen=True)
+class Heard:
+    """One command as it came off the wire, for the trace; `received_ns` is time.monotonic_ns.
+
+    `service` is the part of the protocol that it was sent to, `api_id` its number there, `name` what the protocol's
+    own page calls it, `parameter` its content in words.
+    """
+
+    received_ns: int
+    service: str
+    api_id: int
+    name: str
+    parameter: str
+
+
+class FrontEnd(Protocol):
+    """The robot's half of one protocol. Methods are called by one thread; only `wait` may wait, only `start` long."""
+
+    def where(self) -> str:
+        """Where it can be reached, in words, for the line that says that it is ready."""
+        ...
+
+    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
+        """Wait until it can serve, the world being as in `render_state`; False when `stop` gets an element first.
+
+        Raises RuntimeError or OSError when it cannot.
+        """
+        ...
+
+    def wait(self, left_ns: int) -> None:
+        """Sleep until something arrives, at most `left_ns`."""
+        ...
+
+    def serve(self) -> list[Heard]:
+        """Obey and answer what has arrived; returns it. Malformed input is counted and changes nothing."""
+        ...
+
+    def publish(self, step: int, stamp_s: float) -> None:
+        """Called after physics step number `step`, at `stamp_s` of the robot's own clock: send what is due."""
+        ...
+
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """The world as its cameras see it from now on; after every batch of steps."""
+        ...
+
+    def close(self) -> None:
+        """Let go of everything; may be called twice."""
+        ...
+
+    def summary(self) -> Mapping[str, object]:
+        """Its part of the result, after `close` too.
+
+        `wire`: {commands, last_move, last_command, last_command_zero, malformed}; `video_frames`: pictures sent;
+        `states`: odometry reports sent.
+        """
+        ...
+
+
+_FOLDER: Final = Path(__file__).parent
+Opener = Callable[["Simulation", FrontEndOptions], FrontEnd]
+
+_SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",)}
+)
+
+
+def protocols() -> tuple[str, ...]:
+    """The protocols that are there."""
+    return tuple(name for name in _SPOKEN_BY if (_FOLDER / name / "front_end.py").is_file())
+
+
+def robots() -> tuple[str, ...]:
+    """The robots that speak one of them."""
+    return tuple(dict.fromkeys(robot for name in protocols() for robot in _SPOKEN_BY[name]))
+
+
+def check_combination(robot: str, protocol: str) -> None:
+    """Raises FrontEndError unless `robot` speaks `protocol`."""
+    if robot not in _SPOKEN_BY[protocol]:
+        spoken = [name for name in protocols() if robot in _SPOKEN_BY[name]]
+        raise FrontEndError(
+            f"--robot {robot} --protocol {protocol}: expected a protocol that this robot speaks, {' or '.join(spoken)}"
+        )
+
+
+def open_front_end(protocol: str, simulation: Simulation, options: FrontEndOptions) -> FrontEnd:
+    """Raises FrontEndError, or what the protocol's own library raises for an address that cannot be opened."""
+    opener: Opener = importlib.import_module(f"sim_hil.{protocol}.front_end").open_front_end
+    return opener(simulation, options)
