@@ -1,0 +1,150 @@
+"""Free space of a scene: clearances are exact, paths feasible, short and taut."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from math import hypot, inf, pi, sqrt
+
+import numpy as np
+import pytest
+
+from sim_hil.nav_grid import NavGrid, length_m
+from sim_hil.scene import Scene, SceneObject, Wall, load_scene
+
+CLEARANCE_M = 0.4
+
+
+def hall(*things: SceneObject, walls: tuple[Wall, ...] = ()) -> Scene:
+    """A 20 m x 10 m floor with nothing else on it."""
+    return replace(
+        load_scene("corridor"),
+        name="hall",
+        start=(-8.0, 0.0, 0.0),
+        goal_xy=(8.0, 0.0),
+        floor_min_m=(-10.0, -5.0),
+        floor_max_m=(10.0, 5.0),
+        walls=walls,
+        objects=things,
+        routes=(),
+    )
+
+
+def block(x: float, y: float, depth: float, width: float, *, turn: float = 0.0, z: float = 0.0) -> SceneObject:
+    return SceneObject(f"block {x} {y}", "cabinet", (x, y, z), turn, (depth, width, 1.0), (0.5, 0.5, 0.5), "")
+
+
+def wall(x: float, y0: float, y1: float) -> Wall:
+    return Wall(f"wall {x} {y0}", (x, y0), (x, y1), 0.2, 2.5, "wall_wainscot")
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((2.0, 0.0), 1.5),
+        ((0.0, 1.3), 0.3),
+        ((1.3, 1.6), 1.0),
+        ((0.05, 0.05), -0.45),
+        ((-9.7, 0.0), 0.3),
+        ((5.0, 0.0), 2.0),
+    ],
+)
+def test_clearance_is_the_distance_to_the_nearest_edge_up_to_the_cap(
+    point: tuple[float, float], expected: float
+) -> None:
+    grid = NavGrid(hall(block(0.0, 0.0, 1.0, 2.0)), clearance_m=CLEARANCE_M)
+    assert grid.clearance_m(*point) == pytest.approx(expected, abs=0.02)
+
+
+def test_a_turned_box_is_as_near_as_its_corner() -> None:
+    grid = NavGrid(hall(block(0.0, 0.0, 2.0, 2.0, turn=pi / 4)), clearance_m=CLEARANCE_M)
+    assert grid.clearance_m(2.0, 0.0) == pytest.approx(2.0 - sqrt(2.0), abs=0.02)
+
+
+def test_what_hangs_above_the_robot_stops_nobody() -> None:
+    assert NavGrid(hall(block(0.0, 0.0, 1.0, 1.0, z=1.0)), clearance_m=CLEARANCE_M).is_free(0.0, 0.0)
+    assert not NavGrid(hall(block(0.0, 0.0, 1.0, 1.0, z=0.5)), clearance_m=CLEARANCE_M).is_free(0.0, 0.0)
+
+
+def test_a_free_way_is_straight() -> None:
+    grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
+    assert grid.path((-8.0, 3.0), (7.3, -2.1)) == [(-8.0, 3.0), (7.3, -2.1)]
+
+
+def test_the_way_round_a_wall_is_the_shortest_that_keeps_the_clearance() -> None:
+    # A wall from the lower edge up to y = 3: the shortest way touches the circle of the clearance around its corners.
+    grid = NavGrid(hall(walls=(wall(0.0, -5.0, 3.0),)), clearance_m=CLEARANCE_M)
+    found = grid.distance_m((-6.0, 0.0), (6.0, 0.0))
+    leg = sqrt((6.0 - 0.1) ** 2 + 3.0**2 - CLEARANCE_M**2)
+    turned = np.arctan2(3.0, 5.9) + np.arcsin(CLEARANCE_M / hypot(3.0, 5.9))
+    exact = 2 * (leg + CLEARANCE_M * turned) + 0.2
+    assert exact - 0.01 <= found <= 1.01 * exact
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_every_point_of_a_path_keeps_the_clearance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    things = [
+        block(*rng.uniform((-7, -4), (7, 4)), *rng.uniform(0.4, 1.5, 2), turn=rng.uniform(-3, 3)) for _ in range(9)
+    ]
+    grid = NavGrid(hall(*things), clearance_m=CLEARANCE_M)
+    path = grid.path((-9.0, -4.0), (9.0, 4.0))
+    assert path is not None and path[0] == (-9.0, -4.0) and path[-1] == (9.0, 4.0)
+    for a, b in itertools.pairwise(path):
+        share = np.linspace(0, 1, 200)[:, None]
+        assert grid.clearances_at(np.array(a) * (1 - share) + np.array(b) * share).min() >= CLEARANCE_M - 0.01
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_path_is_no_longer_than_the_way_over_cells_and_no_shorter_than_the_straight_line(seed: int) -> None:
+    rng = np.random.default_rng((seed, 1))
+    things = [
+        block(*rng.uniform((-7, -4), (7, 4)), *rng.uniform(0.4, 1.5, 2), turn=rng.uniform(-3, 3)) for _ in range(9)
+    ]
+    grid = NavGrid(hall(*things), clearance_m=CLEARANCE_M)
+    start, goal = (-9.0, 4.0), (9.0, -4.0)
+    over_cells = grid.field_at(grid.distance_field(goal), *start)
+    found = grid.distance_m(start, goal)
+    assert hypot(18.0, 8.0) - 1e-9 <= found <= over_cells + 0.15
+
+
+def test_a_gap_that_the_robot_does_not_fit_through_is_no_way() -> None:
+    walls = (wall(0.0, -5.0, -0.37), wall(0.0, 0.37, 5.0))
+    assert NavGrid(hall(walls=walls), clearance_m=0.3).path((-3.0, 0.0), (3.0, 0.0)) is not None
+    grid = NavGrid(hall(walls=walls), clearance_m=CLEARANCE_M)
+    assert grid.path((-3.0, 0.0), (3.0, 0.0)) is None
+    assert grid.distance_m((-3.0, 0.0), (3.0, 0.0)) == inf
+
+
+def test_a_start_too_near_a_wall_is_left_by_the_nearest_free_point() -> None:
+    grid = NavGrid(hall(walls=(wall(0.0, -5.0, 5.0),)), clearance_m=CLEARANCE_M)
+    path = grid.path((0.2, 0.0), (4.0, 0.0))
+    assert path is not None and path[0] == (0.2, 0.0) and path[-1] == (4.0, 0.0)
+    assert length_m(path) < 3.9
+
+
+def test_a_distance_field_falls_to_zero_at_the_goal_and_is_infinite_out_of_reach() -> None:
+    grid = NavGrid(hall(walls=(wall(5.0, -5.0, 5.0),)), clearance_m=CLEARANCE_M)
+    field = grid.distance_field((0.0, 0.0))
+    assert grid.field_at(field, 0.0, 0.0) == 0.0
+    assert grid.field_at(field, -3.0, 0.0) == pytest.approx(3.0, abs=0.15)
+    assert grid.field_at(field, 7.0, 0.0) == inf
+
+
+def test_a_price_moves_the_cheapest_way_but_not_what_is_free() -> None:
+    grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
+    plain = grid.cost_field((8.0, 0.0), np.ones(grid.shape))
+    assert np.allclose(plain, grid.distance_field((8.0, 0.0)))
+    doubled = grid.cost_field((8.0, 0.0), np.full(grid.shape, 2.0))
+    assert np.allclose(doubled[grid.free], 2 * plain[grid.free])
+
+
+def test_a_scene_without_room_is_refused() -> None:
+    with pytest.raises(ValueError, match="no room"):
+        NavGrid(hall(block(0.0, 0.0, 20.0, 10.0)), clearance_m=CLEARANCE_M)
+
+
+@pytest.mark.parametrize(("clearance", "cell"), [(-0.1, 0.1), (2.0, 0.1), (0.3, 0.0)])
+def test_senseless_sizes_are_refused(clearance: float, cell: float) -> None:
+    with pytest.raises(ValueError, match="navigation grid"):
+        NavGrid(hall(), clearance_m=clearance, resolution_m=cell)
