@@ -1,8 +1,9 @@
 """What `edge-hil`'s loop and a protocol's robot half agree on, and which robot speaks which protocol.
 
-A protocol is a package sim_hil/<protocol>/ whose module `front_end` has `open_front_end(simulation, options) -> FrontEnd`;
-the loop (`hil_loop.py`) knows nothing else of it. It commands the robot and reads its truth through the simulation. A front end keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that
-`publish` is given, so that it can be tested without waiting; only `received_ns` is the real monotonic clock.
+A protocol is a package sim_hil/NAME whose module `front_end` has `open_front_end(simulation, options) -> FrontEnd`; the
+loop (`hil_loop.py`) knows nothing else of it. It commands the robot and reads its truth through the simulation. It
+keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that `publish` is given, so
+that it can be tested without waiting; only `received_ns` is the real monotonic clock.
 """
 
 from __future__ import annotations
