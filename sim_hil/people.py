@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from sim_hil.scene import Box, Route, Scene, Vec2
 
 Array = NDArray[np.float64]
-UPDATE_HZ = 50
+UPDATE_HZ = 30
 PERSON_RADIUS_M = 0.22
 PERSON_HEIGHT_M = 1.72
 STRIDE_M = 1.35  # distance of one full gait cycle (two steps)
-RENDER_FIELDS = 5  # x, y, heading, gait phase in [0, 1), swing amplitude in [0, 1]
+# x m, y m, heading rad, gait phase in [0, 1), swing amplitude in [0, 1], ground z m, sitting 0..1, gesture (GESTURES)
+RENDER_FIELDS = 8
+GESTURES = ("none", "talking", "phone")
 
 _ROBOT_HALF_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
 _ROBOT_CLEARANCE_M = 0.52
@@ -50,8 +52,8 @@ _SKINS = ((241, 200, 170), (214, 160, 120), (160, 108, 74), (104, 68, 46))
 _HAIRS = ((30, 24, 20), (86, 56, 30), (150, 110, 60), (120, 120, 122))
 
 
-def appearances(count: int, seed: int) -> list[Appearance]:
-    """Looks of the first `count` people of a seed; the same list in the physics and in the camera process."""
+def appearances(count: int, seed: int, scene_name: str = "") -> list[Appearance]:
+    """Looks of the first `count` people of a seed in a scene: the same in the physics and in the camera process."""
     rng = np.random.default_rng((seed, 11))
     shirts = rng.permutation(len(_SHIRTS))
     people = []
@@ -149,7 +151,7 @@ class People:
 
     def render_rows(self) -> Array:
         """[n, RENDER_FIELDS]: what a renderer needs of each person."""
-        rows = [(w.x, w.y, w.heading, w.phase, w.amplitude) for w in self._walkers]
+        rows = [(w.x, w.y, w.heading, w.phase, w.amplitude, 0.0, 0.0, 0.0) for w in self._walkers]
         return np.array(rows, dtype=np.float64).reshape(-1, RENDER_FIELDS)
 
     def step(self, robot_x_m: float, robot_y_m: float, robot_heading_rad: float) -> None:

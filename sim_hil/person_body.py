@@ -77,8 +77,8 @@ class PersonBody:
         self.bodies = [part.bodies(client, folder, f"{prefix}{i}-")[0] for i, part in enumerate(parts)]
 
     def pose(self, row: NDArray[np.float64]) -> None:
-        """Place the body for (x m, y m, heading rad, gait phase 0..1, swing 0..1)."""
-        x, y, heading, phase, swing = (float(value) for value in row)
+        """Place the body for one row of People.render_rows()."""
+        x, y, heading, phase, swing = (float(value) for value in row[:5])
         k, c, s = self._k, cos(heading), sin(heading)
         bob = 0.02 * swing * k * cos(4 * pi * phase)  # highest when the legs pass each other
         self._put(0, x, y, bob, heading, 0.04 * swing)
@@ -94,6 +94,13 @@ class PersonBody:
             self._put(3 + leg, hx + c * reach, hy + s * reach, hz - cos(hip) * _THIGH_M * k, heading, hip + knee)
             ax, ay = x - s * side * _SHOULDER_Y_M * k, y + c * side * _SHOULDER_Y_M * k
             self._put(5 + leg, ax, ay, _SHOULDER_M * k + bob, heading, _ARM_SWING_RAD * swing * sin(angle))
+
+    def hide(self) -> None:
+        """Take the body out of every picture until the next `pose`."""
+        for body in self.bodies:
+            pybullet.resetBasePositionAndOrientation(
+                body, (0.0, 0.0, -1000.0), (0, 0, 0, 1), physicsClientId=self._client
+            )
 
     def _put(self, part: int, x: float, y: float, z: float, heading: float, pitch: float) -> None:
         cz, sz, cy, sy = cos(heading / 2), sin(heading / 2), cos(pitch / 2), sin(pitch / 2)

@@ -13,6 +13,7 @@ import pybullet
 import pytest
 
 from sim_hil.camera import CameraWorld
+from sim_hil.people import RENDER_FIELDS
 from sim_hil.scene import load_scene
 from sim_hil.simulation import Simulation
 from sim_hil.textures import sign
@@ -38,7 +39,8 @@ def bare_world() -> Iterator[CameraWorld]:
 def _state(x: float, y: float, theta: float, person: tuple[float, ...] = NOWHERE) -> np.ndarray:
     """A robot standing level at (x, y, theta)."""
     base = (x, y, 0.31, 0.0, 0.0, sin(theta / 2), cos(theta / 2))
-    return np.array((*base, *(0.0, 0.85, -1.7) * 4, *person))
+    rest = (0.0,) * (RENDER_FIELDS - len(person))  # on level ground, upright, no gesture
+    return np.array((*base, *(0.0, 0.85, -1.7) * 4, *person, *rest))
 
 
 def _changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
