@@ -46,7 +46,7 @@ def test_unknown_scene_is_refused_by_naming_the_known_ones() -> None:
     [
         ("ceiling_height_m = 2.6", "ceiling_height_m = 2.6\nceilling = 1", "ceilling"),
         ('kind = "bench"', 'kind = "bench"\ncolor = [0, 0, 0]', "color"),
-        ('kind = "bench"', 'kind = "sofa"', "sofa"),
+        ('kind = "bench"', 'kind = "throne"', "throne"),
         ("size_m = [0.8, 1.1, 1.9]", "size_m = [0.8, 1.1]", "size_m"),
         ("size_m = [0.8, 1.1, 1.9]", "size_m = [0.8, 1.1, -1]", "positive"),
         ("goal_xy = [24.0, 0.6]", "goal_xy = [240.0, 0.6]", "goal_xy"),
