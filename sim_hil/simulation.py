@@ -1,11 +1,16 @@
-"""The simulated world: a Go2 under physics, static things, walking people. No clock, no DDS, no threads inside."""
+"""The simulated world: a robot under physics, ground, static things, people. No clock, protocol or thread inside."""
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from math import atan2, hypot
+from dataclasses import replace
+from math import atan2
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Final, cast
 
 import numpy as np
 import pybullet
@@ -15,15 +20,26 @@ from sim_hil.gait import GRAVITY_MPS2
 from sim_hil.go2 import Go2, RobotTruth
 from sim_hil.people import PERSON_HEIGHT_M, PERSON_RADIUS_M, RENDER_FIELDS, UPDATE_HZ, People, appearances
 from sim_hil.person_body import PersonBody
+from sim_hil.robot import BaseTruth, Robot
 from sim_hil.scene import Box, Scene
+from sim_hil.scene_terrain import ConvexPiece
 from sim_hil.sport import SportAction
 from sim_hil.world import build_scene
 
-__all__ = ["PERSON_COLLISION_M", "ROBOT_FIELDS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
+__all__ = ["PERSON_COLLISION_M", "ROBOTS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
 
 PERSON_COLLISION_M = 0.5  # DynaNav: a person within 0.5 m of the robot counts as a collision
-ROBOT_FIELDS = 19  # render_state: position, quaternion xyzw, 12 joint angles
-_CONTACT_EVERY = 5  # steps: contacts last longer than 10 ms
+ROBOT_FIELDS = 19  # render_state of a Go2: position, quaternion xyzw, 12 joint angles
+_CONTACT_S = 0.01  # how often contacts are looked at: they last longer than this
+_NEAR_M = 2.5  # people this close have a body that can be walked into; the others only a place
+_MAX_BODIES = 24  # more people do not fit into that circle
+_SETTLE_S = 6.0  # what a robot may take to get ready before it counts as broken
+_FOOTING: Final = 0.9  # friction of what is walked on
+# Slippery sides: with friction, a foot that brushes a wall climbs it and the robot topples over its own leg.
+_SIDES: Final = 0.1
+
+ROBOTS: Final[Mapping[str, str]] = MappingProxyType({"go2": "sim_hil.go2:Go2", "carter": "sim_hil.carter:Carter"})
+"""Robots that a simulation can hold: name -> module and class."""
 
 
 class SimulationClosedError(RuntimeError):
@@ -31,65 +47,118 @@ class SimulationClosedError(RuntimeError):
 
 
 class Simulation:
-    """One deterministic world: the same scene, people, seed and calls give the same motion, step for step.
+    """One deterministic world: the same scene, people, seed, rate and calls give the same motion, step for step.
 
-    With `gui` the physics shows in a window (needs a display). Raises ValueError when the scene has no room
-    or no routes for that many people.
+    `start` (x m, y m, heading rad) takes the place of the scene's. With `gui` the physics shows in a window (needs a
+    display). Raises ValueError for an unknown robot, or when the scene has no room or no routes for that many people.
     """
 
-    DT_S = 0.002
+    DT_S = 0.002  # of the default rate, which real time runs at
 
-    def __init__(self, scene: Scene, *, people: int, seed: int, gui: bool = False) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        people: int,
+        seed: int,
+        gui: bool = False,
+        robot: str = "go2",
+        start: tuple[float, float, float] | None = None,
+        rate_hz: int = 500,
+    ) -> None:
+        if robot not in ROBOTS:
+            raise ValueError(f"simulation: unknown robot {robot!r}, expected one of {', '.join(ROBOTS)}")
+        if not 120 <= rate_hz <= 2000:
+            raise ValueError(f"simulation: expected 120..2000 physics steps a second, found {rate_hz}")
+        self.scene = scene if start is None else replace(scene, start=start)
+        self.rate_hz = rate_hz
+        self.dt_s = 1.0 / rate_hz
         self._gui = gui
         self._looks: list[PersonBody] = []
-        self._walkers = People(scene, people, seed)
+        self._walkers = People(self.scene, people, seed)
+        self._people = self._walkers.poses()
+        self._velocities = np.zeros((people, 2))
         self._seed = seed
         self._steps = 0
+        self._contact_every = max(1, round(_CONTACT_S * rate_hz))
         self._touched: set[str] = set()
+        self._touching: frozenset[str] = frozenset()
         self._fell = False
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
             # The engine reads its files while building: afterwards even a killed run leaves none behind.
             with TemporaryDirectory(prefix="edge-sim-") as folder:
-                self._build(scene, Path(folder))
+                self._build(self.scene, Path(folder), robot)
         except BaseException:
             self.close()
             raise
 
-    def _build(self, scene: Scene, folder: Path) -> None:
+    def _build(self, scene: Scene, folder: Path, robot: str) -> None:
         client = self._client
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.DT_S, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=client
+            fixedTimeStep=self.dt_s, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=client
         )
         pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=client)
         (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
         # The floor reaches beyond the walls, so that nothing can ever fall off the world.
         ground = Box(((x0 + x1) / 2, (y0 + y1) / 2, -0.5), (1.0, 0.0), (x1 - x0 + 10, y1 - y0 + 10, 1.0))
-        self._floor = self._static(ground, friction=0.9)
-        # Slippery sides: with friction, a foot that brushes a wall climbs it and the robot topples over its own leg.
-        self._labels = {self._static(box, friction=0.1): label for label, box in scene.obstacles()}
+        self._floor = self._static(ground, friction=_FOOTING)
+        for piece in scene.terrain_pieces():
+            self._raised(piece)
+        self._labels = {self._static(box, friction=_SIDES): label for label, box in scene.obstacles()}
+        self._aside = (x1 + 50.0, y1 + 50.0)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_HEIGHT_M, physicsClientId=client
         )
         hidden = self._hidden()
+        bodies = min(len(self._walkers), _MAX_BODIES)
         self._person_bodies = [
-            pybullet.createMultiBody(0, shape, hidden, physicsClientId=client) for _ in range(len(self._walkers))
+            pybullet.createMultiBody(0, shape, hidden, self._parking(slot), physicsClientId=client)
+            for slot in range(bodies)
         ]
         self._labels.update((body, "person") for body in self._person_bodies)
+        self._embodied = [-1] * bodies
         if self._gui:
             build_scene(client, folder, scene)
-            looks = appearances(len(self._walkers), self._seed)
+            looks = appearances(len(self._walkers), self._seed, scene.name)
             self._looks = [PersonBody(client, folder, look, f"person{i}-") for i, look in enumerate(looks)]
+        self._robot = self._load(robot, folder)
         self._place_people()
-        self._go2 = Go2(client, folder, scene.start, self.DT_S)
+
+    def _load(self, robot: str, folder: Path) -> Robot:
+        module, _, name = ROBOTS[robot].partition(":")
+        # Imported by name: a wheeled base's code is not needed to walk, nor the other way round.
+        build = cast("Callable[..., Robot]", getattr(importlib.import_module(module), name))
+        start = self.scene.start
+        loaded = build(self._client, folder, start, self.dt_s)
+        ground = self.scene.ground_height_m(start[0], start[1])
+        if ground > 0:
+            (x, y, z), turn = pybullet.getBasePositionAndOrientation(loaded.body, physicsClientId=self._client)
+            pybullet.resetBasePositionAndOrientation(
+                loaded.body, (x, y, z + ground), turn, physicsClientId=self._client
+            )
+            loaded.observe()
+        return loaded
 
     def _static(self, box: Box, friction: float) -> int:
-        client = self._client
         half = [extent / 2 for extent in box.size_m]
-        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client)
         turn = pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0])))
-        body = int(pybullet.createMultiBody(0, shape, self._hidden(), box.centre_m, turn, physicsClientId=client))
+        return self._immovable(shape, box.centre_m, turn, friction)
+
+    def _raised(self, piece: ConvexPiece) -> int:
+        corners = np.array(piece.vertices_m)
+        middle = corners.mean(axis=0)
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self._client
+        )
+        return self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
+
+    def _immovable(
+        self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float
+    ) -> int:  # fmt: skip
+        client = self._client
+        body = int(pybullet.createMultiBody(0, shape, self._hidden(), position, turn, physicsClientId=client))
         pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
         return body
 
@@ -103,20 +172,68 @@ class Simulation:
             )
         )
 
+    def _parking(self, slot: int) -> tuple[float, float, float]:
+        return (self._aside[0] + slot, self._aside[1], PERSON_HEIGHT_M / 2)
+
     def _place_people(self) -> None:
-        for look, row in zip(self._looks, self._walkers.render_rows(), strict=False):
-            look.pose(row)
-        for body, (x, y, _) in zip(self._person_bodies, self._walkers.poses(), strict=True):
-            pybullet.resetBasePositionAndOrientation(
-                body, (x, y, PERSON_HEIGHT_M / 2), (0, 0, 0, 1), physicsClientId=self._client
-            )
+        """Show everybody in the window, and give those near the robot a body."""
+        if self._looks:
+            for look, row in zip(self._looks, self._walkers.render_rows(), strict=False):
+                look.pose(row)
+        (x, y, _), _ = self._robot.pose()
+        gaps = np.hypot(self._people[:, 0] - x, self._people[:, 1] - y)
+        near = np.flatnonzero(gaps < _NEAR_M)
+        if len(near) > len(self._person_bodies):
+            near = np.sort(near[np.argsort(gaps[near], kind="stable")[: len(self._person_bodies)]])
+        for slot, body in enumerate(self._person_bodies):
+            person = int(near[slot]) if slot < len(near) else -1
+            if person < 0 and self._embodied[slot] < 0:
+                continue
+            place = self._parking(slot) if person < 0 else self._middle_of(person)
+            self._embodied[slot] = person
+            pybullet.resetBasePositionAndOrientation(body, place, (0, 0, 0, 1), physicsClientId=self._client)
+
+    def _middle_of(self, person: int) -> tuple[float, float, float]:
+        x, y = float(self._people[person, 0]), float(self._people[person, 1])
+        return (x, y, PERSON_HEIGHT_M / 2 + self.scene.ground_height_m(x, y))
+
+    def settle(self) -> None:
+        """Let the robot get ready to move, while nobody else moves. Raises RuntimeError when it does not.
+
+        Takes simulated time, which `time_s` shows; what it touches meanwhile does not count.
+        """
+        self._robot.stand()
+        for _ in range(round(_SETTLE_S * self.rate_hz)):
+            if self._robot.ready:
+                self._touched.clear()
+                return
+            self._physics()
+        raise RuntimeError(f"simulation: the robot was not ready to move within {_SETTLE_S} s of its start")
 
     def step(self) -> None:
-        """Advance the world by DT_S. Raises SimulationClosedError when the physics is gone."""
+        """Advance the world by dt_s. Raises SimulationClosedError when the physics is gone."""
         try:
-            self._advance()
+            if self._walkers_due() and len(self._walkers):
+                (x, y, _), heading = self._robot.pose()
+                self._walkers.step(x, y, heading)
+                before, self._people = self._people, self._walkers.poses()
+                self._velocities = (self._people[:, :2] - before[:, :2]) * UPDATE_HZ
+                self._place_people()
+            self._physics()
         except pybullet.error as error:
             raise self._explained(error) from error
+
+    def _walkers_due(self) -> bool:
+        """Whether people's own rate, which need not divide this one, has a step here."""
+        return self._steps * UPDATE_HZ // self.rate_hz != (self._steps - 1) * UPDATE_HZ // self.rate_hz
+
+    def _physics(self) -> None:
+        self._robot.drive()
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self._robot.observe()
+        self._steps += 1
+        if self._steps % self._contact_every == 0:
+            self._watch()
 
     def _explained(self, error: Exception) -> Exception:
         if pybullet.isConnected(self._client):
@@ -126,55 +243,83 @@ class Simulation:
             " the end; start the run again and leave the window open"
         )
 
-    def _advance(self) -> None:
-        if self._steps % round(1 / (UPDATE_HZ * self.DT_S)) == 0 and self._person_bodies:
-            (x, y, _), heading = self._go2.pose()
-            self._walkers.step(x, y, heading)
-            self._place_people()
-        self._go2.drive()
-        pybullet.stepSimulation(physicsClientId=self._client)
-        self._go2.observe()
-        self._steps += 1
-        if self._steps % _CONTACT_EVERY == 0:
-            self._watch()
-
     def _watch(self) -> None:
-        for contact in pybullet.getContactPoints(bodyA=self._go2.body, physicsClientId=self._client):
+        labels = set()
+        for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self._client):
             label = self._labels.get(contact[2])
-            if label is not None:
-                self._touched.add(label)
-        (x, y, _), _ = self._go2.pose()
-        if any(hypot(x - px, y - py) < PERSON_COLLISION_M for px, py, _ in self._walkers.poses()):
-            self._touched.add("person")
-        self._fell = self._fell or self._go2.measured().up < 0.5
+            # The engine also lists what is about to touch, up to 2 cm away.
+            if label is not None and (contact[9] > 0.0 or contact[8] < 0.0):
+                labels.add(label)
+        (x, y, _), _ = self._robot.pose()
+        if len(self._people) and bool(
+            np.any(np.hypot(self._people[:, 0] - x, self._people[:, 1] - y) < PERSON_COLLISION_M)
+        ):
+            labels.add("person")
+        self._touching = frozenset(labels)
+        self._touched |= labels
+        self._fell = self._fell or self._robot.up() < 0.5
+
+    @property
+    def robot(self) -> Robot:
+        """The robot, for what only its own protocol asks of it."""
+        return self._robot
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the world was made."""
+        return self._steps * self.dt_s
+
+    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
+        """Command a body-frame velocity, in force for 1 s of simulation time; ignored unless the robot is ready."""
+        self._robot.command(vx_mps, vy_mps, wz_radps)
 
     def sport(self, action: SportAction) -> int:
-        """Ask the sport controller for an action; 0, or a Unitree error code when the posture does not allow it."""
-        return self._go2.sport.request(action)
+        """Ask a Go2's sport controller for an action; 0, or a Unitree error code when the posture does not allow it.
+
+        Raises ValueError for a robot that has none.
+        """
+        if not isinstance(self._robot, Go2):
+            raise ValueError(f"simulation: sport actions are the Go2's, this robot is a {type(self._robot).__name__}")
+        return self._robot.sport.request(action)
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Command a body-frame velocity, in force for 1 s of simulation time; ignored unless balanced on its feet."""
-        self._go2.sport.request_move(vx_mps, vy_mps, wz_radps)
+        """`command` by the name that the Go2's sport service gives it."""
+        self.command(vx_mps, vy_mps, wz_radps)
 
     @property
     def commanded(self) -> tuple[float, float, float]:
         """The velocity command in force in the robot: zero when it may not move, or its last command has expired."""
-        return self._go2.sport.commanded
+        if isinstance(self._robot, Go2):
+            return self._robot.sport.commanded
+        return self._robot.truth(self.time_s).commanded
 
-    def truth(self) -> RobotTruth:
-        """Ground truth of the robot now. Raises SimulationClosedError when the physics is gone."""
+    def truth(self) -> BaseTruth:
+        """Ground truth of the robot now (a Go2's is a RobotTruth). Raises SimulationClosedError."""
         try:
-            return self._go2.truth(self._steps * self.DT_S)
+            return self._robot.truth(self.time_s)
         except pybullet.error as error:
             raise self._explained(error) from error
 
+    def pose(self) -> tuple[tuple[float, float, float], float]:
+        """Base position, m, and heading, rad: the part of `truth` that costs nothing."""
+        return self._robot.pose()
+
     def people(self) -> NDArray[np.float64]:
         """[n, 3]: x m, y m, heading rad of every person."""
-        return self._walkers.poses()
+        return self._people.copy()
+
+    def people_velocities(self) -> NDArray[np.float64]:
+        """[n, 2]: velocity of every person in the world frame, m/s."""
+        return self._velocities.copy()
 
     def collided_with(self) -> set[str]:
         """Labels of what the robot has touched so far; "person" also for one within 0.5 m, centre to centre."""
         return set(self._touched)
+
+    @property
+    def touching(self) -> frozenset[str]:
+        """The same for now, as of the latest look (100 a second)."""
+        return self._touching
 
     @property
     def fell(self) -> bool:
@@ -182,8 +327,8 @@ class Simulation:
         return self._fell
 
     def render_state(self) -> NDArray[np.float64]:
-        """[19 + 5 n]: base position, quaternion xyzw, 12 joints, then per person x, y, heading, gait phase, swing."""
-        robot = np.array(self._go2.base_and_joints())
+        """[fields of the robot + RENDER_FIELDS n]: the robot's render_state, then every person's row."""
+        robot = np.array(self._robot.render_state())
         return np.concatenate((robot, self._walkers.render_rows().reshape(len(self._walkers) * RENDER_FIELDS)))
 
     def close(self) -> None:
