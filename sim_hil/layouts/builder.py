@@ -1,0 +1,316 @@
+"""Collects a layout's rooms, openings, things and places, refusing whatever would stand in something else's way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, pi, radians, sin
+
+import numpy as np
+
+from sim_hil.layouts.plan import WALL_THICKNESS_M, Border, LayoutError, Rect, Vec2, shared_border, wall_lines
+from sim_hil.scene import (
+    KINDS,
+    SKY,
+    Area,
+    Floor,
+    Place,
+    Scene,
+    SceneObject,
+    Terrain,
+    Vec3,
+    Wall,
+)
+
+# Colours that have a name: what an instruction calls red must be red.
+COLOURS: dict[str, Vec3] = {
+    "red": (0.80, 0.08, 0.10),
+    "blue": (0.10, 0.28, 0.72),
+    "green": (0.10, 0.52, 0.22),
+    "yellow": (0.95, 0.80, 0.10),
+    "orange": (0.94, 0.46, 0.06),
+    "purple": (0.46, 0.16, 0.60),
+    "white": (0.93, 0.93, 0.91),
+    "black": (0.10, 0.10, 0.11),
+    "brown": (0.45, 0.28, 0.14),
+    "pink": (0.92, 0.45, 0.62),
+    "grey": (0.55, 0.56, 0.58),
+}
+# Height of the underside of what hangs on a wall, m.
+_HUNG_M = {
+    "window": 1.0, "notice_board": 0.9, "painting": 1.1, "screen": 1.1, "clock": 1.9, "room_sign": 1.45,
+    "exit_sign": 2.2, "sign": 2.2, "whiteboard": 0.8, "fire_extinguisher": 0.3, "handrail": 0.0,
+}  # fmt: skip
+_FACING = {"n": -pi / 2, "s": pi / 2, "w": 0.0, "e": pi}  # where a thing looks whose back is on that side
+_WALL_GAP_M = 0.012  # behind a thing, so that its back and the wall do not share a plane
+_OVERHEAD = frozenset(("light", "sign", "exit_sign", "awning"))
+_LYING = frozenset(("carpet",))
+PERSON_CLEARANCE_M = 0.32
+
+
+@dataclass(frozen=True)
+class Room:
+    """One rectangle of the plan: an area in the making."""
+
+    label: str
+    kind: str
+    name: str
+    rect: Rect
+    floor: str
+
+
+class Builder:
+    """One layout in the making. `rng` is the only source of chance; `flip` mirrors and turns the whole at the end."""
+
+    def __init__(self, kind: str, rng: np.random.Generator, wall_texture: str, ceiling_m: float) -> None:
+        self.kind, self.rng = kind, rng
+        self.wall_texture, self.ceiling_m = wall_texture, ceiling_m
+        self.rooms: list[Room] = []
+        self.openings: list[tuple[Border, str, str]] = []
+        self.things: list[SceneObject] = []
+        self.floors: list[Floor] = []
+        self.terrain: list[Terrain] = []
+        self.places: list[Place] = []
+        self._taken: list[Rect] = []  # outlines of what stands or hangs
+        self._clear: list[Rect] = []  # where nothing solid may stand
+        self._counts: dict[str, int] = {}
+
+    def number(self, what: str) -> int:
+        """1, 2, 3 … for each kind of thing: labels are unique."""
+        self._counts[what] = self._counts.get(what, 0) + 1
+        return self._counts[what]
+
+    def pick(self, choices: Sequence[str]) -> str:
+        """One of them by chance."""
+        return choices[int(self.rng.integers(len(choices)))]
+
+    def room(self, rect: Rect, kind: str, name: str, floor: str = "") -> Room:
+        """Add a rectangle of the plan; raises LayoutError where it overlaps another."""
+        for other in self.rooms:
+            if rect.overlaps(other.rect):
+                raise LayoutError(f"{name} overlaps {other.label}")
+        room = Room(f"{name} {self.number(name)}", kind, name, rect, floor)
+        self.rooms.append(room)
+        return room
+
+    def open(self, a: Room, b: Room, width_m: float = 0.0, at: float | None = None, margin_m: float = 0.55) -> Border:
+        """Open the wall between two rooms: all of it (width 0), or a doorway of that width, by chance or at `at`."""
+        border = shared_border(a.rect, b.rect)
+        if width_m > 0:
+            low, high = border.low + margin_m + width_m / 2, border.high - margin_m - width_m / 2
+            if low > high:
+                raise LayoutError(f"no room for a door of {width_m} m between {a.label} and {b.label}")
+            middle = float(self.rng.uniform(low, high)) if at is None else min(max(at, low), high)
+            border = border.cut(middle - width_m / 2, middle + width_m / 2)
+        self.openings.append((border, a.label, b.label))
+        along, across = border.length / 2 + 0.15, 1.1
+        x, y = border.middle
+        reach = (along, across) if border.along_x else (across, along)
+        self.keep_clear(Rect(x - reach[0], y - reach[1], x + reach[0], y + reach[1]))
+        return border
+
+    def keep_clear(self, rect: Rect) -> None:
+        """Nothing solid shall stand here."""
+        self._clear.append(rect)
+
+    def fits(self, outline: Rect, solid: bool, gap_m: float = 0.1) -> bool:
+        """Whether a thing of this outline would be in nobody's way."""
+        if solid and any(outline.overlaps(zone) for zone in self._clear):
+            return False
+        grown = outline.grown(gap_m)
+        return not any(grown.overlaps(taken) for taken in self._taken)
+
+    def put(
+        self, kind: str, x: float, y: float, heading_rad: float, *, z: float = 0.0, size: Vec3 | None = None,
+        colour: str = "", landmark: str = "", text: str = "", label: str = "", gap_m: float = 0.1, force: bool = False,
+    ) -> SceneObject | None:  # fmt: skip
+        """Add a thing; None where it would be in the way of another. `force` leaves that to the caller."""
+        size = size or KINDS[kind].size_m
+        outline = outline_of(x, y, heading_rad, size)
+        overhead = kind in _OVERHEAD or kind in _LYING
+        # A door or elevator hangs in a wall, but nothing may stand before it.
+        if not (force or overhead or self.fits(outline, KINDS[kind].solid, gap_m)):
+            return None
+        name = label or f"{kind.replace('_', ' ')} {self.number(kind)}"
+        tint = COLOURS[colour] if colour else KINDS[kind].colour
+        thing = SceneObject(name, kind, (x, y, z), heading_rad, size, tint, text, landmark)
+        self.things.append(thing)
+        if not overhead:
+            self._taken.append(outline)
+        return thing
+
+    def against(
+        self, room: Room, kind: str, *, side: str = "", along: float | None = None, size: Vec3 | None = None,
+        colour: str = "", landmark: str = "", text: str = "", label: str = "", tries: int = 24, lone: bool = False,
+        margin_m: float = 0.25,
+    ) -> SceneObject | None:  # fmt: skip
+        """Put a thing with its back to one of the room's walls; None where there was no room.
+
+        `along` is where, as a share of the wall's length; `lone` also keeps the opposite side of a corridor clear.
+        """
+        depth, width, _ = size or KINDS[kind].size_m
+        rect = room.rect
+        for _ in range(tries):
+            where = side or self.pick(("n", "s", "e", "w"))
+            share = float(self.rng.uniform(0, 1)) if along is None else along
+            back = WALL_THICKNESS_M / 2 + _WALL_GAP_M + depth / 2
+            edge = WALL_THICKNESS_M / 2 + margin_m + width / 2
+            low, high = (rect.x0, rect.x1) if where in "ns" else (rect.y0, rect.y1)
+            if high - low < 2 * edge:
+                if side:
+                    return None
+                continue
+            u = low + edge + share * (high - low - 2 * edge)
+            x, y = {"n": (u, rect.y1 - back), "s": (u, rect.y0 + back), "w": (rect.x0 + back, u),
+                    "e": (rect.x1 - back, u)}[where]  # fmt: skip
+            # Flat things too: one over a doorway would hang in the air.
+            outline = outline_of(x, y, _FACING[where], size or KINDS[kind].size_m)
+            if any(outline.overlaps(zone) for zone in self._clear):
+                continue
+            thing = self.put(
+                kind, x, y, _FACING[where], z=_HUNG_M.get(kind, 0.0), size=size, colour=colour, landmark=landmark,
+                text=text, label=label,
+            )  # fmt: skip
+            if thing is not None:
+                if lone and thing.solid:
+                    across = (0.5, rect.depth) if where in "ns" else (rect.width, 0.5)
+                    dx, dy = across
+                    self.keep_clear(Rect(outline.x0 - dx, outline.y0 - dy, outline.x1 + dx, outline.y1 + dy))
+                return thing
+            if along is not None and side:
+                return None
+        return None
+
+    def place(self, kind: str, x: float, y: float, heading_rad: float, capacity: int = 1) -> None:
+        """Add a spot where people go; what is not free in the end is left out."""
+        self.places.append(Place(f"{kind} {self.number('place ' + kind)}", (x, y), heading_rad, kind, capacity))
+
+    def place_before(self, thing: SceneObject, kind: str, capacity: int = 1, gap_m: float = 0.55) -> None:
+        """A spot before a thing's front, facing it."""
+        reach = thing.size_m[0] / 2 + gap_m
+        h = thing.heading_rad
+        self.place(kind, thing.position_m[0] + reach * cos(h), thing.position_m[1] + reach * sin(h), h + pi, capacity)
+
+    def stand_in(self, rect: Rect, count: int) -> None:
+        """Spots to stand in a free part of a rectangle."""
+        for _ in range(count * 4):
+            if count <= 0:
+                return
+            x = float(self.rng.uniform(rect.x0 + 0.5, rect.x1 - 0.5))
+            y = float(self.rng.uniform(rect.y0 + 0.5, rect.y1 - 0.5))
+            if all(_gap(taken, x, y) > PERSON_CLEARANCE_M + 0.1 for taken in self._taken):
+                self.place("stand", x, y, float(self.rng.uniform(-pi, pi)), 2)
+                count -= 1
+
+    def walls(self) -> list[Wall]:
+        """The walls of the rooms."""
+        lines = wall_lines([room.rect for room in self.rooms], [border for border, _, _ in self.openings])
+        return [
+            Wall(f"wall {i + 1}", a, b, WALL_THICKNESS_M, self.ceiling_m, self.wall_texture)
+            for i, (a, b) in enumerate(lines)
+        ]
+
+    def scene(self, name: str, start: Vec3, goal: Vec2, *, floor: str, ceiling: str = "ceiling_panels",
+              walls: list[Wall] | None = None, bounds: Rect | None = None, sky: Vec3 = SKY) -> Scene:  # fmt: skip
+        """Everything as a scene, mirrored and turned by chance so that left and right come equally often."""
+        walls = self.walls() if walls is None else walls
+        bounds = bounds or Rect(
+            min(room.rect.x0 for room in self.rooms), min(room.rect.y0 for room in self.rooms),
+            max(room.rect.x1 for room in self.rooms), max(room.rect.y1 for room in self.rooms),
+        )  # fmt: skip
+        patches = [Floor(room.rect.corners(), room.floor) for room in self.rooms if room.floor] + self.floors
+        ceiling_m = self.ceiling_m if ceiling else 0.0
+        scene = Scene(
+            name=name, start=start, goal_xy=goal, floor_min_m=(bounds.x0, bounds.y0),
+            floor_max_m=(bounds.x1, bounds.y1), floor_texture=floor, ceiling_height_m=ceiling_m, walls=tuple(walls),
+            objects=tuple(self.things), routes=(), floors=tuple(patches), terrain=tuple(self.terrain),
+            areas=tuple(Area(room.label, room.kind, room.rect.corners(), room.name) for room in self.rooms),
+            places=tuple(self.places), ceiling_texture=ceiling or "ceiling_panels", sky=sky,
+        )  # fmt: skip
+        return scene
+
+
+def outline_of(x: float, y: float, heading_rad: float, size: Vec3) -> Rect:
+    """The upright rectangle round a thing, m."""
+    c, s = abs(cos(heading_rad)), abs(sin(heading_rad))
+    half_x, half_y = (size[0] * c + size[1] * s) / 2, (size[0] * s + size[1] * c) / 2
+    return Rect(x - half_x, y - half_y, x + half_x, y + half_y)
+
+
+def _gap(rect: Rect, x: float, y: float) -> float:
+    return hypot(max(rect.x0 - x, x - rect.x1, 0.0), max(rect.y0 - y, y - rect.y1, 0.0))
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A symmetry of the square: swap x and y, then mirror either. Keeps rectangles upright."""
+
+    swap: bool
+    flip_x: bool
+    flip_y: bool
+
+    def point(self, p: Vec2) -> Vec2:
+        """Where a point comes to lie (about the origin)."""
+        x, y = (p[1], p[0]) if self.swap else (p[0], p[1])
+        return (-x if self.flip_x else x, -y if self.flip_y else y)
+
+    def heading(self, heading_rad: float) -> float:
+        """Where a direction then points."""
+        x, y = self.point((cos(heading_rad), sin(heading_rad)))
+        return radians(round(degrees(atan2(y, x)), 3))
+
+
+def turned(scene: Scene, turn: Turn) -> Scene:
+    """The scene under a symmetry, moved back so that its floor begins at (0, 0); every number to 1 mm."""
+    corners = [turn.point(scene.floor_min_m), turn.point(scene.floor_max_m)]
+    x0, y0 = min(c[0] for c in corners), min(c[1] for c in corners)
+    x1, y1 = max(c[0] for c in corners), max(c[1] for c in corners)
+
+    def at(p: Vec2) -> Vec2:
+        x, y = turn.point(p)
+        return (_mm(x - x0), _mm(y - y0))
+
+    def round_(polygon: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
+        moved = tuple(at(p) for p in polygon)
+        mirrored = (turn.swap + turn.flip_x + turn.flip_y) % 2 == 1
+        return tuple(reversed(moved)) if mirrored else moved
+
+    def at3(p: Vec3) -> Vec3:
+        return (*at((p[0], p[1])), _mm(p[2]))
+
+    def size(s: Vec3) -> Vec3:
+        return (_mm(s[0]), _mm(s[1]), _mm(s[2]))
+
+    return Scene(
+        name=scene.name,
+        start=(*at((scene.start[0], scene.start[1])), turn.heading(scene.start[2])),
+        goal_xy=at(scene.goal_xy),
+        floor_min_m=(0.0, 0.0),
+        floor_max_m=(_mm(x1 - x0), _mm(y1 - y0)),
+        floor_texture=scene.floor_texture,
+        ceiling_height_m=scene.ceiling_height_m,
+        walls=tuple(
+            Wall(w.label, at(w.start_m), at(w.end_m), w.thickness_m, w.height_m, w.texture) for w in scene.walls
+        ),
+        objects=tuple(
+            SceneObject(o.label, o.kind, at3(o.position_m), turn.heading(o.heading_rad), size(o.size_m), o.colour,
+                        o.text, o.landmark)
+            for o in scene.objects
+        ),
+        routes=(),
+        floors=tuple(Floor(round_(f.polygon), f.texture, turn.heading(f.heading_rad)) for f in scene.floors),
+        terrain=tuple(
+            Terrain(t.label, t.kind, at3(t.position_m), turn.heading(t.heading_rad), t.size_m, t.rise_m, t.texture)
+            for t in scene.terrain
+        ),
+        areas=tuple(Area(a.label, a.kind, round_(a.polygon), a.name) for a in scene.areas),
+        places=tuple(
+            Place(p.label, at(p.position_m), turn.heading(p.heading_rad), p.kind, p.capacity) for p in scene.places
+        ),
+        ceiling_texture=scene.ceiling_texture,
+        sky=scene.sky,
+    )  # fmt: skip
+
+
+def _mm(value: float) -> float:
+    return round(value, 3) + 0.0

@@ -1,0 +1,88 @@
+"""Whether a layout is sound: nothing stands in anything, every doorway and area can be reached, places are free."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.nav_grid import NavGrid
+from sim_hil.scene import Box, Scene
+
+ROBOT_RADIUS_M = 0.4
+PERSON_RADIUS_M = 0.25
+_TOUCH_M = 0.004  # things may stand flush
+
+
+def problems(scene: Scene, grid: NavGrid | None = None) -> list[str]:
+    """What is wrong with a scene, one line each; empty when it is sound. `grid`: one of ROBOT_RADIUS_M, if at hand."""
+    found = overlaps(scene)
+    grid = grid or NavGrid(scene, clearance_m=ROBOT_RADIUS_M)
+    x, y, _ = scene.start
+    if not grid.is_free(x, y):
+        return [*found, f"start ({x:.2f}, {y:.2f}) is not free for a robot of radius {ROBOT_RADIUS_M} m"]
+    field = grid.distance_field((x, y))
+    if not np.isfinite(grid.field_at(field, *scene.goal_xy)):
+        found.append(f"goal_xy ({scene.goal_xy[0]:.2f}, {scene.goal_xy[1]:.2f}) cannot be reached from the start")
+    return found + unreached_areas(scene, grid, field) + bad_places(scene, grid, field)
+
+
+def overlaps(scene: Scene) -> list[str]:
+    """Pairs of solid things, or of a thing and a wall, that share room."""
+    boxes = [(thing.label, box) for thing in scene.objects for box in thing.boxes]
+    walls = [(wall.label, wall.box) for wall in scene.walls]
+    found = []
+    for index, (label, box) in enumerate(boxes):
+        for other, against in boxes[index + 1 :] + walls:
+            if other != label and boxes_overlap(box, against):
+                line = f"{label} stands in {other}"
+                if line not in found:
+                    found.append(line)
+    return found
+
+
+def boxes_overlap(a: Box, b: Box) -> bool:
+    """Whether two upright boxes share room (separating axes; things that touch do not)."""
+    if abs(a.centre_m[2] - b.centre_m[2]) >= (a.size_m[2] + b.size_m[2]) / 2 - _TOUCH_M:
+        return False
+    dx, dy = b.centre_m[0] - a.centre_m[0], b.centre_m[1] - a.centre_m[1]
+    if hypot(dx, dy) > (hypot(*a.size_m[:2]) + hypot(*b.size_m[:2])) / 2:
+        return False
+    for c, s in (a.axis, (-a.axis[1], a.axis[0]), b.axis, (-b.axis[1], b.axis[0])):
+        reach = 0.0
+        for box in (a, b):
+            u, v = box.axis
+            reach += box.size_m[0] / 2 * abs(c * u + s * v) + box.size_m[1] / 2 * abs(-c * v + s * u)
+        if abs(dx * c + dy * s) >= reach - _TOUCH_M:
+            return False
+    return True
+
+
+def unreached_areas(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> list[str]:
+    """Areas of which no free cell can be reached."""
+    reached = np.isfinite(field)
+    rows, columns = np.nonzero(reached)
+    xs = grid.origin_m[0] + (columns + 0.5) * grid.resolution_m
+    ys = grid.origin_m[1] + (rows + 0.5) * grid.resolution_m
+    found = []
+    for area in scene.areas:
+        px, py = zip(*area.polygon, strict=True)
+        # Areas are upright rectangles or nearly so: the inner part of the bounding box will do.
+        inside = (xs > min(px) + 0.3) & (xs < max(px) - 0.3) & (ys > min(py) + 0.3) & (ys < max(py) - 0.3)
+        if area.kind not in ("garden", "street") and not inside.any():
+            found.append(f"{area.label} cannot be reached by a robot of radius {ROBOT_RADIUS_M} m")
+    return found
+
+
+def bad_places(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> list[str]:
+    """Places to stand, queue or enter that are not free for a person or cannot be reached."""
+    found = []
+    for place in scene.places:
+        if place.kind == "sit":
+            continue
+        if grid.clearance_m(*place.position_m) < PERSON_RADIUS_M:
+            found.append(f"place {place.label} is not free")
+        elif not np.isfinite(grid.field_at(field, *place.position_m)):
+            found.append(f"place {place.label} cannot be reached")
+    return found
