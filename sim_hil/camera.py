@@ -17,6 +17,7 @@ from sim_hil.person_body import PersonBody
 from sim_hil.scene import Scene
 from sim_hil.simulation import ROBOT_FIELDS
 from sim_hil.world import build_scene
+from sim_hil.world_stage import BulletStage
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -39,11 +40,9 @@ class CameraWorld:
         try:
             # The renderer reads its files while building: afterwards even a killed run leaves none behind.
             with TemporaryDirectory(prefix="edge-camera-") as folder:
-                build_scene(self._client, Path(folder), scene)
-                self._people = [
-                    PersonBody(self._client, Path(folder), look, f"person{index}-")
-                    for index, look in enumerate(appearances(people, seed))
-                ]
+                stage = BulletStage(self._client, Path(folder))
+                build_scene(stage, scene)
+                self._people = [PersonBody(stage, look) for look in appearances(people, seed, scene.name)]
         except BaseException:
             self.close()
             raise

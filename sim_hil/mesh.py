@@ -1,78 +1,106 @@
-"""Triangle meshes gathered by texture: quads, boxes, prisms and balls, as few bodies as there are textures.
+"""Triangle meshes gathered by texture: quads, boxes, prisms and balls, as few surfaces as there are textures.
 
-The software renderer pays for every body and draws primitive capsules as rough prisms; one mesh a texture is faster and
-looks better. Plain colours become cells of one palette texture. Faces are drawn from their outer side only.
+Faces are seen from their outer side only. Nothing here knows a renderer: a stage (world_stage) draws the surfaces.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from math import cos, pi, sin
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import cos, pi, sin, sqrt
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
-from sim_hil.textures import Colour, Image, palette, write_png
+from sim_hil.textures import Colour, Image
 
 Vec3 = tuple[float, float, float]
 Vec2 = tuple[float, float]
-_PALETTE = "palette"
 
 
 class Frame:
-    """A pose to build in: origin, and unit axes forward (front), left and up, in the parent's coordinates."""
+    """A pose to build in: x forward (front), y left, z up of an upright thing, in the parent's coordinates."""
 
     def __init__(self, origin: Vec3 = (0.0, 0.0, 0.0), heading_rad: float = 0.0) -> None:
-        self.origin = np.array(origin)
-        c, s = cos(heading_rad), sin(heading_rad)
-        self.axes = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+        self.origin, self.heading_rad = origin, heading_rad
+        self._c, self._s = cos(heading_rad), sin(heading_rad)
 
     def point(self, p: Sequence[float]) -> Vec3:
         """Parent coordinates of a point of this frame."""
-        x, y, z = self.origin + self.axes @ np.asarray(p, dtype=np.float64)
-        return (float(x), float(y), float(z))
+        (x, y, z), (u, v, w) = self.origin, p
+        return (x + self._c * u - self._s * v, y + self._s * u + self._c * v, z + w)
+
+    def direction(self, d: Sequence[float]) -> Vec3:
+        """A direction of this frame as the parent sees it."""
+        u, v, w = d
+        return (self._c * u - self._s * v, self._s * u + self._c * v, w)
+
+    def at(self, p: Sequence[float], heading_rad: float = 0.0) -> Frame:
+        """A frame within this one: its origin at `p`, turned by `heading_rad`."""
+        return Frame(self.point(p), self.heading_rad + heading_rad)
+
+
+@dataclass
+class Surface:
+    """Triangles that share a picture; of a plain surface (no picture) every vertex has a colour."""
+
+    image: Image | None
+    vertices: list[Vec3] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
+    uvs: list[Vec2] = field(default_factory=list)  # in pictures: 1 is one repetition; unused without one
+    normals: list[Vec3] = field(default_factory=list)
+    colours: list[Colour] = field(default_factory=list)  # of a plain surface only
+
+    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32], NDArray[np.float32]]:
+        """Vertices [n, 3], indices [3 m], uvs [n, 2] and normals [n, 3]."""
+        shapes = ((self.vertices, 3), (self.uvs, 2), (self.normals, 3))
+        vertices, uvs, normals = (np.array(values, np.float32).reshape(-1, size) for values, size in shapes)
+        return vertices, np.array(self.indices, np.uint32), uvs, normals
 
 
 class MeshBuilder:
-    """Collects faces; `pictures` maps a texture's name to its RGB picture."""
+    """Collects faces by picture. `detail` below 1 makes round things of fewer sides: for what is seen from afar."""
 
-    def __init__(self) -> None:
-        self.pictures: dict[str, Image] = {}
-        self._faces: dict[str, tuple[list[Vec3], list[int], list[Vec2], list[Vec3]]] = {}
-        self._colours: list[Colour] = []
+    def __init__(self, detail: float = 1.0) -> None:
+        self._detail = detail
+        self._pictures: dict[str, Image] = {}
+        self._textured: dict[str, Surface] = {}
+        self._plain = Surface(None)
 
     def picture(self, name: str, image: Image) -> str:
         """Register a picture under a name, to be used as `texture`."""
-        self.pictures[name] = image
+        self._pictures[name] = image
         return name
 
-    def _cell(self, colour: Colour) -> int:
-        if colour not in self._colours:
-            self._colours.append(colour)
-        return self._colours.index(colour)
+    def has_picture(self, name: str) -> bool:
+        """Whether a picture of that name is there already."""
+        return name in self._pictures
 
-    def _append(self, texture: str, corners: Sequence[Vec3], uvs: Sequence[Vec2], normals: Sequence[Vec3]) -> None:
-        vertices, indices, all_uvs, all_normals = self._faces.setdefault(texture, ([], [], [], []))
-        first = len(vertices)
-        vertices.extend(corners)
-        all_uvs.extend(uvs)
-        all_normals.extend(normals)
-        for k in range(1, len(corners) - 1):
-            indices.extend((first, first + k, first + k + 1))
+    def surfaces(self) -> Iterator[Surface]:
+        """What was built: the plain faces first, then a surface a picture."""
+        if self._plain.indices:
+            yield self._plain
+        yield from self._textured.values()
 
-    def quad(self, texture: str, corners: Sequence[Vec3], repeat: Vec2 = (1.0, 1.0)) -> None:
+    def quad(self, texture: str, corners: Sequence[Vec3], repeat: Vec2 = (1.0, 1.0), origin: Vec2 = (0.0, 0.0)) -> None:
         """A textured quad; corners as its viewer sees them: bottom left, bottom right, top right, top left."""
-        u, v = repeat
-        self._append(texture, corners, ((0, 0), (u, 0), (u, v), (0, v)), (_normal(corners),) * 4)
+        (u, v), (a, b) = repeat, origin
+        self.patch(texture, corners, ((a, b), (a + u, b), (a + u, b + v), (a, b + v)))
+
+    def patch(self, texture: str, corners: Sequence[Vec3], uvs: Sequence[Vec2]) -> None:
+        """A textured convex face, corners counter-clockwise as its viewer sees them."""
+        surface = self._textured.get(texture)
+        if surface is None:
+            surface = self._textured[texture] = Surface(self._pictures[texture])
+        surface.uvs.extend(uvs)
+        _fan(surface, corners, (_normal(corners),) * len(corners))
 
     def face(self, colour: Colour, corners: Sequence[Vec3], normals: Sequence[Vec3] | None = None) -> None:
         """A plain convex face, corners counter-clockwise as its viewer sees them."""
-        cell = float(self._cell(colour))
-        spread = normals if normals is not None else (_normal(corners),) * len(corners)
-        self._append(_PALETTE, corners, ((cell, 0.5),) * len(corners), spread)
+        self._plain.colours.extend((colour,) * len(corners))
+        self._plain.uvs.extend(((0.0, 0.0),) * len(corners))
+        _fan(self._plain, corners, normals if normals is not None else (_normal(corners),) * len(corners))
 
     def box(
         self,
@@ -107,17 +135,15 @@ class MeshBuilder:
 
         Rings go upwards; a limb, a torso, a bottle or a pot is a few of them.
         """
-        loops = []
-        for (x, y, z), rx, ry in rings:
-            angles = [2 * pi * (k + 0.5) / sides for k in range(sides)]
-            loops.append([frame.point((x + rx * cos(t), y + ry * sin(t), z)) for t in angles])
-        around = [2 * pi * (k + 0.5) / sides for k in range(sides)]
-        outward = [tuple(float(v) for v in frame.axes @ (cos(t), sin(t), 0.0)) for t in around]
+        sides = max(round(sides * self._detail), 4)
+        around = [(cos(t), sin(t)) for t in (2 * pi * (k + 0.5) / sides for k in range(sides))]
+        loops = [[frame.point((x + rx * c, y + ry * s, z)) for c, s in around] for (x, y, z), rx, ry in rings]
+        outward = [frame.direction((c, s, 0.0)) for c, s in around]
         for lower, upper in itertools.pairwise(loops):
             for k in range(sides):
                 n = (k + 1) % sides
                 normals = (outward[k], outward[n], outward[n], outward[k])
-                self.face(colour, (lower[k], lower[n], upper[n], upper[k]), normals)  # type: ignore[arg-type]
+                self.face(colour, (lower[k], lower[n], upper[n], upper[k]), normals)
         self.face(colour, loops[-1])
         self.face(colour, tuple(reversed(loops[0])))
 
@@ -126,35 +152,26 @@ class MeshBuilder:
     ) -> None:
         """An ellipsoid as a stack of rings."""
         rings = []
-        for angle in np.linspace(-pi / 2 * 0.92, pi / 2 * 0.92, 6):
+        levels = max(round(6 * self._detail), 3)
+        for level in range(levels):
+            angle = pi / 2 * 0.92 * (2 * level / (levels - 1) - 1)
             width = cos(angle)
             z = centre[2] + radii[2] * sin(angle)
             rings.append(((centre[0], centre[1], z), radii[0] * width, radii[1] * width))
         self.prism(frame, rings, colour, sides)
 
-    def bodies(self, client: int, folder: Path, prefix: str) -> list[int]:
-        """Create one collision-free body a texture in `client`; textures pass through PNG files in `folder`."""
-        made = []
-        for texture, (vertices, indices, uvs, normals) in self._faces.items():
-            if texture == _PALETTE:
-                image = palette(self._colours)
-                uvs = [((cell + 0.5) / len(self._colours), v) for cell, v in uvs]
-            else:
-                image = self.pictures[texture]
-            path = write_png(image, folder / f"{prefix}{len(made)}.png")
-            handle = pybullet.loadTexture(str(path), physicsClientId=client)
-            shape = pybullet.createVisualShape(
-                pybullet.GEOM_MESH, vertices=vertices, indices=indices, uvs=uvs, normals=normals,
-                physicsClientId=client,
-            )  # fmt: skip
-            body = int(pybullet.createMultiBody(0, -1, shape, physicsClientId=client))
-            pybullet.changeVisualShape(body, -1, textureUniqueId=handle, physicsClientId=client)
-            made.append(body)
-        return made
+
+def _fan(surface: Surface, corners: Sequence[Vec3], normals: Sequence[Vec3]) -> None:
+    first = len(surface.vertices)
+    surface.vertices.extend(corners)
+    surface.normals.extend(normals)
+    for k in range(1, len(corners) - 1):
+        surface.indices.extend((first, first + k, first + k + 1))
 
 
 def _normal(corners: Sequence[Vec3]) -> Vec3:
-    a, b, c = (np.asarray(corner) for corner in corners[:3])
-    n: NDArray[np.float64] = np.cross(b - a, c - a)
-    length = float(np.linalg.norm(n)) or 1.0
-    return (float(n[0]) / length, float(n[1]) / length, float(n[2]) / length)
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners[:3]
+    ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = sqrt(x * x + y * y + z * z) or 1.0
+    return (x / length, y / length, z / length)

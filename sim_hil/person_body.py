@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from math import cos, pi, sin
-from pathlib import Path
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from sim_hil.mesh import Frame, MeshBuilder
 from sim_hil.people import Appearance
+from sim_hil.world_stage import Stage
 
 _HIP_M, _SHOULDER_M, _THIGH_M = 0.90, 1.40, 0.43
 _HIP_Y_M, _SHOULDER_Y_M = 0.09, 0.225
@@ -21,9 +20,9 @@ def _darker(colour: tuple[int, int, int], share: float) -> tuple[int, int, int]:
     return (round(colour[0] * share), round(colour[1] * share), round(colour[2] * share))
 
 
-def _trunk(look: Appearance, k: float) -> MeshBuilder:
+def _trunk(look: Appearance, k: float, detail: float) -> MeshBuilder:
     """Pelvis to hair; origin on the floor below the hips."""
-    mesh, frame = MeshBuilder(), Frame()
+    mesh, frame = MeshBuilder(detail), Frame()
     torso = ((0.88, 0.10, 0.155), (1.05, 0.105, 0.15), (1.28, 0.125, 0.19), (1.40, 0.11, 0.20), (1.46, 0.06, 0.09))
     mesh.prism(frame, tuple(((0, 0, z * k), rx * k, ry * k) for z, rx, ry in torso), look.shirt)
     mesh.prism(frame, (((0, 0, 0.82 * k), 0.10 * k, 0.15 * k), ((0, 0, 0.93 * k), 0.105 * k, 0.16 * k)), look.trousers)
@@ -37,25 +36,25 @@ def _trunk(look: Appearance, k: float) -> MeshBuilder:
     return mesh
 
 
-def _thigh(look: Appearance, k: float) -> MeshBuilder:
-    mesh, frame = MeshBuilder(), Frame()
+def _thigh(look: Appearance, k: float, detail: float) -> MeshBuilder:
+    mesh, frame = MeshBuilder(detail), Frame()
     mesh.prism(
         frame, (((0, 0, -_THIGH_M * k), 0.062 * k, 0.058 * k), ((0, 0, 0.02), 0.088 * k, 0.08 * k)), look.trousers, 7
     )
     return mesh
 
 
-def _shin(look: Appearance, k: float) -> MeshBuilder:
-    mesh, frame = MeshBuilder(), Frame()
+def _shin(look: Appearance, k: float, detail: float) -> MeshBuilder:
+    mesh, frame = MeshBuilder(detail), Frame()
     shade = _darker(look.trousers, 0.93)
     mesh.prism(frame, (((0, 0, -0.41 * k), 0.048 * k, 0.045 * k), ((0, 0, 0.01), 0.062 * k, 0.058 * k)), shade, 7)
     mesh.box(frame, (0.05 * k, 0, -0.44 * k), (0.25 * k, 0.085 * k, 0.07 * k), look.shoes)
     return mesh
 
 
-def _arm(look: Appearance, k: float) -> MeshBuilder:
+def _arm(look: Appearance, k: float, detail: float) -> MeshBuilder:
     """Slightly bent arm, one piece: sleeve, forearm, hand."""
-    mesh, frame = MeshBuilder(), Frame()
+    mesh, frame = MeshBuilder(detail), Frame()
     elbow, wrist, tip = (0.015 * k, 0, -0.29 * k), (0.09 * k, 0, -0.52 * k), (0.11 * k, 0, -0.61 * k)
     mesh.prism(frame, ((elbow, 0.042 * k, 0.04 * k), ((0, 0, 0.02), 0.056 * k, 0.052 * k)), look.shirt, 6)
     mesh.prism(frame, ((wrist, 0.034 * k, 0.032 * k), (elbow, 0.042 * k, 0.04 * k)), _darker(look.shirt, 0.9), 6)
@@ -64,17 +63,17 @@ def _arm(look: Appearance, k: float) -> MeshBuilder:
 
 
 class PersonBody:
-    """One person's bodies in a renderer's client, put in place by `pose`."""
+    """One person's meshes on a stage, put in place by `pose`; `detail` below 1 is for people seen from afar."""
 
-    def __init__(self, client: int, folder: Path, look: Appearance, prefix: str) -> None:
-        self._client, self._k = client, look.scale
+    def __init__(self, stage: Stage, look: Appearance, detail: float = 1.0) -> None:
+        self._stage, self._k = stage, look.scale
         parts = (
-            _trunk(look, look.scale),
-            *(_thigh(look, look.scale) for _ in range(2)),
-            *(_shin(look, look.scale) for _ in range(2)),
-            *(_arm(look, look.scale) for _ in range(2)),
+            _trunk(look, look.scale, detail),
+            *(_thigh(look, look.scale, detail) for _ in range(2)),
+            *(_shin(look, look.scale, detail) for _ in range(2)),
+            *(_arm(look, look.scale, detail) for _ in range(2)),
         )
-        self.bodies = [part.bodies(client, folder, f"{prefix}{i}-")[0] for i, part in enumerate(parts)]
+        self._parts = [stage.add(part) for part in parts]
 
     def pose(self, row: NDArray[np.float64]) -> None:
         """Place the body for one row of People.render_rows()."""
@@ -97,12 +96,10 @@ class PersonBody:
 
     def hide(self) -> None:
         """Take the body out of every picture until the next `pose`."""
-        for body in self.bodies:
-            pybullet.resetBasePositionAndOrientation(
-                body, (0.0, 0.0, -1000.0), (0, 0, 0, 1), physicsClientId=self._client
-            )
+        for part in self._parts:
+            self._stage.hide(part)
 
     def _put(self, part: int, x: float, y: float, z: float, heading: float, pitch: float) -> None:
         cz, sz, cy, sy = cos(heading / 2), sin(heading / 2), cos(pitch / 2), sin(pitch / 2)
         turn = (-sz * sy, cz * sy, sz * cy, cz * cy)
-        pybullet.resetBasePositionAndOrientation(self.bodies[part], (x, y, z), turn, physicsClientId=self._client)
+        self._stage.place(self._parts[part], (x, y, z), turn)

@@ -25,6 +25,7 @@ from sim_hil.scene import Box, Scene
 from sim_hil.scene_terrain import ConvexPiece
 from sim_hil.sport import SportAction
 from sim_hil.world import build_scene
+from sim_hil.world_stage import BulletStage
 
 __all__ = ["PERSON_COLLISION_M", "ROBOTS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
 
@@ -119,9 +120,10 @@ class Simulation:
         self._labels.update((body, "person") for body in self._person_bodies)
         self._embodied = [-1] * bodies
         if self._gui:
-            build_scene(client, folder, scene)
+            stage = BulletStage(client, folder)
+            build_scene(stage, scene)
             looks = appearances(len(self._walkers), self._seed, scene.name)
-            self._looks = [PersonBody(client, folder, look, f"person{i}-") for i, look in enumerate(looks)]
+            self._looks = [PersonBody(stage, look) for look in looks]
         self._robot = self._load(robot, folder)
         self._place_people()
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import ceil, pi, sin
-from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from sim_hil import textures
 from sim_hil.mesh import Frame, MeshBuilder, Vec3
 from sim_hil.scene import Scene, SceneObject, Wall
 from sim_hil.textures import rgb
+from sim_hil.world_stage import Stage
 
 _PATCH_M = 2.0  # large surfaces are cut up: a face that reaches behind the camera costs precision
 _WALL_EDGE = (206, 200, 186)
@@ -160,8 +160,8 @@ def _wall(mesh: MeshBuilder, wall: Wall) -> None:
         mesh.box(frame, (end * length / 2, 0, height / 2), (0.01, thickness, height), _WALL_EDGE)
 
 
-def build_scene(client: int, folder: Path, scene: Scene) -> list[int]:
-    """Create everything of the scene that does not move in `client`; return the bodies."""
+def build_scene(stage: Stage, scene: Scene) -> None:
+    """Show everything of the scene that does not move."""
     mesh = MeshBuilder()
     mesh.picture("floor_tiles", textures.floor_tiles())
     mesh.picture("wall_wainscot", textures.wall_wainscot())
@@ -173,4 +173,4 @@ def build_scene(client: int, folder: Path, scene: Scene) -> list[int]:
         _wall(mesh, wall)
     for thing in scene.objects:
         _BUILDERS[thing.kind](mesh, thing)
-    return mesh.bodies(client, folder, "scene")
+    stage.add(mesh)
