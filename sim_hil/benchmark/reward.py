@@ -1,0 +1,47 @@
+"""The paper's reward, equation 5, as a pure function of one control step; weights and target speed from appendix D.
+
+The paper names the four terms but does not write them out. Ours: goal is 1 in the step that reaches it; progress is
+how much shorter the way to the goal became, m; collision is 1 in a step in which one begins; speed is how far the
+speed is off the target, m/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+
+
+@dataclass(frozen=True)
+class RewardWeights:
+    """w_g, w_p, w_c and w_s of equation 5, and the speed that costs nothing, m/s."""
+
+    goal: float = 400.0
+    progress: float = 5.0
+    collision: float = -100.0
+    speed: float = -0.1
+    target_speed_mps: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not all(isfinite(v) for v in (self.goal, self.progress, self.collision, self.speed, self.target_speed_mps)):
+            raise ValueError("reward: every weight must be finite")
+
+
+PAPER = RewardWeights()
+
+
+def reward(
+    *,
+    reached: bool,
+    distance_before_m: float,
+    distance_after_m: float,
+    collision_began: bool,
+    speed_mps: float,
+    weights: RewardWeights = PAPER,
+) -> float:
+    """Reward of one control step; distances are of the way left to the goal, before the step and after it."""
+    return (
+        weights.goal * float(reached)
+        + weights.progress * (distance_before_m - distance_after_m)
+        + weights.collision * float(collision_began)
+        + weights.speed * abs(speed_mps - weights.target_speed_mps)
+    )
