@@ -14,7 +14,6 @@ import pytest
 
 from sim_hil.camera import CameraWorld
 from sim_hil.people import RENDER_FIELDS
-from sim_hil.people import RENDER_FIELDS
 from sim_hil.scene import load_scene
 from sim_hil.simulation import Simulation
 from sim_hil.textures import sign
