@@ -7,7 +7,8 @@ free cells to 16 neighbours (off by at most 2.8 % before smoothing); a path is t
 from __future__ import annotations
 
 import itertools
-from math import ceil, floor, hypot
+from dataclasses import dataclass
+from math import ceil, cos, floor, hypot, sin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from sim_hil.scene import Box, Scene, Vec2
+from sim_hil.scene_terrain import Terrain
 
 Array = NDArray[np.float64]
 
@@ -63,6 +65,7 @@ class NavGrid:
         self.shape = (ceil((y1 - y0) / resolution_m), ceil((x1 - x0) / resolution_m))
         boxes = [box for _, box in scene.obstacles() if box.centre_m[2] - box.size_m[2] / 2 < height_m]
         self._clearances = self._measure(boxes, (x1, y1))
+        self._keep_off_edges(scene.terrain, max_step_m)
         self._free = self._clearances >= clearance_m - _HAIR_M
         if not self._free.any():
             raise ValueError(f"navigation grid: scene {scene.name} has no room for a clearance of {clearance_m} m")
@@ -109,28 +112,46 @@ class NavGrid:
             gaps[rows, columns] = np.minimum(gaps[rows, columns], _box_gaps(box, x, y))
         return gaps
 
+    def _keep_off_edges(self, terrain: tuple[Terrain, ...], max_step_m: float) -> None:
+        """Lower the clearances around where the ground rises or drops by more than a step."""
+        if not terrain:
+            return
+        ground = np.zeros(self.shape)
+        for piece in terrain:
+            corners = np.array(piece.corners())
+            (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
+            rows, columns = self._window((x0, y0), (x1, y1))
+            x, y = self._centres(rows, columns)
+            dx, dy = x - piece.position_m[0], y - piece.position_m[1]
+            c, s = cos(piece.heading_rad), sin(piece.heading_rad)
+            along, across = c * dx + s * dy, c * dy - s * dx
+            inside = (np.abs(along) <= piece.size_m[0] / 2) & (np.abs(across) <= piece.size_m[1] / 2)
+            profile = np.array(piece.profile())
+            height = piece.position_m[2] + np.interp(along, profile[:, 0], profile[:, 1])
+            ground[rows, columns] = np.where(inside, np.maximum(ground[rows, columns], height), ground[rows, columns])
+        edge = np.zeros(self.shape, dtype=bool)
+        for axis in (0, 1):
+            steep = np.abs(np.diff(ground, axis=axis)) > max_step_m
+            before, after = [slice(None)] * 2, [slice(None)] * 2
+            before[axis], after[axis] = slice(None, -1), slice(1, None)
+            edge[tuple(before)] |= steep
+            edge[tuple(after)] |= steep
+        if edge.any():
+            # An edge lies between two cells, both of which are marked: half a cell from either centre.
+            gaps = distance_transform_edt(~edge) * self.resolution_m + 0.5 * self.resolution_m
+            gaps[edge] = 0.5 * self.resolution_m
+            self._clearances = np.minimum(self._clearances, gaps)
+
     def _snaps(self) -> NDArray[np.int32]:
         """[2, rows, columns]: row and column of the free cell nearest to each."""
         nearest = distance_transform_edt(~self._free, return_distances=False, return_indices=True)
         return np.asarray(nearest, dtype=np.int32)
 
     def _graph(self) -> csr_matrix:
-        ids = np.full(self.shape, -1, dtype=np.int32)
-        ids[self._free] = np.arange(int(self._free.sum()), dtype=np.int32)
-        self._ids = ids
+        self._ids, source, target, length = links(self._free, self.resolution_m)
         self._cells = np.argwhere(self._free)
-        sources, targets, lengths = [], [], []
-        for columns, rows, passed in _STEPS:
-            there = _shifted(ids, rows, columns)
-            linked = (ids >= 0) & (there >= 0)
-            for side_columns, side_rows in passed:
-                linked &= _shifted(ids, int(side_rows), int(side_columns)) >= 0
-            sources.append(ids[linked])
-            targets.append(there[linked])
-            lengths.append(np.full(len(sources[-1]), hypot(columns, rows) * self.resolution_m))
-        data, source, target = np.concatenate(lengths), np.concatenate(sources), np.concatenate(targets)
         count = len(self._cells)
-        return csr_matrix((data, (source, target)), shape=(count, count))
+        return csr_matrix((length, (source, target)), shape=(count, count))
 
     def cell(self, x_m: float, y_m: float) -> tuple[int, int]:
         """Row and column of the cell that holds a point (the nearest one for a point off the floor)."""
@@ -199,18 +220,20 @@ class NavGrid:
             field[self._free] = tree[0]
         return field
 
-    def cost_field(self, goal: Vec2, price: Array) -> Array:
-        """Like `distance_field`, every metre costing the mean price [rows, columns] of the cells it joins."""
-        field = np.full(self.shape, np.inf)
-        point = self.nearest_free(*goal)
-        if point is not None:
-            row, column = self._free_cell(*point)
+    def cost_tree(self, goal: Vec2, price: Array) -> CostTree:
+        """Cheapest ways to the goal, every metre costing the mean price [rows, columns] of the cells it joins."""
+        field, onwards = np.full(self.shape, np.inf), np.full(self.shape, -1, dtype=np.int64)
+        if self.nearest_free(*goal) is not None:
+            joins = self._links.tocoo()
             cells = price[self._free]
-            links = self._links.tocoo()
-            data = links.data * 0.5 * (cells[links.row] + cells[links.col])
-            priced = csr_matrix((data, (links.row, links.col)), shape=links.shape)
-            field[self._free] = dijkstra(priced, directed=False, indices=int(self._ids[row, column]))
-        return field
+            data = joins.data * 0.5 * (cells[joins.row] + cells[joins.col])
+            priced = csr_matrix((data, (joins.row, joins.col)), shape=joins.shape)
+            start = int(self._ids[self._free_cell(*goal)])
+            costs, nodes = dijkstra(priced, directed=False, indices=start, return_predecessors=True)
+            field[self._free] = costs
+            flat = self._cells[:, 0] * self.shape[1] + self._cells[:, 1]
+            onwards[self._free] = np.where(nodes >= 0, flat[nodes], -1)
+        return CostTree(field, onwards)
 
     def field_at(self, field: Array, x_m: float, y_m: float) -> float:
         """A field's value at a point, from the free cells around it; inf where there is none within 1 m."""
@@ -299,6 +322,35 @@ class NavGrid:
             else:
                 high = middle
         return best
+
+
+@dataclass(frozen=True)
+class CostTree:
+    """Cheapest ways to one goal: `cost` [rows, columns], inf out of reach; `onwards` each cell's next, flat, or -1."""
+
+    cost: Array
+    onwards: NDArray[np.int64]
+
+
+def links(
+    free: NDArray[np.bool_], resolution_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], Array]:
+    """Number the free cells and join each to its 16 neighbours: ids [rows, columns] (-1: not free), from, to, length m.
+
+    Each pair of cells is there once.
+    """
+    ids = np.full(free.shape, -1, dtype=np.int32)
+    ids[free] = np.arange(int(free.sum()), dtype=np.int32)
+    sources, targets, lengths = [], [], []
+    for columns, rows, passed in _STEPS:
+        there = _shifted(ids, rows, columns)
+        linked = (ids >= 0) & (there >= 0)
+        for side_columns, side_rows in passed:
+            linked &= _shifted(ids, int(side_rows), int(side_columns)) >= 0
+        sources.append(ids[linked])
+        targets.append(there[linked])
+        lengths.append(np.full(len(sources[-1]), hypot(columns, rows) * resolution_m))
+    return ids, np.concatenate(sources), np.concatenate(targets), np.concatenate(lengths)
 
 
 def length_m(points: list[Vec2]) -> float:

@@ -11,6 +11,7 @@ import pytest
 
 from sim_hil.nav_grid import NavGrid, length_m
 from sim_hil.scene import Scene, SceneObject, Wall, load_scene
+from sim_hil.scene_terrain import Terrain
 
 CLEARANCE_M = 0.4
 
@@ -133,10 +134,27 @@ def test_a_distance_field_falls_to_zero_at_the_goal_and_is_infinite_out_of_reach
 
 def test_a_price_moves_the_cheapest_way_but_not_what_is_free() -> None:
     grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
-    plain = grid.cost_field((8.0, 0.0), np.ones(grid.shape))
-    assert np.allclose(plain, grid.distance_field((8.0, 0.0)))
-    doubled = grid.cost_field((8.0, 0.0), np.full(grid.shape, 2.0))
-    assert np.allclose(doubled[grid.free], 2 * plain[grid.free])
+    plain = grid.cost_tree((8.0, 0.0), np.ones(grid.shape))
+    assert np.allclose(plain.cost, grid.distance_field((8.0, 0.0)))
+    doubled = grid.cost_tree((8.0, 0.0), np.full(grid.shape, 2.0))
+    assert np.allclose(doubled.cost[grid.free], 2 * plain.cost[grid.free])
+
+
+@pytest.mark.parametrize(("rise", "expected"), [(0.04, True), (0.15, False)])
+def test_a_platform_too_high_to_step_on_is_kept_off(rise: float, expected: bool) -> None:
+    step = Terrain("step", "platform", (0.0, 0.0, 0.0), 0.0, (4.0, 9.9), rise, "concrete")
+    grid = NavGrid(replace(hall(), terrain=(step,)), clearance_m=CLEARANCE_M)
+    assert (grid.path((-6.0, 0.0), (6.0, 0.0)) is not None) == expected
+    assert grid.is_free(0.0, 0.0)
+
+
+def test_a_platform_is_reached_by_its_ramp() -> None:
+    platform = Terrain("platform", "platform", (3.0, 0.0, 0.0), 0.0, (4.0, 6.0), 0.2, "concrete")
+    ramp = Terrain("ramp", "ramp", (0.0, 1.0, 0.0), 0.0, (2.0, 1.5), 0.2, "concrete")
+    grid = NavGrid(replace(hall(), terrain=(platform, ramp)), clearance_m=CLEARANCE_M)
+    path = grid.path((-6.0, 0.0), (3.0, -2.0))
+    assert path is not None and length_m(path) > hypot(9.0, 2.0) + 0.1
+    assert NavGrid(replace(hall(), terrain=(platform,)), clearance_m=CLEARANCE_M).path((-6.0, 0.0), (3.0, 0.0)) is None
 
 
 def test_a_scene_without_room_is_refused() -> None:
