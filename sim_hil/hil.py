@@ -168,7 +168,7 @@ def _open(args: argparse.Namespace) -> tuple[HilLoop, str]:
         domain=args.domain,
         interface=args.interface,
     )
-    simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui)
+    simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui, robot=args.robot)
     try:
         front_end = open_front_end(args.protocol, simulation, options)
     except BaseException:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -36,6 +36,9 @@ class Server:
     def requests(self) -> Iterator[Received]:
         waiting, self.waiting = self.waiting, []
         yield from waiting
+
+    def answer(self, request: Received, handle: Callable[[int, str], Answer]) -> Answer:
+        return handle(request.api_id, request.parameter)
 
     def reply(self, request: Received, code: int, data: str = "", binary: bytes = b"") -> None:
         self.answers.append((request.api_id, binary))

@@ -62,10 +62,7 @@ class SportFaults:
             self._held, self._late_s, self._wants_move = request, self._wants_move, None
             return
         now_ns = time.monotonic_ns()
-        if request.api_id == ids.API_VERSION:
-            server.reply(request, ids.OK, ids.SERVICE_VERSION)
-            return
-        answer = handle(request.api_id, request.parameter)
+        answer = server.answer(request, handle)
         slow = self._on.get("stop-unanswered") if request.api_id == ids.STOP_MOVE else None
         if slow is not None:
             self._unanswered.append((now_ns + round(slow.number("delay_s") * 1e9), request, answer))

@@ -3,35 +3,50 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.geometry import SE2
 from firmware_bridge.config import DdsConfig
 from firmware_bridge.unitree import ids
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.dds import Bus, take_each
 from sim_hil.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.go2 import Go2, RobotTruth
 from sim_hil.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.simulation import Simulation
-from sim_hil.unitree import sport
+from sim_hil.unitree.avoidance import OBSTACLES_AVOID_VERSION, ObstaclesAvoid, Pilot, RangeFinder
+from sim_hil.unitree.behaviour import Go2Behaviour
 from sim_hil.unitree.camera_process import CameraProcess
 from sim_hil.unitree.drifting import DriftingOdometry
+from sim_hil.unitree.idl_command import LowCmd_
+from sim_hil.unitree.leases import Lease
+from sim_hil.unitree.low_level import LOW_COMMAND_TOPIC
 from sim_hil.unitree.remote import Remote
-from sim_hil.unitree.service import Received, ServiceServer
+from sim_hil.unitree.service import Answer, LeaseServer, Received, ServiceServer
+from sim_hil.unitree.sport import CommandLog, api_name
+from sim_hil.unitree.sport_service import UNLEASED, SportService
 from sim_hil.unitree.state import OdometryFrame, StatePublishers
+from sim_hil.unitree.switching import MotionSwitcher, RobotState
 
 if TYPE_CHECKING:
     from sim_hil.faults.injector import FaultInjector
+
+
+PILOT_HZ: Final = 20  # how often the surroundings are looked at
 
 
 class UnitreeFrontEnd:
     """A simulated Go2 answering its maker's protocol. Raises DdsError, OSError or ValueError when it cannot."""
 
     def __init__(self, simulation: Simulation, options: FrontEndOptions, dds: DdsConfig) -> None:
+        if not isinstance(simulation.robot, Go2):
+            raise FrontEndError(f"unitree: expected a Go2, found a {type(simulation.robot).__name__}")
         self._simulation = simulation
+        self._robot = simulation.robot
         self._dds = dds
         self._faults: FaultInjector | None = None
         self._bus = Bus(dds)
@@ -44,24 +59,55 @@ class UnitreeFrontEnd:
             state_length=len(simulation.render_state()),
             faults=options.faults is not None,
         )
-        self._sport = ServiceServer(self._bus, ids.SPORT_SERVICE)
-        self._robot_state = ServiceServer(self._bus, sport.ROBOT_STATE_SERVICE)
-        self._motion_switcher = ServiceServer(self._bus, sport.MOTION_SWITCHER_SERVICE)
-        self._servers = (self._sport, self._robot_state, self._motion_switcher)
-        self._waitset = self._bus.waitset(*(server.reader for server in self._servers))
+        self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
+        self._robot.sport = self._behaviour  # type: ignore[assignment]
+        self._odometry = _odometry(options)
+        self._range_finder = RangeFinder([box for _, box in options.scene.obstacles()])
+        self._pilot = Pilot(self._behaviour.request_move, self._free_m)
+        self._steps_a_look = round(simulation.rate_hz / PILOT_HZ)
+        self._open_services()
         remote = Remote()
         if options.faults is not None:
             self._faults = self._injector(options.faults, remote)
         self._publishers = StatePublishers(
             self._bus,
-            _odometry(options),
-            round(1 / Simulation.DT_S),
+            self._odometry,
+            simulation.rate_hz,
             remote=remote,
             faults=None if self._faults is None else self._faults.states,
         )
-        self._log = sport.CommandLog()
+        self._log = CommandLog()
+        self._listened = False
         self._video_frames = 0
         self._video_malformed = 0
+
+    def _open_services(self) -> None:
+        lease = Lease()
+        self._sport = ServiceServer(self._bus, ids.SPORT_SERVICE, lease=lease, unleased=UNLEASED)
+        self._leases = LeaseServer(self._bus, ids.SPORT_SERVICE, lease)
+        self._sport_service = SportService(self._behaviour, self._pilot)
+        switcher = MotionSwitcher(self._behaviour)
+        avoid = ObstaclesAvoid(self._pilot, self._reported_pose)
+        self._others: tuple[tuple[ServiceServer, Callable[[int, str], Answer]], ...] = (
+            (ServiceServer(self._bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
+            (ServiceServer(self._bus, ids.MOTION_SWITCHER_SERVICE), switcher.handle),
+            (
+                ServiceServer(self._bus, ids.OBSTACLES_AVOID_SERVICE, version=OBSTACLES_AVOID_VERSION),
+                avoid.handle,
+            ),
+        )
+        self._servers = (self._sport, self._leases, *(server for server, _ in self._others))
+        self._low_commands = self._bus.reader(LOW_COMMAND_TOPIC, LowCmd_)
+        self._waitset = self._bus.waitset(*(server.reader for server in self._servers))
+
+    def _free_m(self, direction_rad: float) -> float:
+        (x_m, y_m, _), heading_rad = self._simulation.pose()
+        return self._range_finder.free_m(x_m, y_m, heading_rad + direction_rad, self._simulation.people())
+
+    def _reported_pose(self) -> SE2:
+        (x_m, y_m, z_m), heading_rad = self._simulation.pose()
+        x, y, _ = self._odometry.position((x_m, y_m, z_m))
+        return SE2(x, y, self._odometry.rpy((0.0, 0.0, heading_rad))[2])
 
     def _injector(self, path: Path, remote: Remote) -> FaultInjector:
         # Imported here: without --faults the code that makes anything go wrong is not even loaded.
@@ -89,8 +135,10 @@ class UnitreeFrontEnd:
     def serve(self) -> list[Heard]:
         """Answer what is waiting at every service; the camera's are told of by its process."""
         received = self._serve_sport()
-        received += self._robot_state.serve(sport.handle_robot_state)
-        received += self._motion_switcher.serve(sport.handle_motion_switcher)
+        self._leases.serve_leases()
+        for server, handle in self._others:
+            received += server.serve(handle)
+        self._take_low_command()
         for event in self._camera.events():
             received += self._of_camera(event)
         for request in received:
@@ -98,14 +146,21 @@ class UnitreeFrontEnd:
         return [_heard(request) for request in received]
 
     def _serve_sport(self) -> list[Received]:
-        def handle(api_id: int, parameter: str) -> tuple[int, str]:
-            return sport.handle_sport(self._simulation, api_id, parameter)
-
         if self._faults is None:
-            return self._sport.serve(handle)
+            return self._sport.serve(self._sport_service.handle)
         self._faults.poll(time.monotonic_ns())
         self._publishers.overdue()
-        return self._faults.sport.serve(self._sport, handle)
+        return self._faults.sport.serve(self._sport, self._sport_service.handle)
+
+    def _take_low_command(self) -> None:
+        """The newest low command; what was said while the sport controller had the joints is thrown away."""
+        if not self._behaviour.released:
+            self._listened = False
+            return
+        for command in take_each(self._low_commands):
+            if self._listened:
+                self._behaviour.low_level.take(command, self._behaviour.time_s)
+        self._listened = True
 
     def _of_camera(self, event: dict[str, object]) -> list[Received]:
         if event["event"] == "frame":
@@ -125,10 +180,14 @@ class UnitreeFrontEnd:
         return []
 
     def publish(self, step: int, stamp_s: float) -> None:
-        """Write the state topics that are due."""
+        """Write the state topics that are due, and look out for obstacles."""
+        if step % self._steps_a_look == 0:
+            self._pilot.step(stamp_s, self._reported_pose)
         due = self._publishers.due(step)
         if due:
-            self._publishers.publish(due, self._simulation.truth(), stamp_s)
+            truth = self._simulation.truth()
+            assert isinstance(truth, RobotTruth)
+            self._publishers.publish(due, truth, stamp_s, self._behaviour.progress)
 
     def show(self, render_state: NDArray[np.float64]) -> None:
         """Hand the camera process what it renders from now on."""
@@ -142,7 +201,8 @@ class UnitreeFrontEnd:
 
     def summary(self) -> dict[str, object]:
         """What was heard and sent."""
-        malformed = self._video_malformed + sum(server.malformed for server in self._servers)
+        malformed = self._video_malformed + self._behaviour.low_level.rejected
+        malformed += sum(server.malformed for server in self._servers)
         return {
             "wire": {**self._log.summary(), "malformed": malformed},
             "video_frames": self._video_frames,
@@ -166,5 +226,5 @@ def _odometry(options: FrontEndOptions) -> OdometryFrame:
 
 
 def _heard(request: Received) -> Heard:
-    name = sport.api_name(request.service, request.api_id)
+    name = api_name(request.service, request.api_id)
     return Heard(request.received_ns, request.service, request.api_id, name, request.parameter)

@@ -1,19 +1,13 @@
-"""What the services of the simulated Go2 do with their requests: sport, robot_state, motion_switcher."""
+"""The sport service's plain actions and velocities, the names of all requests, and a log of what was commanded."""
 
 from __future__ import annotations
 
-import json
-import math
 from typing import Final, Protocol
 
 from firmware_bridge.unitree import ids
 from sim_hil.sport import SportAction
+from sim_hil.unitree.parameters import parse_numbers, parse_table
 from sim_hil.unitree.service import Answer, Received
-
-ROBOT_STATE_SERVICE: Final = "robot_state"
-MOTION_SWITCHER_SERVICE: Final = "motion_switcher"
-_SERVICE_LIST: Final = 1003  # of robot_state
-_CHECK_MODE: Final = 1001  # of motion_switcher
 
 _ACTIONS: Final = {
     ids.DAMP: SportAction.DAMP,
@@ -26,12 +20,25 @@ _ACTIONS: Final = {
 # A request that is not here leaves the velocity in force, or is counted as if it did: BalanceStand, a RecoveryStand on
 # its feet and an unknown id change nothing, and StandUp is not a way to stop a robot.
 _ENDS_MOTION: Final = frozenset({ids.STOP_MOVE, ids.DAMP, ids.STAND_DOWN})
+_VELOCITY_MODE: Final = 0  # of an obstacles_avoid Move; the others are poses
+AVOID_MOVE: Final = 1003
 _API_NAMES: Final = {
-    ids.SPORT_SERVICE: ids.SPORT_API_NAMES,
+    ids.SPORT_SERVICE: {
+        **ids.SPORT_API_NAMES,
+        1007: "Euler", 1009: "Sit", 1010: "RiseSit", 1015: "SpeedLevel", 1016: "Hello", 1017: "Stretch",
+        1020: "Content", 1022: "Dance1", 1023: "Dance2", 1027: "SwitchJoystick", 1028: "Pose", 1061: "StaticWalk",
+        1062: "TrotRun", 1063: "EconomicGait", 2045: "FreeWalk", 2048: "FreeAvoid", 2049: "ClassicWalk",
+        2054: "AutoRecoverySet", 2055: "AutoRecoveryGet", 2058: "SwitchAvoidMode",
+    },
     ids.VIDEO_SERVICE: {ids.GET_IMAGE_SAMPLE: "GetImageSample"},
-    ROBOT_STATE_SERVICE: {_SERVICE_LIST: "ServiceList"},
-    MOTION_SWITCHER_SERVICE: {_CHECK_MODE: "CheckMode"},
-}
+    ids.ROBOT_STATE_SERVICE: {1001: "ServiceSwitch", 1002: "SetReportFreq", 1003: "ServiceList"},
+    ids.MOTION_SWITCHER_SERVICE: {
+        1001: "CheckMode", 1002: "SelectMode", 1003: "ReleaseMode", 1004: "SetSilent", 1005: "GetSilent",
+    },
+    ids.OBSTACLES_AVOID_SERVICE: {
+        1001: "SwitchSet", 1002: "SwitchGet", AVOID_MOVE: "Move", 1004: "UseRemoteCommandFromApi",
+    },
+}  # fmt: skip
 
 
 class Robot(Protocol):
@@ -53,15 +60,7 @@ def api_name(service: str, api_id: int) -> str:
 
 def parse_move(parameter: str) -> tuple[float, float, float] | None:
     """Velocity of a Move's parameter `{"x","y","z"}`; None unless it is three finite numbers."""
-    try:
-        table = json.loads(parameter)
-    except (ValueError, RecursionError):
-        return None
-    values = [table.get(key) for key in ("x", "y", "z")] if isinstance(table, dict) else []
-    numbers = [float(v) for v in values if isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < 1e9]
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        return None
-    return numbers[0], numbers[1], numbers[2]
+    return parse_numbers(parameter, "x", "y", "z")  # type: ignore[return-value]
 
 
 def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
@@ -76,23 +75,8 @@ def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
     return (robot.sport(action), "") if action is not None else (ids.ERROR_NOT_IMPLEMENTED, "")
 
 
-def handle_robot_state(api_id: int, _parameter: str) -> Answer:
-    """robot_state: which services run; switching them off is not simulated."""
-    if api_id != _SERVICE_LIST:
-        return ids.ERROR_NOT_IMPLEMENTED, ""
-    names = ("sport_mode", "video_hub", "robot_state", "motion_switcher")
-    return ids.OK, json.dumps([{"name": name, "status": 1, "protect": 0} for name in names])
-
-
-def handle_motion_switcher(api_id: int, _parameter: str) -> Answer:
-    """motion_switcher: the sport controller is active; releasing it is not simulated."""
-    if api_id != _CHECK_MODE:
-        return ids.ERROR_NOT_IMPLEMENTED, ""
-    return ids.OK, json.dumps({"form": "0", "name": "normal"})
-
-
 class CommandLog:
-    """What has been commanded over the sport service, for the result: the sniffer's truth, not the commander's."""
+    """What has been commanded over sport and obstacles_avoid, for the result: what was heard, not what was meant."""
 
     def __init__(self) -> None:
         self.commands = 0
@@ -102,15 +86,25 @@ class CommandLog:
 
     def note(self, request: Received) -> None:
         """Count one received request."""
-        if request.service != ids.SPORT_SERVICE or request.api_id == ids.API_VERSION:
+        if request.api_id == ids.API_VERSION:
             return
+        if request.service == ids.OBSTACLES_AVOID_SERVICE and request.api_id == AVOID_MOVE:
+            mode = (parse_table(request.parameter) or {}).get("mode", _VELOCITY_MODE)
+            velocity = parse_numbers(request.parameter, "x", "y", "yaw") if mode == _VELOCITY_MODE else None
+            self._moved(request, velocity)  # type: ignore[arg-type]
+        elif request.service == ids.SPORT_SERVICE:
+            if request.api_id == ids.MOVE:
+                self._moved(request, parse_move(request.parameter))
+                return
+            self.last_command = api_name(request.service, request.api_id)
+            if request.api_id in _ENDS_MOTION:
+                self._at_zero = True
+
+    def _moved(self, request: Received, velocity: tuple[float, float, float] | None) -> None:
         self.last_command = api_name(request.service, request.api_id)
-        if request.api_id == ids.MOVE:
-            self.commands += 1
-            self.last_move = parse_move(request.parameter)
-            self._at_zero = self.last_move is not None and not any(self.last_move)
-        elif request.api_id in _ENDS_MOTION:
-            self._at_zero = True
+        self.commands += 1
+        self.last_move = velocity
+        self._at_zero = velocity is not None and not any(velocity)
 
     def summary(self) -> dict[str, object]:
         """The `wire` part of the result; a robot that was never told to move was last told zero."""

@@ -1,6 +1,7 @@
 """The simulated Go2's state topics: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`.
 
-And `rt/wirelesscontroller` at 100 Hz, the remote that nobody touches.
+And `rt/wirelesscontroller` at 100 Hz, the remote that nobody touches, and `rt/odommodestate`, the sport state again,
+under the name by which makers' other robots and bindings know the odometry.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 WIRELESS_HZ: Final = 100  # the maker's MuJoCo simulator
 SPORT_STATE_HZ: Final = 50
 LOW_STATE_HZ: Final = 500
+ODOMETRY_TOPIC: Final = "rt/odommodestate"
 LF_HZ: Final = 20  # the maker names no number; owners report 15 to 20
 _MATCH_CHECK_HZ: Final = 10
 _MOTORS: Final = 20
@@ -92,7 +94,7 @@ def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
     )
 
 
-def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame) -> SportModeState_:
+def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame, progress: float = 0.0) -> SportModeState_:
     """`rt/sportmodestate`: position and velocity in the odometry frame, as the maker's MuJoCo simulator has them."""
     seconds = int(truth.time_s)
     return SportModeState_(
@@ -100,7 +102,7 @@ def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame) -> SportModeSta
         error_code=0,
         imu_state=imu_state(truth, odometry),
         mode=truth.mode,
-        progress=0.0,
+        progress=progress,
         gait_type=truth.gait_type,
         foot_raise_height=_FOOT_RAISE_M,
         position=odometry.position(truth.position_m),
@@ -233,6 +235,7 @@ class StatePublishers:
         self._sport = (
             periodic(ids.SPORT_STATE_TOPIC, SportModeState_, SPORT_STATE_HZ, always=True),  # its rate is reported
             periodic("rt/lf/sportmodestate", SportModeState_, LF_HZ),
+            periodic(ODOMETRY_TOPIC, SportModeState_, SPORT_STATE_HZ),
         )
         self._low = (
             periodic(ids.LOW_STATE_TOPIC, LowState_, LOW_STATE_HZ),
@@ -244,14 +247,14 @@ class StatePublishers:
         """Which topics want a sample after this physics step; hand the list to `publish`."""
         return [topic for topic in (*self._sport, *self._low, self._wireless) if topic.due(step)]
 
-    def publish(self, due: list[_Periodic], truth: RobotTruth, stamp_s: float) -> None:
-        """Write one instant to the topics that are due; `stamp_s` is the robot's own clock."""
+    def publish(self, due: list[_Periodic], truth: RobotTruth, stamp_s: float, progress: float = 0.0) -> None:
+        """Write one instant to the topics that are due; `stamp_s` is the robot's own clock, `progress` of a show."""
         truth = replace(truth, time_s=stamp_s)
         sport = [topic for topic in due if topic in self._sport]
         if sport:
             self._odometry.update(truth)
             self._empty_battery(truth)
-            self._write_sport(sport, sport_mode_state(truth, self._odometry))
+            self._write_sport(sport, sport_mode_state(truth, self._odometry, progress))
         low = [topic for topic in due if topic in self._low]
         if low:
             self._write_low(low, truth)
