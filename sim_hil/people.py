@@ -1,285 +1,268 @@
-"""Walking people: to and fro along the scene's routes, giving way to the robot and to each other; no physics engine.
+"""People of a scene: they walk to places, stand, sit, queue, go in groups, and give way to each other and the robot.
 
-A simple social rule instead of a planner: keep to the route, slow down for whatever is close ahead, step aside to the
-freer side (to the right when in doubt, so that two people who meet do not mirror each other), stop rather than push,
-turn back when blocked for long. Velocities change smoothly; a person never enters the robot's or a wall's clearance.
+Thirty times a second everybody moves with limited acceleration towards the velocity picked last, and nobody gets into
+a wall, another person or the robot; ten times a second they look around, decide and pick. No physics engine.
 """
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin
+from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim_hil.scene import Box, Route, Scene, Vec2
+from sim_hil.crowd_map import BODY_RADIUS_M, CrowdMap
+from sim_hil.crowd_plans import Plans
+from sim_hil.crowd_senses import RobotSeen, RobotWatch, notice
+from sim_hil.crowd_state import Array, Crowd, Doing, Ints
+from sim_hil.crowd_steering import Nearby, choose
+from sim_hil.people_looks import Appearance, appearances
+from sim_hil.scene import Scene
 
-Array = NDArray[np.float64]
+__all__ = [
+    "GESTURES", "PERSON_HEIGHT_M", "PERSON_RADIUS_M", "RENDER_FIELDS", "UPDATE_HZ", "Appearance", "People",
+    "appearances",
+]  # fmt: skip
+
 UPDATE_HZ = 30
-PERSON_RADIUS_M = 0.22
+PERSON_RADIUS_M = BODY_RADIUS_M
 PERSON_HEIGHT_M = 1.72
-STRIDE_M = 1.35  # distance of one full gait cycle (two steps)
-# x m, y m, heading rad, gait phase in [0, 1), swing amplitude in [0, 1], ground z m, sitting 0..1, gesture (GESTURES)
+# x m, y m, heading rad, gait phase in [0, 1), swing amplitude, ground z m, sitting 0..1, gesture (index of GESTURES)
 RENDER_FIELDS = 8
 GESTURES = ("none", "talking", "phone")
 
-_ROBOT_HALF_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
-_ROBOT_CLEARANCE_M = 0.52
-_WALL_CLEARANCE_M = 0.28
-_PERSON_CLEARANCE_M = 0.55
-_LOOK_AHEAD_M = 2.2
-_BLOCKED_S = 4.0
+_DECIDE_EVERY = 3  # steps
+_STAGGER_FROM = 40  # more people than this decide in turn, a third of them a step
 _START_CLEAR_M = 2.5  # nobody starts closer to the robot than this
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """How a person looks: colours as RGB 0..255, and a scale of body height."""
-
-    shirt: tuple[int, int, int]
-    trousers: tuple[int, int, int]
-    skin: tuple[int, int, int]
-    hair: tuple[int, int, int]
-    shoes: tuple[int, int, int]
-    scale: float
-
-
-_SHIRTS = ((188, 42, 40), (36, 88, 160), (232, 196, 70), (60, 130, 80), (235, 235, 230), (110, 60, 140), (225, 120, 40))
-_TROUSERS = ((38, 44, 62), (70, 68, 64), (112, 92, 66), (28, 28, 30), (58, 82, 118))
-_SKINS = ((241, 200, 170), (214, 160, 120), (160, 108, 74), (104, 68, 46))
-_HAIRS = ((30, 24, 20), (86, 56, 30), (150, 110, 60), (120, 120, 122))
-
-
-def appearances(count: int, seed: int, scene_name: str = "") -> list[Appearance]:
-    """Looks of the first `count` people of a seed in a scene: the same in the physics and in the camera process."""
-    rng = np.random.default_rng((seed, 11))
-    shirts = rng.permutation(len(_SHIRTS))
-    people = []
-    for index in range(count):
-        trousers, skin, hair = (int(rng.integers(len(pool))) for pool in (_TROUSERS, _SKINS, _HAIRS))
-        shirt = _SHIRTS[int(shirts[index % len(_SHIRTS)])]
-        scale = float(rng.uniform(0.93, 1.06))
-        people.append(Appearance(shirt, _TROUSERS[trousers], _SKINS[skin], _HAIRS[hair], (24, 22, 22), scale))
-    return people
-
-
-class _Walker:
-    """One person's motion."""
-
-    def __init__(
-        self, route: Route, along: float, forward: bool, speed_mps: float, lane_m: float, phase: float
-    ) -> None:
-        self.points = [_shift(route.points_m, index, lane_m) for index in range(len(route.points_m))]
-        self.x, self.y, self.next = _place(self.points, along, forward)
-        self.step = 1 if forward else -1
-        self.speed_mps = speed_mps
-        self.vx = self.vy = 0.0
-        target = self.points[self.next]
-        self.heading = atan2(target[1] - self.y, target[0] - self.x)
-        self.phase = phase
-        self.amplitude = 0.0
-        self.blocked_s = 0.0
-        self.side = 0.0  # the side chosen for passing what is ahead: +1 left, -1 right
-
-    def turn_back(self) -> None:
-        self.step = -self.step
-        self.next = min(max(self.next + self.step, 0), len(self.points) - 1)
-        self.blocked_s = 0.0
-
-
-def _shift(points: tuple[Vec2, ...], index: int, lane_m: float) -> Vec2:
-    """A route's point moved sideways: people on one route do not walk in single file."""
-    before, after = points[max(index - 1, 0)], points[min(index + 1, len(points) - 1)]
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    norm = hypot(dx, dy) or 1.0
-    return (points[index][0] - dy / norm * lane_m, points[index][1] + dx / norm * lane_m)
-
-
-def _place(points: list[Vec2], along: float, forward: bool) -> tuple[float, float, int]:
-    """Position at the fraction `along` of the polyline, and the index of the point to walk to next."""
-    lengths = [hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(points)]
-    rest = along * sum(lengths)
-    for index, length in enumerate(lengths):
-        if rest <= length or index == len(lengths) - 1:
-            share = min(rest / length, 1.0)
-            a, b = points[index], points[index + 1]
-            return a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share, index + 1 if forward else index
-        rest -= length
-    raise AssertionError("a route has at least one segment")
+_NEIGHBOURS, _NEIGHBOURS_M = 8, 5.0
+_TOUCH_M, _CLOSE_M = 0.50, 0.85  # between the middles of two people: steered for, and liked
+_MATES_TOUCH_M, _MATES_CLOSE_M = 0.48, 0.60
+_SQUEEZE_TOUCH_M, _SQUEEZE_CLOSE_M = 0.45, 0.55
+_BODIES_M = 0.45  # two people are never closer
+_ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
+_ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
+_WALL_M = 0.22
+_SPEED_UP_MPS2, _BRAKE_MPS2 = 1.8, 3.5
+_FASTEST_MPS = 1.9
+_TURN_RADPS = 2.8
+_STEP_PER_ROOT_SPEED = 0.6245  # step length m = this * sqrt(speed): a walk ratio of 0.0065 m min (Sekiya et al. 1996)
+_FULL_STEP_M = 0.71  # of an amplitude of 1
 
 
 class People:
-    """All walkers of a scene. Deterministic per seed; `step` once every 1/UPDATE_HZ seconds of simulation time."""
+    """Everybody in a scene. Deterministic per seed; `step` once every 1/UPDATE_HZ seconds of simulation time.
+
+    Raises ValueError when the scene has no room for `count` people. Nobody starts within 2.5 m of the scene's start.
+    """
 
     def __init__(self, scene: Scene, count: int, seed: int) -> None:
         if count < 0:
             raise ValueError(f"people: expected 0 or more, found {count}")
-        if count and not scene.routes:
-            raise ValueError(f"people: scene {scene.name} has no routes to walk on")
         rng = np.random.default_rng((seed, 7))
-        order = rng.permutation(len(scene.routes)) if scene.routes else []
-        self._boxes = [box for _, box in scene.obstacles()]
-        self._walkers: list[_Walker] = []
-        for index in range(count):
-            route = scene.routes[int(order[index % len(order)])]
-            self._walkers.append(self._spawn(rng, scene, route))
-
-    def _spawn(self, rng: np.random.Generator, scene: Scene, route: Route) -> _Walker:
-        for _ in range(200):
-            walker = _Walker(
-                route,
-                along=float(rng.uniform(0, 1)),
-                forward=bool(rng.integers(2)),
-                speed_mps=float(rng.uniform(0.8, 1.3)),
-                lane_m=float(rng.uniform(-0.2, 0.2)),
-                phase=float(rng.uniform(0, 1)),
-            )
-            far = hypot(walker.x - scene.start[0], walker.y - scene.start[1]) > _START_CLEAR_M
-            alone = all(hypot(walker.x - o.x, walker.y - o.y) > 2 * _PERSON_CLEARANCE_M for o in self._walkers)
-            if far and alone and self._wall_gap(walker.x, walker.y) > _WALL_CLEARANCE_M:
-                return walker
-        raise ValueError(f"people: no room for another person in scene {scene.name}")
+        self._crowd = Crowd(count, rng)
+        self._steps = 0
+        self._watch = RobotWatch(_ROBOT_AXIS_M)
+        self._scene = scene
+        if count:
+            self._ways = CrowdMap(scene)
+            self._plans = Plans(scene, self._ways, self._crowd, rng)
+            self._plans.settle(scene, _START_CLEAR_M)
+            nothing = np.zeros(0, dtype=np.int64)
+            self._pairs = [(nothing, nothing)] * _DECIDE_EVERY
 
     def __len__(self) -> int:
-        return len(self._walkers)
+        return self._crowd.n
 
     def poses(self) -> Array:
         """[n, 3]: x m, y m, heading rad."""
-        return np.array([(w.x, w.y, w.heading) for w in self._walkers], dtype=np.float64).reshape(-1, 3)
+        return np.stack((self._crowd.x, self._crowd.y, self._crowd.heading), axis=1)
+
+    def velocities(self) -> Array:
+        """[n, 2]: vx, vy in the world, m/s."""
+        return np.stack((self._crowd.vx, self._crowd.vy), axis=1)
 
     def render_rows(self) -> Array:
         """[n, RENDER_FIELDS]: what a renderer needs of each person."""
-        rows = [(w.x, w.y, w.heading, w.phase, w.amplitude, 0.0, 0.0, 0.0) for w in self._walkers]
-        return np.array(rows, dtype=np.float64).reshape(-1, RENDER_FIELDS)
+        crowd = self._crowd
+        ground = np.zeros(crowd.n)
+        if self._scene.terrain:
+            places = zip(crowd.x.tolist(), crowd.y.tolist(), strict=True)
+            ground[:] = [self._scene.ground_height_m(x, y) for x, y in places]
+        columns = (crowd.x, crowd.y, crowd.heading, crowd.phase, crowd.swing, ground, crowd.sitting, crowd.gesture)
+        return np.stack(columns, axis=1)
 
     def step(self, robot_x_m: float, robot_y_m: float, robot_heading_rad: float) -> None:
         """Move everybody by 1/UPDATE_HZ s, given where the robot is."""
-        dt = 1.0 / UPDATE_HZ
-        ax, ay = cos(robot_heading_rad) * _ROBOT_HALF_AXIS_M, sin(robot_heading_rad) * _ROBOT_HALF_AXIS_M
-        for walker in self._walkers:
-            self._move(walker, (robot_x_m, robot_y_m), (ax, ay), dt)
-
-    def _move(self, me: _Walker, robot: Vec2, axis: Vec2, dt: float) -> None:
-        goal = me.points[me.next]
-        gx, gy = goal[0] - me.x, goal[1] - me.y
-        distance = hypot(gx, gy)
-        if distance < 0.5:
-            if not 0 <= me.next + me.step < len(me.points):
-                me.step = -me.step
-            me.next += me.step
-            goal = me.points[me.next]
-            gx, gy = goal[0] - me.x, goal[1] - me.y
-            distance = hypot(gx, gy)
-        dx, dy = gx / distance, gy / distance
-
-        near_x, near_y = _nearest_on_robot(me.x, me.y, robot, axis)
-        robot_gap = hypot(me.x - near_x, me.y - near_y)
-        pace, aside = self._give_way(me, (dx, dy), (near_x, near_y))
-        want_x = dx * me.speed_mps * pace - dy * aside
-        want_y = dy * me.speed_mps * pace + dx * aside
-        if robot_gap < 0.85:
-            # Somebody whom the robot walks up to steps back, as far as there is room.
-            back = 0.7 * (0.85 - robot_gap) / 0.35
-            want_x += back * (me.x - near_x) / max(robot_gap, 1e-6)
-            want_y += back * (me.y - near_y) / max(robot_gap, 1e-6)
-        blend = min(dt / 0.25, 1.0)
-        me.vx += (want_x - me.vx) * blend
-        me.vy += (want_y - me.vy) * blend
-        self._advance(me, robot, axis, robot_gap, dt)
-
-        speed = hypot(me.vx, me.vy)
-        if speed < 0.2:
-            me.blocked_s += dt
-            if me.blocked_s > _BLOCKED_S:
-                me.turn_back()
-        else:
-            me.blocked_s = max(0.0, me.blocked_s - 0.5 * dt)
-        if speed > 0.12:
-            turn = (atan2(me.vy, me.vx) - me.heading + pi) % (2 * pi) - pi
-            # Stepping back is not turning round: the body keeps facing where the person wants to go.
-            if abs(turn) > 2.4 and robot_gap < 0.9:
-                turn = 0.0
-            me.heading += min(max(turn, -3.0 * dt), 3.0 * dt)
-            me.heading = (me.heading + pi) % (2 * pi) - pi
-        me.phase = (me.phase + speed * dt / STRIDE_M) % 1.0
-        me.amplitude += (min(speed / 0.9, 1.0) - me.amplitude) * min(dt / 0.2, 1.0)
-
-    def _give_way(self, me: _Walker, direction: Vec2, robot_point: Vec2) -> tuple[float, float]:
-        """Share of the own pace, 0..1, and sideways velocity (left positive), m/s, for what is ahead."""
-        dx, dy = direction
-        pace, urgency, aside = 1.0, 0.0, 0.0
-        others = [(w.x, w.y, 0.62, _PERSON_CLEARANCE_M) for w in self._walkers if w is not me]
-        others.append((*robot_point, 0.75, _ROBOT_CLEARANCE_M))
-        for ox, oy, width, stop in others:
-            rx, ry = ox - me.x, oy - me.y
-            ahead = rx * dx + ry * dy
-            if not -0.1 < ahead < _LOOK_AHEAD_M:
-                continue
-            left = -rx * dy + ry * dx
-            if abs(left) > width:
-                continue
-            gap = hypot(rx, ry)
-            overlap = 1.0 - abs(left) / width
-            pace = min(pace, max(0.0, min(1.0, (gap - stop) / 1.1 + (1.0 - overlap) * 0.5)))
-            if overlap > urgency:
-                urgency = overlap
-                if me.side == 0.0 or abs(left) > 0.2:
-                    me.side = -1.0 if left > -0.05 else 1.0
-                aside = me.side * (0.25 + 0.45 * overlap)
-        if urgency == 0.0:
-            me.side = 0.0
-        elif self._wall_gap(me.x - dy * me.side * 0.35, me.y + dx * me.side * 0.35) < _WALL_CLEARANCE_M:
-            # No room on this side: try the other one.
-            me.side = -me.side
-            aside = 0.0
-        return pace, aside
-
-    def _advance(self, me: _Walker, robot: Vec2, axis: Vec2, robot_gap: float, dt: float) -> None:
-        """Move, dropping whatever would come too near a wall, the robot or another person."""
-        here = self._wall_gap(me.x, me.y)
-        for share_x, share_y in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0)):
-            x, y = me.x + me.vx * share_x * dt, me.y + me.vy * share_y * dt
-            wall = self._wall_gap(x, y)
-            if wall < _WALL_CLEARANCE_M and wall < here:
-                continue
-            px, py = _nearest_on_robot(x, y, robot, axis)
-            gap = hypot(x - px, y - py)
-            if gap < _ROBOT_CLEARANCE_M and gap < robot_gap:
-                continue
-            if any(
-                w is not me and hypot(x - w.x, y - w.y) < min(_PERSON_CLEARANCE_M - 0.05, hypot(me.x - w.x, me.y - w.y))
-                for w in self._walkers
-            ):
-                continue
-            me.x, me.y = x, y
-            me.vx, me.vy = me.vx * share_x, me.vy * share_y
+        crowd = self._crowd
+        if not crowd.n:
             return
-        me.vx = me.vy = 0.0
+        dt = 1.0 / UPDATE_HZ
+        robot = self._watch.step(robot_x_m, robot_y_m, robot_heading_rad, dt)
+        turn = self._steps % _DECIDE_EVERY
+        if turn == 0:
+            notice(crowd, self._ways, robot, dt * _DECIDE_EVERY)
+            self._plans.update(self._steps * dt, dt * _DECIDE_EVERY, robot)
+        if crowd.n > _STAGGER_FROM:
+            self._decide(np.arange(turn, crowd.n, _DECIDE_EVERY), turn, robot)
+        elif turn == 0:
+            self._decide(np.arange(crowd.n), turn, robot)
+        self._move(robot, dt)
+        self._turn_and_stride(dt)
+        self._steps += 1
 
-    def _wall_gap(self, x: float, y: float) -> float:
-        """Distance to the nearest wall or solid object, m (capped at 1)."""
-        best = 1.0
-        for box in self._boxes:
-            gap = _box_gap(box, x, y)
-            if gap < best:
-                best = gap
-        return best
+    # -- picking a velocity ----------------------------------------------------------------------------------------
 
+    def _decide(self, who: Ints, turn: int, robot: RobotSeen) -> None:
+        """Let these people look around and pick a velocity."""
+        crowd = self._crowd
+        dx = crowd.x[None, :] - crowd.x[who, None]
+        dy = crowd.y[None, :] - crowd.y[who, None]
+        gap2 = dx * dx + dy * dy
+        gap2[np.arange(len(who)), who] = np.inf
+        mine, theirs = np.nonzero(gap2 < 1.0)
+        self._pairs[turn] = (who[mine], theirs)
 
-def _box_gap(box: Box, x: float, y: float) -> float:
-    rx, ry = x - box.centre_m[0], y - box.centre_m[1]
-    c, s = box.axis
-    u = abs(rx * c + ry * s) - box.size_m[0] / 2
-    v = abs(-rx * s + ry * c) - box.size_m[1] / 2
-    if u <= 0:
-        return v if v > 0 else 0.0
-    return u if v <= 0 else hypot(u, v)
+        active = np.flatnonzero((crowd.like_x[who] != 0.0) | (crowd.like_y[who] != 0.0))
+        crowd.wish_x[who] = crowd.wish_y[who] = 0.0
+        crowd.meet_s[who] = 1e3
+        if not len(active):
+            return
+        me = who[active]
+        gap2 = gap2[active]
+        count = min(_NEIGHBOURS, crowd.n)
+        near = np.argpartition(gap2, count - 1, axis=1)[:, :count] if crowd.n > count else np.tile(
+            np.arange(crowd.n), (len(me), 1)
+        )  # fmt: skip
+        rows = np.arange(len(me))[:, None]
+        nearby = self._around(me, near, dx[active[:, None], near], dy[active[:, None], near], gap2[rows, near], robot)
+        liking = crowd.like_x[me], crowd.like_y[me]
+        pace = np.maximum(np.sqrt(liking[0] * liking[0] + liking[1] * liking[1]), 0.35)
+        picked = choose(
+            self._ways, (crowd.x[me], crowd.y[me]), (crowd.vx[me], crowd.vy[me]), liking, pace, nearby
+        )  # fmt: skip
+        crowd.wish_x[me], crowd.wish_y[me], crowd.meet_s[me] = picked
 
+    def _around(self, me: Ints, near: Ints, dx: Array, dy: Array, gap2: Array, robot: RobotSeen) -> Nearby:
+        crowd = self._crowd
+        vx, vy = crowd.vx[near], crowd.vy[near]
+        # Who walks avoids too; who stands is a thing to walk round.
+        walks = (crowd.like_x[near] != 0.0) | (crowd.like_y[near] != 0.0)
+        mates = crowd.group[near] == crowd.group[me][:, None]
+        squeeze = (crowd.squeeze_s[me] > 0.0)[:, None]
+        touch = np.where(squeeze, _SQUEEZE_TOUCH_M, np.where(mates, _MATES_TOUCH_M, _TOUCH_M))
+        close = np.where(squeeze, _SQUEEZE_CLOSE_M, np.where(mates, _MATES_CLOSE_M, _CLOSE_M))
+        away = gap2 > _NEIGHBOURS_M * _NEIGHBOURS_M
+        dx, dy = np.where(away, 1e3, dx), np.where(away, 1e3, dy)
+        ux = np.where(walks, vx + crowd.vx[me][:, None], vx)
+        uy = np.where(walks, vy + crowd.vy[me][:, None], vy)
 
-def _nearest_on_robot(x: float, y: float, robot: Vec2, axis: Vec2) -> Vec2:
-    length2 = axis[0] * axis[0] + axis[1] * axis[1]
-    share = ((x - robot[0]) * axis[0] + (y - robot[1]) * axis[1]) / length2
-    share = min(max(share, -1.0), 1.0)
-    return (robot[0] + axis[0] * share, robot[1] + axis[1] * share)
+        # The robot: three circles along its body. It may not avoid, so all of the avoiding is one's own.
+        aware = crowd.aware[me][:, None]
+        along = np.array((-robot.axis_m, 0.0, robot.axis_m))
+        rx = np.where(aware, robot.x + robot.c * along - crowd.x[me][:, None], 1e3)
+        ry = np.where(aware, robot.y + robot.s * along - crowd.y[me][:, None], 1e3)
+        shape = rx.shape
+        personal = np.broadcast_to(np.where(squeeze, _ROBOT_TOUCH_M + 0.05, crowd.personal_m[me][:, None]), shape)
+        return Nearby(
+            x=np.concatenate((dx, rx), axis=1),
+            y=np.concatenate((dy, ry), axis=1),
+            ux=np.concatenate((ux, np.full(shape, robot.vx)), axis=1),
+            uy=np.concatenate((uy, np.full(shape, robot.vy)), axis=1),
+            share=np.concatenate((np.where(walks, 2.0, 1.0), np.ones(shape)), axis=1),
+            touch=np.concatenate((touch, np.full(shape, _ROBOT_TOUCH_M)), axis=1),
+            close=np.concatenate((close, personal), axis=1),
+        )
+
+    # -- moving ----------------------------------------------------------------------------------------------------
+
+    def _move(self, robot: RobotSeen, dt: float) -> None:
+        crowd = self._crowd
+        ax, ay = crowd.wish_x - crowd.vx, crowd.wish_y - crowd.vy
+        size = np.sqrt(ax * ax + ay * ay) + 1e-9
+        braking = (crowd.meet_s < 1.0) | (ax * crowd.vx + ay * crowd.vy < 0.0)
+        limit = np.where(braking, _BRAKE_MPS2, _SPEED_UP_MPS2) * dt
+        share = np.minimum(limit / size, 1.0)
+        x = crowd.x + (crowd.vx + ax * share) * dt
+        y = crowd.y + (crowd.vy + ay * share) * dt
+        self._keep_apart(x, y)
+        self._keep_off_robot(x, y, robot)
+        self._keep_off_walls(x, y)
+
+        sits = np.flatnonzero(crowd.doing == Doing.SIT)
+        if len(sits):
+            # Onto a seat and off it is a movement of its own, at the pace of sitting down.
+            pull = min(3.5 * dt, 1.0)
+            x[sits] = crowd.x[sits] + (crowd.target_x[sits] - crowd.x[sits]) * pull
+            y[sits] = crowd.y[sits] + (crowd.target_y[sits] - crowd.y[sits]) * pull
+        dx, dy = x - crowd.x, y - crowd.y
+        most = _FASTEST_MPS * dt
+        share = np.minimum(most / (np.sqrt(dx * dx + dy * dy) + 1e-9), 1.0)
+        crowd.vx, crowd.vy = dx * (share / dt), dy * (share / dt)
+        crowd.x, crowd.y = crowd.x + dx * share, crowd.y + dy * share
+
+    def _keep_apart(self, x: Array, y: Array) -> None:
+        """Push people who would overlap away from each other; who stands gives way less than who walks."""
+        crowd = self._crowd
+        turns = self._pairs if crowd.n > _STAGGER_FROM else self._pairs[:1]
+        me = np.concatenate([pair[0] for pair in turns])
+        if not len(me):
+            return
+        other = np.concatenate([pair[1] for pair in turns])
+        dx, dy = x[me] - x[other], y[me] - y[other]
+        gap = np.sqrt(dx * dx + dy * dy) + 1e-9
+        over = np.flatnonzero(gap < _BODIES_M)
+        if not len(over):
+            return
+        me, other = me[over], other[over]
+        firm = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
+        mine, theirs = firm[crowd.doing[me]], firm[crowd.doing[other]]
+        push = (_BODIES_M - gap[over]) * mine / (mine + theirs + 1e-9) / gap[over]
+        x += np.bincount(me, dx[over] * push, crowd.n)
+        y += np.bincount(me, dy[over] * push, crowd.n)
+
+    def _keep_off_robot(self, x: Array, y: Array, robot: RobotSeen) -> None:
+        """Nobody walks into the robot; who is run into by it is pushed, not passed through."""
+        crowd = self._crowd
+        if not (np.abs(x - robot.x) + np.abs(y - robot.y)).min() < 2.0:
+            return
+        rx, ry, gap = robot.nearest(x, y)
+        close = np.flatnonzero((gap < _ROBOT_BODY_M) & (crowd.doing != Doing.SIT))
+        for k in close:
+            nx, ny = rx[k] / (gap[k] + 1e-9), ry[k] / (gap[k] + 1e-9)
+            inwards = (x[k] - crowd.x[k]) * nx + (y[k] - crowd.y[k]) * ny
+            push = max(-inwards, 0.0) if gap[k] > 0.4 else max(-inwards, 0.0) + min(0.4 - gap[k], 0.03)
+            x[k] += nx * push
+            y[k] += ny * push
+
+    def _keep_off_walls(self, x: Array, y: Array) -> None:
+        """Slide along walls; what is left of the way into one is not walked."""
+        crowd = self._crowd
+        gap, slope_x, slope_y = self._ways.slopes_at(x, y)
+        near = np.flatnonzero((gap < _WALL_M) & (crowd.doing != Doing.SIT))
+        if not len(near):
+            return
+        norm = np.sqrt(slope_x[near] ** 2 + slope_y[near] ** 2) + 1e-9
+        push = np.minimum(_WALL_M - gap[near], 0.06) / norm
+        x[near] += slope_x[near] * push
+        y[near] += slope_y[near] * push
+        after = self._ways.slopes_at(x[near], y[near])[0]
+        before = self._ways.slopes_at(crowd.x[near], crowd.y[near])[0]
+        stuck = near[(after < 0.16) & (after < before)]
+        x[stuck], y[stuck] = crowd.x[stuck], crowd.y[stuck]
+
+    def _turn_and_stride(self, dt: float) -> None:
+        crowd = self._crowd
+        speed = np.sqrt(crowd.vx * crowd.vx + crowd.vy * crowd.vy)
+        walks = speed > 0.2
+        want = np.where(walks, np.arctan2(crowd.vy, crowd.vx), crowd.facing)
+        off = (want - crowd.heading + pi) % (2 * pi) - pi
+        # A step back or aside is not turning round; whoever has nowhere to look keeps looking there.
+        keeps = np.isnan(off) | (walks & (np.abs(off) > 2.0) & (speed < 0.6))
+        off = np.where(keeps, 0.0, off)
+        crowd.heading += np.clip(off * min(6.0 * dt, 1.0), -_TURN_RADPS * dt, _TURN_RADPS * dt)
+        crowd.heading = (crowd.heading + pi) % (2 * pi) - pi
+        walking = np.where(crowd.sitting > 0, 0.0, speed)
+        step = _STEP_PER_ROOT_SPEED * np.sqrt(walking) * crowd.stride
+        talks = np.where(crowd.gesture == 1.0, 0.35 * dt, 0.0)  # hands move while one stands and talks
+        rate = np.where(walking > 0.05, walking * dt / (2.0 * step + 1e-9), talks)
+        crowd.phase = (crowd.phase + rate) % 1.0
+        crowd.swing += (np.minimum(step / _FULL_STEP_M, 1.2) - crowd.swing) * min(dt / 0.2, 1.0)

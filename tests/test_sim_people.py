@@ -9,8 +9,8 @@ from math import hypot, pi
 import numpy as np
 import pytest
 
-from sim_hil.people import UPDATE_HZ, People, _box_gap, appearances
-from sim_hil.scene import Route, Scene, load_scene
+from sim_hil.people import UPDATE_HZ, People, appearances
+from sim_hil.scene import Box, Route, Scene, load_scene
 from sim_hil.simulation import Simulation, SportAction
 
 FAR_AWAY = (-100.0, -100.0, 0.0)
@@ -28,6 +28,12 @@ def _walk(people: People, seconds: float, robot: tuple[float, float, float] = FA
         people.step(*robot)
         poses.append(people.poses())
     return poses
+
+
+def _box_gap(box: Box, x: float, y: float) -> float:
+    rx, ry = x - box.centre_m[0], y - box.centre_m[1]
+    c, s = box.axis
+    return hypot(max(abs(rx * c + ry * s) - box.size_m[0] / 2, 0), max(abs(-rx * s + ry * c) - box.size_m[1] / 2, 0))
 
 
 def test_same_seed_gives_the_same_people(corridor: Scene) -> None:
@@ -119,6 +125,11 @@ def test_limbs_swing_with_walking_and_rest_at_the_start(corridor: Scene) -> None
     assert 0 <= people.render_rows()[0, 3] < 1
 
 
-def test_a_scene_without_routes_has_no_people(corridor: Scene) -> None:
-    with pytest.raises(ValueError, match="routes"):
-        People(replace(corridor, routes=()), 1, 0)
+def test_a_scene_without_routes_is_walked_all_over(corridor: Scene) -> None:
+    poses = np.array(_walk(People(replace(corridor, routes=()), 6, 0), 60.0))
+    assert np.ptp(poses[:, :, 0], axis=0).max() > 10.0
+
+
+def test_a_scene_without_room_has_no_people(corridor: Scene) -> None:
+    with pytest.raises(ValueError, match="no room"):
+        People(corridor, 2000, 0)
