@@ -1,48 +1,78 @@
-"""The Go2's forward camera: the scene and its people in a renderer of their own, posed from a render state."""
+"""The robot's forward camera: the scene and its people in a renderer of their own, posed from a render state."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from math import atan, degrees, radians, tan
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from dataclasses import dataclass
+from math import cos, radians, sin, tan
+from typing import Final
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
-from sim_hil.go2 import load_go2, place_go2, rotation_matrix
-from sim_hil.people import RENDER_FIELDS, appearances
+from sim_hil import carter, go2
+from sim_hil.go2 import rotation_matrix
+from sim_hil.people import RENDER_FIELDS, Appearance, appearances
 from sim_hil.person_body import PersonBody
 from sim_hil.scene import Scene
-from sim_hil.simulation import ROBOT_FIELDS
 from sim_hil.world import build_scene
-from sim_hil.world_stage import BulletStage
+from sim_hil.world_renderer import Picture, Renderer
+from sim_hil.world_robot import RobotBody
 
 Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
-# Where the front camera sits on the base, and how it looks (the real one: wide, nearly level, at the nose).
+# Where the Go2's front camera sits on the base, and how it looks (the real one: wide, nearly level, at the nose).
 CAMERA_POSITION_M = (0.327, 0.0, 0.043)
 CAMERA_PITCH_RAD = radians(2.0)  # downwards
 CAMERA_HFOV_RAD = radians(100.0)
-_NEAR_M, _FAR_M = 0.02, 60.0  # near: the nose may touch a wall, which must still be seen
+
+_PERSON_M: Final = 1.2  # anything of a person is within this of the point between the feet
+_FAR_PERSON_M: Final = 45.0  # a pixel or two high at 128 x 128: left out
+_NEAR_PERSON_M: Final = 7.0  # with all details up to here, rounder from there on
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A robot's camera: its place on the base, m, its pitch (downwards) and field of view across, rad.
+
+    `fields` is how many numbers of a render state are the robot's.
+    """
+
+    position_m: tuple[float, float, float]
+    pitch_rad: float
+    hfov_rad: float
+    fields: int
+
+
+MOUNTS: Final = {
+    "go2": Mount(CAMERA_POSITION_M, CAMERA_PITCH_RAD, CAMERA_HFOV_RAD, go2.RENDER_FIELDS),
+    "carter": Mount(
+        carter.CAMERA_POSITION_M, carter.CAMERA_PITCH_RAD, carter.CAMERA_HFOV_RAD, carter.RENDER_FIELDS
+    ),
+}  # fmt: skip
 
 
 class CameraWorld:
-    """Renders what the robot's camera sees. Own PyBullet client: build it in a process of its own for real time."""
+    """Renders what the robot's camera sees. Build it in a process of its own for real time.
 
-    def __init__(self, scene: Scene, *, people: int, seed: int) -> None:
-        self._people_count = people
-        self._robot: int | None = None
-        self._robot_joints: list[int] = []
-        self._client = pybullet.connect(pybullet.DIRECT)
+    `looks` are the people's appearances; without them those of the seed. Raises ValueError on an unknown robot.
+    """
+
+    def __init__(
+        self, scene: Scene, *, people: int, seed: int, robot: str = "go2", looks: list[Appearance] | None = None
+    ) -> None:
+        if robot not in MOUNTS:
+            raise ValueError(f"camera: unknown robot {robot!r}, expected one of {', '.join(MOUNTS)}")
+        self._looks = appearances(people, seed, scene.name) if looks is None else looks
+        if len(self._looks) != people:
+            raise ValueError(f"camera: expected looks of {people} people, found {len(self._looks)}")
+        self._mount, self._robot_name = MOUNTS[robot], robot
+        self._robot: RobotBody | None = None
+        self._renderer = Renderer(scene.sky)
+        self._near: dict[int, PersonBody] = {}
+        self._far: dict[int, PersonBody] = {}
+        self._shown: list[PersonBody] = []
         try:
-            # The renderer reads its files while building: afterwards even a killed run leaves none behind.
-            with TemporaryDirectory(prefix="edge-camera-") as folder:
-                stage = BulletStage(self._client, Path(folder))
-                build_scene(stage, scene)
-                self._people = [PersonBody(stage, look) for look in appearances(people, seed, scene.name)]
+            build_scene(self._renderer, scene)
         except BaseException:
             self.close()
             raise
@@ -50,64 +80,75 @@ class CameraWorld:
     @property
     def state_size(self) -> int:
         """Length of the render state this world takes."""
-        return ROBOT_FIELDS + RENDER_FIELDS * self._people_count
+        return self._mount.fields + RENDER_FIELDS * len(self._looks)
 
-    def render(self, render_state: Array, width: int, height: int) -> Picture:
-        """The forward camera's picture, uint8 RGB [height, width, 3]. Raises ValueError on a state of another world."""
-        self._pose(render_state)
+    def render(self, render_state: Array, width: int, height: int, aspect: float | None = None) -> Picture:
+        """The forward camera's picture, uint8 RGB [height, width, 3]. Raises ValueError on a state of another world.
+
+        `aspect` squeezes the field of view of a picture of that shape into this one's; without it pixels are square.
+        """
+        self._check(render_state)
+        mount = self._mount
         rotation = rotation_matrix(tuple(float(v) for v in render_state[3:7]))
-        eye = render_state[0:3] + rotation @ CAMERA_POSITION_M
-        forward = rotation @ (np.cos(CAMERA_PITCH_RAD), 0.0, -np.sin(CAMERA_PITCH_RAD))
-        return self._picture(eye, eye + forward, rotation[:, 2], CAMERA_HFOV_RAD, width, height)
+        eye = render_state[0:3] + rotation @ mount.position_m
+        forward = rotation @ (cos(mount.pitch_rad), 0.0, -sin(mount.pitch_rad))
+        if self._robot is not None:
+            self._robot.hide()
+        shape = width / height if aspect is None else aspect
+        self._show_people(render_state, eye, forward, mount.hfov_rad, shape)
+        return self._renderer.picture(eye, forward, rotation[:, 2], mount.hfov_rad, width, height, shape)
 
     def look(
         self, render_state: Array, eye_m: tuple[float, float, float], target_m: tuple[float, float, float],
         width: int, height: int, hfov_rad: float = radians(70.0),
     ) -> Picture:  # fmt: skip
         """The world, robot included, from anywhere: for reports and for looking at the simulation itself."""
-        self._pose(render_state)
-        self._show_robot(render_state)
-        return self._picture(np.array(eye_m), np.array(target_m), np.array((0.0, 0.0, 1.0)), hfov_rad, width, height)
+        self._check(render_state)
+        if self._robot is None:
+            self._robot = RobotBody(self._renderer, self._robot_name)
+        self._robot.pose(render_state[: self._mount.fields])
+        eye = np.array(eye_m)
+        forward = np.array(target_m) - eye
+        forward /= np.linalg.norm(forward)
+        self._show_people(render_state, eye, forward, hfov_rad, width / height)
+        # Straight down there is no up to hold on to but north.
+        up = np.array((0.0, 0.0, 1.0) if abs(forward[2]) < 0.999 else (0.0, 1.0, 0.0))
+        return self._renderer.picture(eye, forward, up, hfov_rad, width, height, width / height)
 
-    def _pose(self, state: Array) -> None:
+    def _check(self, state: Array) -> None:
         if state.shape != (self.state_size,):
             raise ValueError(f"render state has shape {state.shape}, this world takes ({self.state_size},)")
-        rows = state[ROBOT_FIELDS:].reshape(self._people_count, RENDER_FIELDS)
-        for person, row in zip(self._people, rows, strict=True):
-            person.pose(row)
 
-    def _show_robot(self, state: Array) -> None:
-        # The forward camera never sees the robot, so its body is loaded only for a view from outside.
-        if self._robot is None:
-            with TemporaryDirectory(prefix="edge-camera-") as folder:
-                self._robot, self._robot_joints = load_go2(self._client, Path(folder), (0, 0, 0.3), 0.0)
-        place_go2(self._client, self._robot, self._robot_joints, state)
+    def _show_people(self, state: Array, eye: Array, forward: Array, hfov_rad: float, aspect: float) -> None:
+        """Pose those who may be in the picture and take all others out of it."""
+        rows = state[self._mount.fields :].reshape(len(self._looks), RENDER_FIELDS)
+        for body in self._shown:
+            body.hide()
+        self._shown.clear()
+        if not len(rows):
+            return
+        away = rows[:, :2] - eye[:2]
+        gaps = np.hypot(away[:, 0], away[:, 1])
+        # Within a cone around the view's axis, through the picture's corners, widened by a person's size.
+        corner = np.hypot(1.0, 1.0 / aspect) * tan(hfov_rad / 2)
+        heights = np.zeros(len(rows)) + 0.9 - eye[2]
+        ahead = away @ forward[:2] + heights * forward[2]
+        aside = np.sqrt(np.maximum(gaps**2 + heights**2 - ahead**2, 0.0))
+        margin = _PERSON_M * np.hypot(1.0, corner)
+        seen = (gaps < _FAR_PERSON_M) & (aside < corner * np.maximum(ahead, -_PERSON_M) + margin)
+        for index in np.flatnonzero(seen):
+            body = self._body(int(index), bool(gaps[index] < _NEAR_PERSON_M))
+            body.pose(rows[index])
+            self._shown.append(body)
 
-    def _picture(self, eye: Array, target: Array, up: Array, hfov_rad: float, width: int, height: int) -> Picture:
-        view = pybullet.computeViewMatrix(eye.tolist(), target.tolist(), up.tolist())
-        vertical = degrees(2 * atan(tan(hfov_rad / 2) * height / width))
-        projection = pybullet.computeProjectionMatrixFOV(vertical, width / height, _NEAR_M, _FAR_M)
-        image = pybullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            shadow=0,  # a second pass over everything; the ceiling would put the whole corridor in the shade anyway
-            lightDirection=(-3.0, 2.0, 6.0),
-            lightColor=(1.0, 0.99, 0.96),
-            lightAmbientCoeff=0.72,
-            lightDiffuseCoeff=0.36,
-            lightSpecularCoeff=0.0,
-            renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._client,
-        )[2]
-        pixels = np.asarray(image, dtype=np.uint8).reshape(height, width, 4)
-        return np.ascontiguousarray(pixels[:, :, :3])
+    def _body(self, index: int, near: bool) -> PersonBody:
+        bodies = self._near if near else self._far
+        if index not in bodies:
+            bodies[index] = PersonBody(self._renderer, self._looks[index], 1.0 if near else 0.5)
+        return bodies[index]
 
     def close(self) -> None:
-        """Release the client; may be called twice, and after its connection was lost."""
-        if self._client >= 0:
-            with suppress(pybullet.error):
-                pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        """Release the renderer; may be called twice."""
+        if self._robot is not None:
+            self._robot.close()
+        self._renderer.close()

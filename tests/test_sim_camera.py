@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
-from math import cos, pi, sin
+from math import cos, pi, radians, sin
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pybullet
 import pytest
 
 from sim_hil.camera import CameraWorld
@@ -164,14 +165,53 @@ def test_the_top_of_a_wall_is_seen_from_above(world: CameraWorld) -> None:
     assert (red / blue, green / blue) == pytest.approx((206 / 186, 200 / 186), abs=0.04)
 
 
-def test_a_camera_keeps_no_files_and_closes_after_its_connection_was_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_camera_keeps_no_files_and_may_be_closed_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     camera = CameraWorld(load_scene("corridor"), people=1, seed=0)
-    assert list(tmp_path.iterdir()) == []
     camera.look(_state(0, 0, 0), (2.0, 0.0, 1.0), (0.0, 0.0, 0.3), 64, 36)
     assert list(tmp_path.iterdir()) == []
-    pybullet.disconnect(physicsClientId=camera._client)
     camera.close()
     camera.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_squeezed_picture_shows_what_the_wide_one_shows(world: CameraWorld) -> None:
+    person = (13.0, 0.6, pi, 0.25, 1.0)
+    wide = world.render(_state(10, 0, 0, person), 320, 180)
+    square = world.render(_state(10, 0, 0, person), 128, 128, aspect=16 / 9)
+    squeezed = cv2.resize(wide, (128, 128), interpolation=cv2.INTER_AREA)
+    assert np.abs(square.astype(int) - squeezed.astype(int)).mean() < 6
+    assert np.abs(world.render(_state(10, 0, 0, person), 128, 128).astype(int) - squeezed.astype(int)).mean() > 12
+
+
+def test_two_processes_see_the_same_to_the_last_bit() -> None:
+    program = (
+        "import hashlib, numpy as np; from sim_hil.camera import CameraWorld; from sim_hil.scene import load_scene;"
+        "from sim_hil.people import RENDER_FIELDS;"
+        "w = CameraWorld(load_scene('corridor'), people=1, seed=3);"
+        "s = np.zeros(19 + RENDER_FIELDS); s[:7] = (9, 0.2, 0.3, 0, 0, 0, 1); s[19:24] = (12, 0.3, 2, 0.3, 1);"
+        "print(hashlib.sha256(w.render(s, 128, 128, 16 / 9).tobytes()).hexdigest())"
+    )
+    runs = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True) for _ in range(2)]
+    assert runs[0].returncode == 0, runs[0].stderr
+    assert runs[0].stdout.splitlines()[-1] == runs[1].stdout.splitlines()[-1]
+
+
+def test_the_wheeled_base_sees_from_its_mast_and_takes_its_own_state() -> None:
+    scene = load_scene("corridor")
+    carter = CameraWorld(scene, people=0, seed=0, robot="carter")
+    go2 = CameraWorld(scene, people=0, seed=0)
+    # Same eye: 0.45 m high, level; the Go2's is 0.327 m ahead of and 0.043 m above its base, and looks 2 degrees down.
+    low = go2.render(
+        np.array((5 + 0.25 - 0.327, 0, 0.407, 0, sin(radians(-1)), 0, cos(radians(-1)), *(0.0,) * 12)), 320, 180
+    )
+    mast = carter.render(np.array((5.0, 0, 0, 0, 0, 0, 1, 0, 0)), 320, 180)
+    assert np.abs(low.astype(int) - mast.astype(int)).mean() < 3
+    assert carter.state_size == 9
+    for world in (carter, go2):
+        world.close()
+
+
+def test_an_unknown_robot_is_refused_by_naming_the_known_ones() -> None:
+    with pytest.raises(ValueError, match="carter"):
+        CameraWorld(load_scene("corridor"), people=0, seed=0, robot="hovercraft")
