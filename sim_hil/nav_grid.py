@@ -164,7 +164,8 @@ class NavGrid:
         x = self.origin_m[0] + (column + 0.5) * self.resolution_m
         return (x, self.origin_m[1] + (row + 0.5) * self.resolution_m)
 
-    def _free_cell(self, x_m: float, y_m: float) -> tuple[int, int]:
+    def free_cell(self, x_m: float, y_m: float) -> tuple[int, int]:
+        """Row and column of the free cell nearest to a point."""
         row, column = self.cell(x_m, y_m)
         return int(self._nearest[0, row, column]), int(self._nearest[1, row, column])
 
@@ -172,7 +173,7 @@ class NavGrid:
         """The point itself when it is free, else the nearest free cell's centre within 1 m, else None."""
         if self.is_free(x_m, y_m):
             return (x_m, y_m)
-        point = self.centre(*self._free_cell(x_m, y_m))
+        point = self.centre(*self.free_cell(x_m, y_m))
         return point if hypot(point[0] - x_m, point[1] - y_m) <= _SNAP_M else None
 
     def is_free(self, x_m: float, y_m: float) -> bool:
@@ -203,7 +204,7 @@ class NavGrid:
         point = self.nearest_free(*goal)
         if point is None:
             return None
-        row, column = self._free_cell(*point)
+        row, column = self.free_cell(*point)
         if (row, column) not in self._trees:
             if len(self._trees) >= 32:
                 self._trees.pop(next(iter(self._trees)))
@@ -228,16 +229,16 @@ class NavGrid:
             cells = price[self._free]
             data = joins.data * 0.5 * (cells[joins.row] + cells[joins.col])
             priced = csr_matrix((data, (joins.row, joins.col)), shape=joins.shape)
-            start = int(self._ids[self._free_cell(*goal)])
+            start = int(self._ids[self.free_cell(*goal)])
             costs, nodes = dijkstra(priced, directed=False, indices=start, return_predecessors=True)
             field[self._free] = costs
             flat = self._cells[:, 0] * self.shape[1] + self._cells[:, 1]
-            onwards[self._free] = np.where(nodes >= 0, flat[nodes], -1)
+            onwards[self._free] = np.where(nodes >= 0, flat[np.maximum(nodes, 0)], -1)
         return CostTree(field, onwards)
 
     def field_at(self, field: Array, x_m: float, y_m: float) -> float:
         """A field's value at a point, from the free cells around it; inf where there is none within 1 m."""
-        row, column = self._free_cell(x_m, y_m)
+        row, column = self.free_cell(x_m, y_m)
         cx, cy = self.centre(row, column)
         if hypot(cx - x_m, cy - y_m) > _SNAP_M:
             return float("inf")
@@ -249,7 +250,7 @@ class NavGrid:
         if first is None or last is None or tree is None:
             return None
         _, onwards = tree
-        node = int(self._ids[self._free_cell(*first)])
+        node = int(self._ids[self.free_cell(*first)])
         if not np.isfinite(tree[0][node]):
             return None
         points = [first]

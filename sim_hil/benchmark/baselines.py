@@ -11,7 +11,7 @@ import numpy as np
 from edge.geometry import SE2, wrap_angle
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.observation import Observation
-from sim_hil.benchmark.policy import Velocity
+from sim_hil.benchmark.policy import Policy, Velocity
 
 if TYPE_CHECKING:
     from sim_hil.benchmark.world import EpisodeWorld
@@ -115,3 +115,19 @@ class PointGoalPolicy:
 
     def close(self) -> None:
         """Nothing to release."""
+
+
+BASELINES: Final = ("expert", "point-goal", "random", "still")
+
+
+def make_baseline(name: str) -> Policy:
+    """One of BASELINES. Raises ValueError for another name."""
+    if name == "expert":
+        # Imported here: the planner's libraries take a while to load.
+        from sim_hil.benchmark.expert import ExpertPolicy
+
+        return ExpertPolicy()
+    made: dict[str, Policy] = {"point-goal": PointGoalPolicy(), "random": RandomPolicy(), "still": StillPolicy()}
+    if name not in made:
+        raise ValueError(f"policy: unknown baseline {name!r}, expected one of {', '.join(BASELINES)}")
+    return made[name]

@@ -1,0 +1,167 @@
+"""The privileged expert: knows the scene's plan and where everybody is and walks; shows that an episode can be done.
+
+It drives as a considerate person would: with room to walls and people, slowing, waiting or stepping back rather than
+pushing, and it is the teacher of policies that see only pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import cos, sin
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.geometry import SE2
+from sim_hil.benchmark.episode import Episode
+from sim_hil.benchmark.expert_motion import CONTROL_S, Choice, Driving, Motion
+from sim_hil.benchmark.expert_route import SPACING_M, RoutePlanner
+from sim_hil.benchmark.observation import Observation
+from sim_hil.benchmark.policy import Velocity
+from sim_hil.benchmark.world import EpisodeWorld
+
+Array = NDArray[np.float64]
+Vec2 = tuple[float, float]
+
+PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)  # where a reasoning model is asked to say that it will be
+_REPLAN_TICKS: Final = 5
+_REACH_M: Final = 10.0  # length of the way looked at: 9 s of it, and what the last steps need to aim at
+_SIGHT_M: Final = 7.0  # people further away do not matter yet
+_STUCK_S: Final = 6.0
+_STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
+
+
+@dataclass(frozen=True)
+class Build:
+    """What the expert must know of a robot that the robot itself does not tell."""
+
+    driving: Driving
+    max_step_m: float
+
+
+BUILDS: Final[Mapping[str, Build]] = MappingProxyType(
+    {
+        "go2": Build(Driving(), 0.06),
+        "carter": Build(Driving(body_radius_m=0.33, body_reach_m=0.04, margin_m=0.17), 0.03),
+    }
+)
+
+
+class ExpertPolicy:
+    """Drives by the world itself; needs `reset` with a world."""
+
+    name = "expert"
+    privileged = True
+    needs_image = False
+
+    def __init__(self) -> None:
+        self._world: EpisodeWorld | None = None
+        self._choice: Choice | None = None
+
+    def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
+        """Plan the episode. Raises ValueError without a world, or where the goal cannot be reached."""
+        if world is None:
+            raise ValueError("expert: expected the episode's world, which only a privileged policy is given")
+        build = BUILDS[episode.robot]
+        planner = RoutePlanner(world.scene, episode.goal_xy, world.robot.radius_m, build.max_step_m)
+        pose = world.pose()
+        if not planner.reachable(pose.x_m, pose.y_m):
+            raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
+        self._world, self._planner, self._build = world, planner, build
+        self._motion = Motion(planner.grid, build.driving)
+        self._route = np.array([(pose.x_m, pose.y_m)])
+        self._ticks = 0
+        self._choice = None
+        self._left: list[float] = []
+
+    def act(self, observation: Observation) -> Velocity:
+        """The next velocity, by the world as it is now."""
+        world = self._running()
+        pose = world.pose()
+        people, velocities = self._seen(pose)
+        if self._ticks % _REPLAN_TICKS == 0:
+            self._route = self._planner.route((pose.x_m, pose.y_m), people, velocities, _REACH_M)
+        else:
+            self._route = _from_here(self._route, pose)
+        self._ticks += 1
+        self._left.append(self._planner.left(pose.x_m, pose.y_m))
+        self._choice = self._motion.choose(
+            pose.as_tuple(), observation.state[0], self._route, people, velocities, patience=self._patience()
+        )
+        return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
+
+    def _running(self) -> EpisodeWorld:
+        if self._world is None:
+            raise RuntimeError("expert: expected reset first")
+        return self._world
+
+    def _seen(self, pose: SE2) -> tuple[Array, Array]:
+        """Positions and velocities of the people who matter."""
+        world = self._running()
+        people, velocities = world.people()[:, :2], world.people_velocities()
+        near = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m) < _SIGHT_M
+        return people[near], velocities[near]
+
+    def _patience(self) -> float:
+        """1 while it comes on; less and less, down to 0.3, the longer it is stuck."""
+        ticks = round(_STUCK_S / CONTROL_S)
+        if len(self._left) <= ticks:
+            return 1.0
+        stuck = 0
+        for back in range(ticks, len(self._left), ticks):
+            if self._left[-1 - back] - self._left[-1] > _STUCK_M:
+                break
+            stuck += 1
+        return max(0.3, 1.0 - 0.25 * stuck)
+
+    def plan(self, times_s: Sequence[float] = PLAN_TIMES_S) -> list[Vec2]:
+        """Where it means to be at these times from now, m in the base frame (x forward, y left); costs next to nothing.
+
+        Until the end of the future it has chosen, that; then the way ahead at the comfortable speed.
+        """
+        world, driving = self._running(), self._build.driving
+        pose = world.pose()
+        line = self._route
+        along = np.arange(len(line)) * SPACING_M
+        speed = self._choice.vx_mps if self._choice is not None else 0.0
+        points = []
+        for time_s in times_s:
+            # Speeding up to the comfortable speed, then on at it.
+            rise_s = min(max(driving.speed_mps - speed, 0.0) / driving.accel_mps2, time_s)
+            gone = (speed + 0.5 * driving.accel_mps2 * rise_s) * rise_s + driving.speed_mps * (time_s - rise_s)
+            x, y = float(np.interp(gone, along, line[:, 0])), float(np.interp(gone, along, line[:, 1]))
+            there = pose.inverse() @ SE2(x, y, 0.0)
+            points.append((there.x_m, there.y_m))
+        return points
+
+    def route(self) -> Array:
+        """[n, 2]: the way ahead, m in the world, points 0.1 m apart."""
+        return self._route.copy()
+
+    def notes(self) -> Mapping[str, object]:
+        """`waypoints`: `plan()`; `future`: the next 4 s as chosen, m in the base frame; `shift_m`: to the left."""
+        if self._choice is None:
+            return {}
+        pose = self._running().pose()
+        c, s = cos(pose.theta_rad), sin(pose.theta_rad)
+        dx, dy = self._choice.future[::5, 0] - pose.x_m, self._choice.future[::5, 1] - pose.y_m
+        future = np.stack((c * dx + s * dy, c * dy - s * dx), axis=1)
+        return {
+            "waypoints": [list(point) for point in self.plan()],
+            "future": future.tolist(),
+            "shift_m": self._choice.shift_m,
+        }
+
+    def close(self) -> None:
+        """Forget the world."""
+        self._world = None
+
+
+def _from_here(route: Array, pose: SE2) -> Array:
+    """The part of a route that is still ahead."""
+    gaps = np.hypot(route[:15, 0] - pose.x_m, route[:15, 1] - pose.y_m)
+    nearest = int(np.argmin(gaps))
+    return route[nearest:] if len(route) - nearest >= 2 else route[-2:]
