@@ -9,13 +9,19 @@ import numpy as np
 from sim_hil.layouts.builder import Turn, turned
 from sim_hil.layouts.check import problems
 from sim_hil.layouts.hospital import hospital
+from sim_hil.layouts.office import office
 from sim_hil.layouts.plan import LayoutError
+from sim_hil.layouts.sidewalk import sidewalk
+from sim_hil.layouts.warehouse import warehouse
 from sim_hil.scene import Scene, SceneError
 
 __all__ = ["BENCHMARK_SEEDS", "KINDS", "LayoutError", "generate", "is_reserved", "problems"]
 
 _MAKERS: dict[str, tuple[int, Callable[[np.random.Generator], Scene]]] = {
     "hospital": (1, hospital),
+    "office": (2, office),
+    "warehouse": (3, warehouse),
+    "sidewalk": (4, sidewalk),
 }
 KINDS = tuple(_MAKERS)
 RESERVED_BELOW = 100  # these seeds are the benchmark's: no training scene may come from them

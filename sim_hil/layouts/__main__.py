@@ -51,28 +51,27 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     args = _parser().parse_args(argv)
     if args.out.suffix != ".toml":
-        print(f"--out: expected a file that ends in .toml, found {args.out}", file=sys.stderr)
+        sys.stderr.write(f"--out: expected a file that ends in .toml, found {args.out}" + "\n")
         return 2
     if not args.benchmark and 0 <= args.seed < RESERVED_BELOW:
-        print(f"--seed: {args.seed} is reserved for the benchmark; take {RESERVED_BELOW} or more, or --benchmark",
-              file=sys.stderr)  # fmt: skip
+        sys.stderr.write(f"--seed: {args.seed} is the benchmark's; take {RESERVED_BELOW} or more, or --benchmark\n")
         return 2
     seed = BENCHMARK_SEEDS[args.kind] if args.benchmark else args.seed
     try:
         scene = generate(args.kind, seed, reserved=args.benchmark)
     except LayoutError as error:
-        print(str(error), file=sys.stderr)
+        sys.stderr.write(str(error) + "\n")
         return 1 if seed >= 0 else 2
     try:
         args.out.write_text(scene_to_toml(scene), encoding="utf-8")
         if args.map is not None:
             write_png(draw_map(scene, args.px_per_m, names=True), args.map)
         if args.json == "-":
-            print(json.dumps(_summary(scene)))
+            sys.stdout.write(json.dumps(_summary(scene)) + "\n")
         elif args.json:
             Path(args.json).write_text(json.dumps(_summary(scene)) + "\n", encoding="utf-8")
     except OSError as error:
-        print(f"cannot write: {error}", file=sys.stderr)
+        sys.stderr.write(f"cannot write: {error}" + "\n")
         return 2
     return 0
 

@@ -44,6 +44,7 @@ _HUNG_M = {
 _FACING = {"n": -pi / 2, "s": pi / 2, "w": 0.0, "e": pi}  # where a thing looks whose back is on that side
 _WALL_GAP_M = 0.012  # behind a thing, so that its back and the wall do not share a plane
 _OVERHEAD = frozenset(("light", "sign", "exit_sign", "awning"))
+_STEMS: dict[str, Vec3] = {"tree": (0.7, 0.7, 5.0), "lamp_post": (0.3, 0.3, 4.4)}  # what one meets of them
 _LYING = frozenset(("carpet",))
 PERSON_CLEARANCE_M = 0.32
 
@@ -126,7 +127,7 @@ class Builder:
     ) -> SceneObject | None:  # fmt: skip
         """Add a thing; None where it would be in the way of another. `force` leaves that to the caller."""
         size = size or KINDS[kind].size_m
-        outline = outline_of(x, y, heading_rad, size)
+        outline = outline_of(x, y, heading_rad, _STEMS.get(kind, size))
         overhead = kind in _OVERHEAD or kind in _LYING
         # A door or elevator hangs in a wall, but nothing may stand before it.
         if not (force or overhead or self.fits(outline, KINDS[kind].solid, gap_m)):

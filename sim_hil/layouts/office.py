@@ -1,0 +1,209 @@
+"""An office: connected rooms, branching corridors, elevators, an open floor of desks, lounges with coloured carpets.
+
+Paper appendix C: "interconnected rooms, corridors, elevators, and desk areas … greater topological diversity".
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+
+from sim_hil.layouts.builder import Builder, Room
+from sim_hil.layouts.furnish import corridor_ends, door, lights, lintel, named, outer_windows, sit_on, wide_opening
+from sim_hil.layouts.plan import LayoutError, Rect, shared_border
+from sim_hil.layouts.skeleton import Bones, Building, raise_bones
+from sim_hil.scene import Scene
+
+_BONES = Bones(
+    length_m=(33.0, 37.0),
+    corridor_m=(2.0, 2.4),
+    outer_row_m=(5.0, 6.0),
+    inner_row_m=(5.0, 6.2),
+    room_m=(3.6, 5.2),
+    cross=(2, 3),
+    stubs=(1, 3),
+    door_m=1.2,
+    corridor_floor="carpet_tiles",
+)
+_NAMES = ("office", "office", "meeting room", "lounge", "print room", "kitchen", "office")
+_SIGNS = {"office": ("blue", "OFFICE"), "meeting room": ("green", "MEETING"), "lounge": ("purple", "LOUNGE"),
+          "print room": ("grey", "PRINT"), "kitchen": ("orange", "KITCHEN")}  # fmt: skip
+_FLOORS = {"office": "wood", "meeting room": "carpet_blue", "lounge": "wood", "print room": "concrete",
+           "kitchen": "floor_tiles"}  # fmt: skip
+_CARPETS = ("red", "green", "yellow", "purple", "blue")
+
+
+def office(rng: np.random.Generator) -> Scene:
+    """One office floor; raises LayoutError or SceneError when what was drawn does not go together."""
+    builder = Builder("office", rng, "wall_office", 2.7)
+    building = raise_bones(builder, _BONES)
+    bounds = Rect(0, 0, building.long[0].rect.x1, max(slot.y1 for slot, _ in building.slots))
+    corridor_ends(building, "door")
+    slots = sorted(building.slots, key=lambda slot: (slot[0].y0, slot[0].x0))
+    slots, hall = _merged(builder, slots)
+    rooms = [_open_floor(builder, *hall)]
+    order = [slots[int(i)] for i in rng.permutation(len(slots))]
+    if len(order) < 9:
+        raise LayoutError("too few rooms")
+    _elevators(builder, *order.pop())
+    carpets = [_CARPETS[int(i)] for i in rng.permutation(len(_CARPETS))]
+    for number, (slot, corridor) in enumerate(sorted(order, key=lambda s: (s[0].y0, s[0].x0))):
+        # One of each first, so that every office has a kitchen and a lounge; then by chance.
+        name = _NAMES[number] if number < len(_NAMES) else builder.pick(_NAMES)
+        room = builder.room(slot, "room", name, _FLOORS[name])
+        rooms.append(room)
+        colour, word = _SIGNS[name]
+        door(builder, room, corridor, _BONES.door_m, colour, f"{word} {number + 1}")
+    _connect(builder, rooms)
+    for room in rooms[1:]:
+        _furnish(builder, room, carpets)
+    _along_corridors(building)
+    outer_windows(builder, bounds, rooms)
+    lights(builder)
+    for room in rooms:
+        builder.stand_in(room.rect, 1)
+    for corridor in building.long + building.cross + building.stubs:
+        builder.stand_in(corridor.rect, max(1, round(max(corridor.rect.width, corridor.rect.depth) / 5)))
+    south = building.long[0].rect
+    start = (south.x0 + 2.0, south.centre[1], 0.0)
+    return builder.scene("office", start, (south.x1 - 2.5, south.centre[1]), floor="carpet_tiles")
+
+
+def _merged(
+    builder: Builder, slots: list[tuple[Rect, Room]]
+) -> tuple[list[tuple[Rect, Room]], tuple[Rect, Room]]:  # fmt: skip
+    """Two or three neighbouring slots become one large one; raises LayoutError where there are none."""
+    runs = []
+    for index, (first, corridor) in enumerate(slots):
+        run = [(first, corridor)]
+        for rect, other in slots[index + 1 :]:
+            if other is corridor and rect.y0 == first.y0 and abs(rect.x0 - run[-1][0].x1) < 1e-6 and len(run) < 3:
+                run.append((rect, other))
+        if len(run) >= 2 and run[-1][0].x1 - first.x0 >= 8.0:
+            runs.append(run)
+    if not runs:
+        raise LayoutError("no room for the open floor")
+    run = runs[int(builder.rng.integers(len(runs)))]
+    whole = Rect(run[0][0].x0, run[0][0].y0, run[-1][0].x1, run[0][0].y1)
+    return [slot for slot in slots if slot not in run], (whole, run[0][1])
+
+
+def _open_floor(builder: Builder, rect: Rect, corridor: Room) -> Room:
+    """Rows of desks with partitions, open to the corridor."""
+    room = builder.room(rect, "lobby", "open office", "carpet_blue")
+    border = builder.open(room, corridor, 3.2, margin_m=0.4)
+    lintel(builder, border, corridor.rect, "blue", "OPEN OFFICE")
+    south = corridor.rect.y0 < rect.y0
+    back = "n" if south else "s"
+    count = int(rect.width // 2.7)
+    for index in range(count):
+        desk = builder.against(room, "desk", side=back, along=(index + 0.5) / count, landmark=named("desk"))
+        if desk is not None:
+            toward = 1 if south else -1
+            x, y, _ = desk.position_m
+            builder.put("office_chair", x, y - toward * 0.85, toward * pi / 2, gap_m=0.0)
+    for wall in ("w", "e"):
+        builder.against(room, "shelf", side=wall, landmark=named("shelf"))
+        builder.against(room, "printer", side=wall, landmark=named("printer"))
+    builder.stand_in(rect, 3)
+    return room
+
+
+def _elevators(builder: Builder, rect: Rect, corridor: Room) -> None:
+    room = builder.room(rect, "lobby", "elevator lobby", "marble")
+    wide_opening(builder, room, corridor, 3.0, "red", "ELEVATORS")
+    back = "n" if corridor.rect.y0 < rect.y0 else "s"
+    width = min(1.6, rect.width / 2 - 0.6)
+    for share in (0.1, 0.9):
+        lift = builder.against(room, "elevator", side=back, along=share, size=(0.08, width, 2.35),
+                               landmark=named("elevator"))  # fmt: skip
+        if lift is not None:
+            builder.place_before(lift, "door", 2, gap_m=0.6)
+            x, y, _ = lift.position_m
+            inward = -1 if back == "n" else 1
+            builder.keep_clear(Rect(x - width / 2, min(y, y + inward * 1.6), x + width / 2, max(y, y + inward * 1.6)))
+    builder.against(room, "plant", side=builder.pick(("w", "e")), landmark=named("plant"))
+    builder.stand_in(rect, 2)
+
+
+def _connect(builder: Builder, rooms: list[Room]) -> None:
+    """Doors between some neighbouring rooms."""
+    for index, a in enumerate(rooms):
+        for b in rooms[index + 1 :]:
+            try:
+                border = shared_border(a.rect, b.rect)
+            except LayoutError:
+                continue
+            if border.length > 3.0 and builder.rng.uniform() < 0.25:
+                builder.open(a, b, _BONES.door_m, margin_m=0.9)
+
+
+def _furnish(builder: Builder, room: Room, carpets: list[str]) -> None:
+    middle = room.rect.centre
+    if room.name == "office":
+        for _ in range(2 if room.rect.width > 4.4 else 1):
+            builder.against(room, "desk", landmark=named("desk"), tries=40)
+        builder.against(room, "shelf", landmark=named("shelf"))
+        builder.against(room, "cabinet", colour=builder.pick(("white", "brown", "grey")))
+        builder.against(room, builder.pick(("painting", "whiteboard", "clock")))
+    elif room.name == "meeting room":
+        along_x = room.rect.width > room.rect.depth
+        size = (1.0, 1.8, 0.74)
+        table = builder.put("meeting_table", *middle, pi / 2 if along_x else 0.0, size=size, gap_m=0.0,
+                            landmark=named("meeting_table"))  # fmt: skip
+        if table is None:
+            raise LayoutError("no room for the meeting table")
+        builder.against(room, "screen", landmark=named("screen"))
+        builder.against(room, "whiteboard", landmark=named("whiteboard"))
+        builder.against(room, "plant")
+    elif room.name == "lounge":
+        colour = carpets.pop() if carpets else "brown"
+        builder.put("carpet", *middle, 0.0, size=(min(2.4, room.rect.width - 1.6), 2.0, 0.01), colour=colour,
+                    landmark=named("carpet", colour))  # fmt: skip
+        colour = builder.pick(("red", "green", "yellow", "blue"))
+        sofa = builder.against(room, "sofa", colour=colour, landmark=named("sofa", colour), tries=40)
+        if sofa is not None:
+            sit_on(builder, sofa, 2)
+        chair = builder.against(room, "armchair", colour=builder.pick(("orange", "green", "purple")))
+        if chair is not None:
+            sit_on(builder, chair, 1)
+        builder.against(room, "painting")
+    elif room.name == "print room":
+        builder.against(room, "printer", landmark=named("printer"), tries=40)
+        builder.against(room, "shelf", landmark=named("shelf"))
+        builder.against(room, "box_stack")
+        builder.against(room, "cabinet", colour="grey")
+    else:
+        colour = builder.pick(("red", "blue", "green", "yellow"))
+        machine = builder.against(room, "vending_machine", colour=colour, text="SNACKS", tries=40,
+                                  landmark=named("vending_machine", colour))  # fmt: skip
+        fridge = builder.against(room, "refrigerator", landmark=named("refrigerator"))
+        coffee = builder.against(room, "coffee_machine", landmark=named("coffee_machine"), tries=40)
+        for thing in (machine, fridge, coffee):
+            if thing is not None:
+                builder.place_before(thing, "queue", 2)
+        builder.against(room, "table")
+        builder.against(room, "trash_bin")
+
+
+def _along_corridors(building: Building) -> None:
+    builder = building.builder
+    for corridor in [*building.long, *building.cross]:
+        walls = ("n", "s") if corridor in building.long else ("w", "e")
+        length = max(corridor.rect.width, corridor.rect.depth)
+        wanted = ["water_dispenser", "bench", "plant", "fire_extinguisher", "trash_bin", "cabinet", "wet_floor_sign"]
+        wanted = [wanted[int(i)] for i in builder.rng.permutation(len(wanted))]
+        for kind in wanted[: 5 if length > 20 else 2]:
+            colour = builder.pick(("blue", "red", "green", "orange")) if kind in ("bench", "cabinet") else ""
+            thing = builder.against(corridor, kind, side=builder.pick(walls), colour=colour,
+                                    landmark=named(kind, colour), lone=True)  # fmt: skip
+            if thing is not None and kind == "bench":
+                sit_on(builder, thing, 2)
+            elif thing is not None and kind == "water_dispenser":
+                builder.place_before(thing, "queue", 2)
+        for _ in range(round(length / 7)):
+            kind = builder.pick(("notice_board", "painting", "painting", "screen"))
+            colour = builder.pick(("red", "blue", "green", "yellow")) if kind == "painting" else ""
+            builder.against(corridor, kind, side=builder.pick(walls), text="NOTICES" if kind == "notice_board" else "",
+                            colour=colour, landmark=named(kind, "") if kind == "notice_board" else "")  # fmt: skip
