@@ -32,7 +32,8 @@ class FrontEndOptions:
     """What a front end may need to know of the command line.
 
     `scene_source` is what `load_scene` takes (a name or a file) and `scene` what it made of that, with the start that
-    was asked for. `link` is the protocol's address, in a form of its own; `domain` and `interface` are DDS's.
+    was asked for. `camera_size` is None for a robot without a camera. `link` is the protocol's address, in a form of
+    its own; `domain` and `interface` are DDS's.
     """
 
     robot: str
@@ -40,7 +41,7 @@ class FrontEndOptions:
     scene: Scene
     people: int
     seed: int
-    camera_size: tuple[int, int]
+    camera_size: tuple[int, int] | None
     odometry_noise: str
     faults: Path | None
     link: str | None

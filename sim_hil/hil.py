@@ -65,11 +65,13 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """`WxH` in pixels; raises argparse.ArgumentTypeError."""
+def parse_size(text: str) -> tuple[int, int] | None:
+    """`WxH` in pixels, None for `none`; raises argparse.ArgumentTypeError."""
+    if text == "none":
+        return None
     width, times, height = text.partition("x")
     if not (times and width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"expected WxH such as 320x180, found {text!r}")
+        raise argparse.ArgumentTypeError(f"expected WxH such as 320x180, or none, found {text!r}")
     if not (32 <= int(width) <= 1920 and 32 <= int(height) <= 1080):
         raise argparse.ArgumentTypeError(f"expected 32x32 to 1920x1080, found {text}")
     return int(width), int(height)
@@ -107,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="unitree: DDS domain (default 0)")
     parser.add_argument("--interface", default="lo", help="unitree: network interface (default lo)")
     parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: where; default and form are the protocol's")
-    parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH", help="default 320x180")
+    parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="default 320x180")
     parser.add_argument(
         "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
     )

@@ -49,16 +49,10 @@ class UnitreeFrontEnd:
         self._robot = simulation.robot
         self._dds = dds
         self._faults: FaultInjector | None = None
-        self._bus = Bus(dds)
-        self._camera = CameraProcess(
-            options.scene_source,
-            people=options.people,
-            seed=options.seed,
-            size=options.camera_size,
-            dds=dds,
-            state_length=len(simulation.render_state()),
-            faults=options.faults is not None,
-        )
+        self._closed = False
+        self.bus = Bus(dds)
+        """The participant: DDS allows a process one in a domain."""
+        self._camera = None if options.camera_size is None else _camera(simulation, options, options.camera_size, dds)
         self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
         self._robot.sport = self._behaviour  # type: ignore[assignment]
         self._odometry = _odometry(options)
@@ -70,7 +64,7 @@ class UnitreeFrontEnd:
         if options.faults is not None:
             self._faults = self._injector(options.faults, remote)
         self._publishers = StatePublishers(
-            self._bus,
+            self.bus,
             self._odometry,
             simulation.rate_hz,
             remote=remote,
@@ -83,22 +77,22 @@ class UnitreeFrontEnd:
 
     def _open_services(self) -> None:
         lease = Lease()
-        self._sport = ServiceServer(self._bus, ids.SPORT_SERVICE, lease=lease, unleased=UNLEASED)
-        self._leases = LeaseServer(self._bus, ids.SPORT_SERVICE, lease)
+        self._sport = ServiceServer(self.bus, ids.SPORT_SERVICE, lease=lease, unleased=UNLEASED)
+        self._leases = LeaseServer(self.bus, ids.SPORT_SERVICE, lease)
         self._sport_service = SportService(self._behaviour, self._pilot)
         switcher = MotionSwitcher(self._behaviour)
         avoid = ObstaclesAvoid(self._pilot, self._reported_pose)
         self._others: tuple[tuple[ServiceServer, Callable[[int, str], Answer]], ...] = (
-            (ServiceServer(self._bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
-            (ServiceServer(self._bus, ids.MOTION_SWITCHER_SERVICE), switcher.handle),
+            (ServiceServer(self.bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
+            (ServiceServer(self.bus, ids.MOTION_SWITCHER_SERVICE), switcher.handle),
             (
-                ServiceServer(self._bus, ids.OBSTACLES_AVOID_SERVICE, version=OBSTACLES_AVOID_VERSION),
+                ServiceServer(self.bus, ids.OBSTACLES_AVOID_SERVICE, version=OBSTACLES_AVOID_VERSION),
                 avoid.handle,
             ),
         )
         self._servers = (self._sport, self._leases, *(server for server, _ in self._others))
-        self._low_commands = self._bus.reader(LOW_COMMAND_TOPIC, LowCmd_)
-        self._waitset = self._bus.waitset(*(server.reader for server in self._servers))
+        self._low_commands = self.bus.reader(LOW_COMMAND_TOPIC, LowCmd_)
+        self._waitset = self.bus.waitset(*(server.reader for server in self._servers))
 
     def _free_m(self, direction_rad: float) -> float:
         (x_m, y_m, _), heading_rad = self._simulation.pose()
@@ -114,10 +108,14 @@ class UnitreeFrontEnd:
         from sim_hil.faults.injector import FaultInjector
 
         try:
-            return FaultInjector(path, remote=remote, camera=self._camera.tell)
+            return FaultInjector(path, remote=remote, camera=self._tell_camera)
         except OSError:
             self.close()
             raise
+
+    def _tell_camera(self, line: bytes) -> None:
+        if self._camera is not None:
+            self._camera.tell(line)
 
     def where(self) -> str:
         """Domain and interface."""
@@ -125,6 +123,8 @@ class UnitreeFrontEnd:
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
         """Wait for the camera. Raises CameraProcessError."""
+        if self._camera is None:
+            return True
         self._camera.show(render_state)
         return self._camera.wait_ready(stop)
 
@@ -139,7 +139,7 @@ class UnitreeFrontEnd:
         for server, handle in self._others:
             received += server.serve(handle)
         self._take_low_command()
-        for event in self._camera.events():
+        for event in self._camera.events() if self._camera is not None else ():
             received += self._of_camera(event)
         for request in received:
             self._log.note(request)
@@ -191,13 +191,20 @@ class UnitreeFrontEnd:
 
     def show(self, render_state: NDArray[np.float64]) -> None:
         """Hand the camera process what it renders from now on."""
-        self._camera.show(render_state)
+        if self._camera is not None:
+            self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process and remove the faults' socket."""
+        """End the camera process, remove the faults' socket, leave the bus."""
         if self._faults is not None:
             self._faults.close()
-        self._camera.close()
+            self._faults = None
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+        if not self._closed:
+            self._closed = True
+            self.bus.close()
 
     def summary(self) -> dict[str, object]:
         """What was heard and sent."""
@@ -216,6 +223,20 @@ def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeF
         raise FrontEndError("--link: unitree is reached by --domain and --interface; leave it out")
     peers = ("127.0.0.1",) if options.interface == "lo" else ()
     return UnitreeFrontEnd(simulation, options, DdsConfig(options.domain, options.interface, peers))
+
+
+def _camera(
+    simulation: Simulation, options: FrontEndOptions, size: tuple[int, int], dds: DdsConfig
+) -> CameraProcess:  # fmt: skip
+    return CameraProcess(
+        options.scene_source,
+        people=options.people,
+        seed=options.seed,
+        size=size,
+        dds=dds,
+        state_length=len(simulation.render_state()),
+        faults=options.faults is not None,
+    )
 
 
 def _odometry(options: FrontEndOptions) -> OdometryFrame:

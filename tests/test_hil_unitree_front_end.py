@@ -1,0 +1,69 @@
+"""The Unitree front end keeps the contract of all front ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.unitree.idl import SportModeState_
+from firmware_bridge.unitree.rpc import RpcClient, move_parameter
+from firmware_bridge.unitree.state import robot_state
+from sim_hil.simulation import Simulation
+from sim_hil.unitree.front_end import UnitreeFrontEnd, open_front_end
+from tests.front_end_contract import FrontEndContract, Report, Rig, options
+from tests.processes import wait_for
+
+
+class UnitreeClient:
+    """A client of the sport service that shares the front end's participant: DDS allows one a process."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.reports: list[Report] = []
+        self._mode = -1
+        self._sport = RpcClient(bus, ids.SPORT_SERVICE)
+        self._states = bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_, depth=500)
+        wait_for(self._sport.connected, 10, "the sport service")
+
+    def poll(self) -> None:
+        for sample in take_each(self._states, limit=1000):
+            state = robot_state(sample, time.monotonic_ns(), "odom")
+            assert state is not None
+            self._mode = state.mode
+            self.reports.append(Report(state.robot_stamp_ns / 1e9, *state.T_odom_base, state.vx_mps))
+
+    def get_ready(self) -> None:
+        self._sport.send(ids.RECOVERY_STAND)
+
+    def is_ready(self) -> bool:
+        return self._mode in (ids.MODE_BALANCE_STAND, ids.MODE_LOCOMOTION)
+
+    def drive(self, vx_mps: float, wz_radps: float) -> None:
+        self._sport.send(ids.MOVE, move_parameter(vx_mps, 0.0, wz_radps), noreply=True)
+
+    def stop(self) -> None:
+        self._sport.send(ids.STOP_MOVE)
+
+    def emergency_stop(self) -> None:
+        self._sport.send(ids.DAMP)
+
+    def send_garbage(self) -> None:
+        self._sport.send(ids.MOVE, "x" * 5000)
+
+    def close(self) -> None:
+        pass
+
+
+class TestUnitree(FrontEndContract):
+    @pytest.fixture
+    def rig(self, dds_domain: int) -> Iterator[Rig]:
+        asked = options("go2", domain=dds_domain)
+        simulation = Simulation(asked.scene, people=0, seed=0)
+        front_end = open_front_end(simulation, asked)
+        assert isinstance(front_end, UnitreeFrontEnd)
+        rig = Rig(simulation, front_end, UnitreeClient(front_end.bus))
+        yield rig
+        rig.close()
