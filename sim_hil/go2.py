@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2, cos, sin
+from math import atan2, exp, pi, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from sim_hil.gait import GRAVITY_MPS2, BodyMotion
-from sim_hil.go2_urdf import BASE_COM_M, JOINT_FRICTION_NM, JOINT_NAMES, LEGS, write_go2_urdf
+from sim_hil.go2_urdf import BASE_COM_M, IMU_M, JOINT_FRICTION_NM, JOINT_NAMES, LEGS, write_go2_urdf
 from sim_hil.kinematics import Vec3, foot_position, foot_velocity
 from sim_hil.robot import BaseTruth
 from sim_hil.sport import LYING_RAD, Measured, SportAction, SportController
@@ -22,6 +22,10 @@ LYING_HEIGHT_M = 0.075
 RADIUS_M = 0.33
 HALF_LENGTH_M = 0.345
 RENDER_FIELDS = 19
+ACCEL_CUTOFF_HZ = 40.0  # our choice
+# A moving joint's dry friction, as a torque: rises over this range of speed instead of at once.
+_FRICTION_FULL_RADPS = 0.2
+_FRICTION_SLOPE = JOINT_FRICTION_NM / _FRICTION_FULL_RADPS
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,6 @@ class RobotTruth(BaseTruth):
     mode: int
     gait_type: int
     body_height_m: float
-
-
-def _cross(a: Vec3, b: Vec3) -> Vec3:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _rotate(quaternion_xyzw: tuple[float, float, float, float], v: Vec3) -> Vec3:
-    x, y, z, w = quaternion_xyzw
-    t = _cross((x, y, z), v)
-    t = (2 * t[0], 2 * t[1], 2 * t[2])
-    u = _cross((x, y, z), t)
-    return (v[0] + w * t[0] + u[0], v[1] + w * t[1] + u[1], v[2] + w * t[2] + u[2])
 
 
 def rotation_matrix(quaternion_xyzw: tuple[float, ...]) -> Array:
@@ -101,11 +93,8 @@ class Go2:
             pybullet.getJointInfo(self.body, link, physicsClientId=client)[1].decode(): link for link in range(links)
         }
         self._feet = [names[f"{leg}_foot"] for leg in LEGS]
-        # PyBullet drives every joint with a velocity motor by default; as weak as this it is the joint's dry friction.
-        friction = [JOINT_FRICTION_NM] * 12
-        pybullet.setJointMotorControlArray(
-            self.body, self._joints, pybullet.VELOCITY_CONTROL, forces=friction, physicsClientId=client
-        )
+        self._set_friction(JOINT_FRICTION_NM)
+        self._trotting = False
         for link in range(-1, links):
             grip = 0.9 if link in self._feet else 0.4
             pybullet.changeDynamics(
@@ -113,57 +102,123 @@ class Go2:
                 physicsClientId=client,
             )  # fmt: skip
         self._torques: tuple[float, ...] = (0.0,) * 12
-        self._accel = np.array((0.0, 0.0, GRAVITY_MPS2))
-        self._last_velocity = np.zeros(3)
+        self._accel: Vec3 = (0.0, 0.0, GRAVITY_MPS2)
+        self._accel_blend = 1.0 - exp(-2.0 * pi * ACCEL_CUTOFF_HZ * dt_s)
         self._read()
+        self._last_imu_velocity = self._imu_velocity()
+
+    def _set_friction(self, friction_nm: float) -> None:
+        # PyBullet drives every joint with a velocity motor by default; as weak as this it is the joint's dry friction.
+        pybullet.setJointMotorControlArray(
+            self.body, self._joints, pybullet.VELOCITY_CONTROL, forces=[friction_nm] * 12, physicsClientId=self._client
+        )
 
     def _read(self) -> None:
-        states = pybullet.getJointStates(self.body, self._joints, physicsClientId=self._client)
-        self._q = tuple(state[0] for state in states)
-        self._dq = tuple(state[1] for state in states)
+        client = self._client
+        states = pybullet.getJointStates(self.body, self._joints, physicsClientId=client)
+        self._q = tuple([state[0] for state in states])
+        self._dq = tuple([state[1] for state in states])
         # PyBullet speaks of the base's centre of mass; everybody else means the base frame between the hips.
-        com, self._quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
-        velocity, self._angular = pybullet.getBaseVelocity(self.body, physicsClientId=self._client)
-        arm = _rotate(self._quaternion, BASE_COM_M)
-        spin = _cross(self._angular, arm)
-        self._position = (com[0] - arm[0], com[1] - arm[1], com[2] - arm[2])
-        self._linear = (velocity[0] - spin[0], velocity[1] - spin[1], velocity[2] - spin[2])
+        com, self._quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=client)
+        velocity, self._angular = pybullet.getBaseVelocity(self.body, physicsClientId=client)
+        x, y, z, w = self._quaternion
+        self._forward = fx, fy, fz = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        self._upward = ux, uy, uz = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        forward, _, upward = BASE_COM_M
+        ax, ay, az = forward * fx + upward * ux, forward * fy + upward * uy, forward * fz + upward * uz
+        wx, wy, wz = self._angular
+        self._position = (com[0] - ax, com[1] - ay, com[2] - az)
+        self._linear = (
+            velocity[0] - wy * az + wz * ay,
+            velocity[1] - wz * ax + wx * az,
+            velocity[2] - wx * ay + wy * ax,
+        )
+        self._measured: Measured | None = None
+
+    def _imu_velocity(self) -> Vec3:
+        fx, fy, fz = self._forward
+        ux, uy, uz = self._upward
+        forward, _, upward = IMU_M
+        ax, ay, az = forward * fx + upward * ux, forward * fy + upward * uy, forward * fz + upward * uz
+        vx, vy, vz = self._linear
+        wx, wy, wz = self._angular
+        return (vx + wy * az - wz * ay, vy + wz * ax - wx * az, vz + wx * ay - wy * ax)
 
     def measured(self) -> Measured:
         """What the controller sees: joints, attitude, and velocities in the level frame along the heading."""
-        x, y, z, w = self._quaternion
-        yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-        c, s = cos(yaw), sin(yaw)
+        if self._measured is not None:
+            return self._measured
+        fx, fy, fz = self._forward
+        ux, uy, up = self._upward
+        across = sqrt(fx * fx + fy * fy)
+        c, s = (fx / across, fy / across) if across > 1e-9 else (1.0, 0.0)
+        # The left axis' rise, from forward and up: left = up x forward.
+        left_z = ux * fy - uy * fx
         vx, vy, _ = self._linear
         wx, wy, wz = self._angular
         body = BodyMotion(
-            yaw_rad=yaw,
-            roll_rad=atan2(up_y, up_z),
-            pitch_rad=atan2(-up_x, (up_y * up_y + up_z * up_z) ** 0.5),
-            roll_rate_radps=c * wx + s * wy,
-            pitch_rate_radps=-s * wx + c * wy,
-            yaw_rate_radps=wz,
-            vx_mps=c * vx + s * vy,
-            vy_mps=-s * vx + c * vy,
+            atan2(fy, fx),
+            atan2(left_z, up),
+            atan2(-fz, sqrt(left_z * left_z + up * up)),
+            c * wx + s * wy,
+            -s * wx + c * wy,
+            wz,
+            c * vx + s * vy,
+            -s * vx + c * vy,
         )
-        return Measured(self._q, self._dq, body, up_z)
+        self._measured = Measured(self._q, self._dq, body, up)
+        return self._measured
+
+    @property
+    def torques_nm(self) -> tuple[float, ...]:
+        """The 12 joint torques of the latest step."""
+        return self._torques
 
     def drive(self) -> None:
         """Let the sport controller set this step's torques."""
-        self._torques = self.sport.step(self.measured())
+        sport = self.sport
+        self._torques = forces = sport.step(self.measured())
+        if sport.trotting != self._trotting:
+            self._trotting = sport.trotting
+            self._set_friction(0.0 if self._trotting else JOINT_FRICTION_NM)
+        if self._trotting:
+            # At rest the engine holds the joints by their dry friction, which doubles the price of a step. A trotting
+            # joint hardly ever rests: there the friction is a torque against its motion.
+            forces = tuple(
+                [
+                    torque
+                    - (
+                        JOINT_FRICTION_NM
+                        if speed > _FRICTION_FULL_RADPS
+                        else -JOINT_FRICTION_NM
+                        if speed < -_FRICTION_FULL_RADPS
+                        else speed * _FRICTION_SLOPE
+                    )
+                    for torque, speed in zip(forces, self._dq, strict=True)
+                ]
+            )
         pybullet.setJointMotorControlArray(
-            self.body, self._joints, pybullet.TORQUE_CONTROL, forces=self._torques, physicsClientId=self._client
+            self.body, self._joints, pybullet.TORQUE_CONTROL, forces=forces, physicsClientId=self._client
         )
 
     def observe(self) -> None:
-        """Read the body after the step; the accelerometer is the change of velocity over it, low-passed at 40 Hz."""
+        """Read the body after the step; accelerometer: how the velocity of its place changes, low-passed at 40 Hz."""
         self._read()
-        velocity = np.array(self._linear)
-        specific = (velocity - self._last_velocity) / self._dt_s + (0.0, 0.0, GRAVITY_MPS2)
-        self._last_velocity = velocity
+        vx, vy, vz = velocity = self._imu_velocity()
+        was_x, was_y, was_z = self._last_imu_velocity
+        self._last_imu_velocity = velocity
+        dt_s = self._dt_s
+        sx, sy, sz = (vx - was_x) / dt_s, (vy - was_y) / dt_s, (vz - was_z) / dt_s + GRAVITY_MPS2
+        fx, fy, fz = self._forward
+        ux, uy, uz = self._upward
         # Rigid contacts are impulses: the raw difference shows spikes of many g that no filtered IMU reports.
-        self._accel += 0.4 * (rotation_matrix(self._quaternion).T @ specific - self._accel)
+        blend = self._accel_blend
+        ax, ay, az = self._accel
+        self._accel = (
+            ax + blend * (fx * sx + fy * sy + fz * sz - ax),
+            ay + blend * ((uy * fz - uz * fy) * sx + (uz * fx - ux * fz) * sy + (ux * fy - uy * fx) * sz - ay),
+            az + blend * (ux * sx + uy * sy + uz * sz - az),
+        )
 
     def pose(self) -> tuple[tuple[float, float, float], float]:
         """Base position, m, and heading, rad."""
@@ -171,8 +226,7 @@ class Go2:
 
     def up(self) -> float:
         """World z of the base's up axis: 1 upright, -1 on its back."""
-        x, y, _, _ = self._quaternion
-        return 1.0 - 2.0 * (x * x + y * y)
+        return self._upward[2]
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
         """Take a velocity of the body frame, kept for 1 s; without effect unless `ready`."""
@@ -187,10 +241,6 @@ class Go2:
     def ready(self) -> bool:
         """Whether it stands balanced, so that a velocity would be obeyed."""
         return self.sport.ready
-
-    def base_and_joints(self) -> tuple[float, ...]:
-        """`render_state` by its former name."""
-        return self.render_state()
 
     def render_state(self) -> tuple[float, ...]:
         """Position, quaternion xyzw and joint angles: 19 numbers for a renderer."""
@@ -213,7 +263,7 @@ class Go2:
             rpy_rad=np.array((body.roll_rad, body.pitch_rad, body.yaw_rad)),
             velocity_world_mps=np.array(self._linear),
             gyro_radps=rotation_matrix(self._quaternion).T @ np.array(self._angular),
-            accel_mps2=self._accel.copy(),
+            accel_mps2=np.array(self._accel),
             joint_q_rad=np.array(self._q),
             joint_dq_radps=np.array(self._dq),
             joint_tau_nm=np.array(self._torques),

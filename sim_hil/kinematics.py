@@ -5,7 +5,7 @@ Plain floats instead of arrays: a leg has three numbers, and this runs four time
 
 from __future__ import annotations
 
-from math import acos, atan2, cos, sin, sqrt
+from math import acos, atan2, cos, pi, sin, sqrt
 
 from sim_hil.go2_urdf import CALF_LENGTH_M, CALF_LIMITS_RAD, LEG_GEOMETRY, THIGH_LENGTH_M, THIGH_Y_M
 
@@ -13,13 +13,15 @@ Vec3 = tuple[float, float, float]
 
 # Hip-to-foot distance that the calf's limits allow; both segments have the same length, hence the half-angle.
 _REACH_MIN_M, _REACH_MAX_M = (2 * THIGH_LENGTH_M * cos(limit / 2) for limit in CALF_LIMITS_RAD)
+# Per leg: hip joint x and y in the base frame, and the thigh joint sideways of it; m.
+_HIPS = tuple((*geometry.hip_m, THIGH_Y_M * geometry.left) for geometry in LEG_GEOMETRY)
+_SIDE2_M2 = THIGH_Y_M * THIGH_Y_M
+_PER_BOTH = 0.5 / THIGH_LENGTH_M
 
 
 def foot_position(leg: int, q: Vec3) -> Vec3:
     """Foot centre in the base frame, m, of leg 0..3 (FR, FL, RR, RL) at joint angles q, rad."""
-    geometry = LEG_GEOMETRY[leg]
-    hip_x, hip_y = geometry.hip_m
-    side = THIGH_Y_M * geometry.left
+    hip_x, hip_y, side = _HIPS[leg]
     x = -THIGH_LENGTH_M * sin(q[1]) - CALF_LENGTH_M * sin(q[1] + q[2])
     z = -THIGH_LENGTH_M * cos(q[1]) - CALF_LENGTH_M * cos(q[1] + q[2])
     s, c = sin(q[0]), cos(q[0])
@@ -31,27 +33,25 @@ def joint_angles(leg: int, foot: Vec3) -> Vec3:
 
     A target out of reach is replaced by the nearest one the leg's length allows, in the same direction.
     """
-    geometry = LEG_GEOMETRY[leg]
-    hip_x, hip_y = geometry.hip_m
-    side = THIGH_Y_M * geometry.left
+    hip_x, hip_y, side = _HIPS[leg]
     x, y, z = foot[0] - hip_x, foot[1] - hip_y, foot[2]
-    drop = -sqrt(max(y * y + z * z - side * side, 1e-6))
-    hip = atan2(z, y) - atan2(drop, side)
-    if hip > 3.141592653589793:
-        hip -= 6.283185307179586
-    elif hip < -3.141592653589793:
-        hip += 6.283185307179586
+    drop2 = y * y + z * z - _SIDE2_M2
+    drop = sqrt(drop2) if drop2 > 1e-6 else 1e-3
+    hip = atan2(z, y) - atan2(-drop, side)
+    if hip > pi:
+        hip -= 2 * pi
+    elif hip < -pi:
+        hip += 2 * pi
     reach = sqrt(x * x + drop * drop)
-    reach = min(max(reach, _REACH_MIN_M), _REACH_MAX_M)
-    cosine = (reach * reach - THIGH_LENGTH_M**2 - CALF_LENGTH_M**2) / (2 * THIGH_LENGTH_M * CALF_LENGTH_M)
-    calf = -acos(min(max(cosine, -1.0), 1.0))
-    thigh = atan2(-x, -drop) - atan2(CALF_LENGTH_M * sin(calf), THIGH_LENGTH_M + CALF_LENGTH_M * cos(calf))
-    return (hip, thigh, calf)
+    reach = _REACH_MIN_M if reach < _REACH_MIN_M else _REACH_MAX_M if reach > _REACH_MAX_M else reach
+    # Thigh and calf are equally long: the knee's triangle has two equal angles, each half of the calf's.
+    half = acos(reach * _PER_BOTH)
+    return (hip, atan2(-x, drop) + half, -2.0 * half)
 
 
 def jacobian(leg: int, q: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     """Rows d(x, y, z)/d(hip, thigh, calf) of the foot position in the base frame, m/rad."""
-    side = THIGH_Y_M * LEG_GEOMETRY[leg].left
+    side = _HIPS[leg][2]
     both = q[1] + q[2]
     calf_x, calf_z = -CALF_LENGTH_M * sin(both), -CALF_LENGTH_M * cos(both)
     x = -THIGH_LENGTH_M * sin(q[1]) + calf_x
@@ -72,10 +72,17 @@ def foot_velocity(leg: int, q: Vec3, dq: Vec3) -> Vec3:
 
 def joint_torque(leg: int, q: Vec3, force: Vec3) -> Vec3:
     """Joint torques, N.m, with which the foot pushes on the world with `force` (base frame, N): the transposed map."""
-    rx, ry, rz = jacobian(leg, q)
+    hip, thigh, calf = q
     fx, fy, fz = force
+    side = _HIPS[leg][2]
+    both = thigh + calf
+    calf_x, calf_z = -CALF_LENGTH_M * sin(both), -CALF_LENGTH_M * cos(both)
+    x, drop = calf_x - THIGH_LENGTH_M * sin(thigh), calf_z - THIGH_LENGTH_M * cos(thigh)
+    s, c = sin(hip), cos(hip)
+    # The columns of `jacobian` times the force, with what they share computed once.
+    along, across = fy * s - fz * c, fy * c + fz * s
     return (
-        rx[0] * fx + ry[0] * fy + rz[0] * fz,
-        rx[1] * fx + ry[1] * fy + rz[1] * fz,
-        rx[2] * fx + ry[2] * fy + rz[2] * fz,
+        side * (fz * c - fy * s) - drop * across,
+        fx * drop + x * along,
+        fx * calf_z + calf_x * along,
     )

@@ -28,11 +28,17 @@ VX_RANGE_MPS, VY_RANGE_MPS, WZ_RANGE_RADPS = (-2.5, 3.8), (-1.0, 1.0), (-4.0, 4.
 HOLD_S = 1.0  # firmware from V1.1.6 keeps the latest Move for one second
 _BALANCED = (MODE_BALANCE_STAND, MODE_LOCOMOTION)
 _STOPPING_S = 4.0  # a robot held or pushed may never come to rest: then the awaited motion starts all the same
-_CALF_DAMPING_SHARE = 0.6  # without the rotor's inertia a swinging calf is so light that full damping overshoots
+# Proportional and damping gain, N.m/rad and N.m.s/rad.
+_WALK_GAINS, _HOLD_GAINS, _LIE_GAINS, _LIMP_DAMPING = (70.0, 2.0), (90.0, 2.5), (25.0, 2.0), 2.0
+# Damping that acts a step late overshoots the more, the longer the step: what a joint bears falls with the rate.
+# Without the rotor's inertia a swinging calf is so light that it bears less.
+_DAMPING_PER_HZ, _CALF_DAMPING_PER_HZ = 0.005, 0.0024
+_CALF_DAMPING_SHARE = 0.6
 _FADE_SHARE = 0.2  # our choice: over the last fifth of its speed range a motor's driving torque falls to zero
 
 LYING_RAD = (-0.25, 1.32, -2.70, 0.25, 1.32, -2.70, -0.25, 1.32, -2.70, 0.25, 1.32, -2.70)
-_NO_PUSH: tuple[Vec3, ...] = ((0.0, 0.0, 0.0),) * 4
+_NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
+_NO_PUSH: tuple[Vec3, ...] = (_NO_FORCE,) * 4
 _WEIGHT: tuple[Vec3, ...] = ((0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4),) * 4
 
 # Self-righting from the back, found by search in simulation. The right legs reach over to the floor beside the trunk
@@ -48,6 +54,14 @@ _RIGHTING: tuple[tuple[float, Vec3, Vec3], ...] = (
     (0.3, (0.0, 1.3, -2.7), (0.0, 1.3, -2.7)),
 )
 _RIGHTING_ATTEMPTS = 4
+
+
+# Per joint: its angle's limits, its torque limit, the speed from which its driving torque fades, whether it is a calf.
+_JOINTS = tuple(
+    (*leg.limits_rad[joint], TORQUE_LIMITS_NM[joint], (1.0 - _FADE_SHARE) * VELOCITY_LIMITS_RADPS[joint], joint)
+    for leg in LEG_GEOMETRY
+    for joint in range(3)
+)
 
 
 class SportAction(Enum):
@@ -78,7 +92,7 @@ class _Motion(NamedTuple):
 
 
 def _clip(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
+    return low if value < low else high if value > high else value
 
 
 def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
@@ -98,7 +112,7 @@ class SportController:
     """The mode machine and its torques. Deterministic; call `step` once every dt_s."""
 
     def __init__(self, dt_s: float, gait: GaitConfig | None = None) -> None:
-        self._dt_s = dt_s
+        self._dt_s, self._inverse_dt = dt_s, 1.0 / dt_s
         self._config = gait if gait is not None else GaitConfig()
         self._mode = MODE_LIE_DOWN
         self._time_s = 0.0
@@ -112,6 +126,11 @@ class SportController:
         self._targets: tuple[float, ...] = LYING_RAD
         self._latest: Measured | None = None
         self._attempts = 0
+
+    @property
+    def trotting(self) -> bool:
+        """Whether the legs are stepping, or about to: a standing robot that is pushed over steps too."""
+        return self._motion is None and self._gait.walking and self._mode in _BALANCED
 
     @property
     def mode(self) -> int:
@@ -240,13 +259,14 @@ class SportController:
             torques = self._scripted(measured)
         elif self._mode == MODE_DAMPING:
             self._targets = measured.q_rad
-            torques = tuple(motor_torque(i % 3, -2.0 * dq, dq) for i, dq in enumerate(measured.dq_radps))
+            damping = min(_LIMP_DAMPING, _DAMPING_PER_HZ * self._inverse_dt)
+            torques = tuple(motor_torque(i % 3, -damping * dq, dq) for i, dq in enumerate(measured.dq_radps))
         elif self._mode in _BALANCED:
             torques = self._walk(measured)
         elif self._mode == MODE_JOINT_LOCK:
-            torques = self._track(measured, self._targets, 90.0, 2.5, _WEIGHT)
+            torques = self._track(measured, self._targets, _HOLD_GAINS, _WEIGHT)
         else:
-            torques = self._track(measured, LYING_RAD, 25.0, 2.0, _NO_PUSH)
+            torques = self._track(measured, LYING_RAD, _LIE_GAINS, _NO_PUSH)
         self._time_s += self._dt_s
         return torques
 
@@ -254,9 +274,10 @@ class SportController:
         command = self.commanded
         self._gait, output = step_gait(self._config, self._gait, command, measured.body, self._dt_s)
         self._mode = MODE_LOCOMOTION if command != (0.0, 0.0, 0.0) else MODE_BALANCE_STAND
-        targets = tuple(angle for leg, foot in enumerate(output.feet) for angle in joint_angles(leg, foot))
-        gains = (70.0, 2.0) if self._gait.walking else (90.0, 2.5)
-        return self._track(measured, targets, *gains, output.push)
+        f0, f1, f2, f3 = output.feet
+        targets = (*joint_angles(0, f0), *joint_angles(1, f1), *joint_angles(2, f2), *joint_angles(3, f3))
+        gains = _WALK_GAINS if self._gait.walking else _HOLD_GAINS
+        return self._track(measured, targets, gains, output.push)
 
     def _scripted(self, measured: Measured) -> tuple[float, ...]:
         motion = self._motion
@@ -267,7 +288,7 @@ class SportController:
             if elapsed < duration:
                 blend = 0.5 * (1.0 - cos(pi * elapsed / duration))
                 targets = tuple(a + (b - a) * blend for a, b in zip(begin, end, strict=True))
-                return self._track(measured, targets, 90.0, 2.5, _NO_PUSH)
+                return self._track(measured, targets, _HOLD_GAINS, _NO_PUSH)
             elapsed, begin = elapsed - duration, end
         self._motion = None
         self._targets = begin
@@ -276,26 +297,31 @@ class SportController:
             self._enter_balance()
         elif motion.mode == MODE_RECOVERY_STAND:
             self._recover()
-        return self._track(measured, begin, 90.0, 2.5, _NO_PUSH)
+        return self._track(measured, begin, _HOLD_GAINS, _NO_PUSH)
 
     def _track(
-        self, measured: Measured, targets: tuple[float, ...], kp: float, kd: float, push: tuple[Vec3, ...]
+        self, measured: Measured, targets: tuple[float, ...], gains: tuple[float, float], push: tuple[Vec3, ...]
     ) -> tuple[float, ...]:
         """PD on the joints plus the torque of each foot's push on the ground (without it the knees sag)."""
-        previous, inverse_dt = self._targets, 1.0 / self._dt_s
+        stiffness, damping = gains
+        inverse_dt = self._inverse_dt
+        calf_damping = min(_CALF_DAMPING_SHARE * damping, _CALF_DAMPING_PER_HZ * inverse_dt)
+        damping = min(damping, _DAMPING_PER_HZ * inverse_dt)
+        angles, speeds = measured.q_rad, measured.dq_radps
+        carry: list[float] = []
+        for leg, force in enumerate(push):
+            carry += _NO_FORCE if force == _NO_FORCE else joint_torque(leg, angles[3 * leg : 3 * leg + 3], force)  # type: ignore[arg-type]
         torques = []
-        for leg in range(4):
-            base = 3 * leg
-            q = measured.q_rad[base : base + 3]
-            carry = joint_torque(leg, q, push[leg])  # type: ignore[arg-type]
-            lower_upper = LEG_GEOMETRY[leg].limits_rad
-            for joint in range(3):
-                i = base + joint
-                target = _clip(targets[i], *lower_upper[joint])
-                # Swing targets move fast: the damping term must not fight the motion it is asked for.
-                rate = _clip((targets[i] - previous[i]) * inverse_dt, -15.0, 15.0)
-                damping = kd * (_CALF_DAMPING_SHARE if joint == 2 else 1.0)
-                torque = kp * (target - q[joint]) + damping * (rate - measured.dq_radps[i]) + carry[joint]
-                torques.append(motor_torque(joint, torque, measured.dq_radps[i]))
+        for target, previous, q, dq, extra, (lower, upper, limit, fading, joint) in zip(
+            targets, self._targets, angles, speeds, carry, _JOINTS, strict=True
+        ):
+            # Swing targets move fast: the damping term must not fight the motion it is asked for.
+            rate = (target - previous) * inverse_dt
+            rate = -15.0 if rate < -15.0 else 15.0 if rate > 15.0 else rate
+            wanted = lower if target < lower else upper if target > upper else target
+            torque = stiffness * (wanted - q) + (calf_damping if joint == 2 else damping) * (rate - dq) + extra
+            if not (-limit < torque < limit and -fading < dq < fading):
+                torque = motor_torque(joint, torque, dq)
+            torques.append(torque)
         self._targets = targets
         return tuple(torques)

@@ -227,7 +227,7 @@ def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> 
 @pytest.mark.parametrize("roll", [pi, 1.6, -2.5])
 def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: float) -> None:
     pybullet.resetBasePositionAndOrientation(
-        simulation._go2.body, (0, 0, 0.3), pybullet.getQuaternionFromEuler((roll, 0, 0.4)), simulation._client
+        simulation.robot.body, (0, 0, 0.3), pybullet.getQuaternionFromEuler((roll, 0, 0.4)), simulation._client
     )
     simulation.sport(SportAction.DAMP)
     _run(simulation, 1.0)
@@ -303,7 +303,7 @@ def test_a_motor_drives_less_and_less_towards_its_top_speed_but_always_brakes(jo
 
 def test_a_joint_without_torque_is_held_by_its_dry_friction(simulation: Simulation) -> None:
     """Weightless, a torque below the friction (0.2 N.m) moves nothing and one above it does."""
-    body, calf = simulation._go2.body, simulation._go2._joints[2]
+    body, calf = simulation.robot.body, simulation.robot._joints[2]
     pybullet.setGravity(0, 0, 0, physicsClientId=simulation._client)
     pybullet.resetBasePositionAndOrientation(body, (0, 0, 1), (0, 0, 0, 1), physicsClientId=simulation._client)
     pybullet.resetJointState(body, calf, -1.8, physicsClientId=simulation._client)
