@@ -1,0 +1,90 @@
+"""A serial line between two processes of one machine: two ptys and a thread that carries bytes between them.
+
+Nothing is kept for an end that nobody has opened: whoever plugs in hears what is said from then on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+import tty
+from pathlib import Path
+from typing import Final
+
+_CHUNK: Final = 4096
+_POLL_MS: Final = 50
+_UNPLUGGED_S: Final = 0.01
+
+
+class PtyLine:
+    """`near` is the device of our own end; `far` a link that the other process opens. Raises OSError."""
+
+    def __init__(self, far: Path) -> None:
+        """`far`: a path that does not exist yet; removed again by `close`."""
+        self._masters: list[int] = []
+        self.far = far
+        devices = []
+        try:
+            for _ in range(2):
+                master, slave = os.openpty()
+                tty.setraw(slave)
+                devices.append(os.ttyname(slave))
+                os.close(slave)  # so that the line can tell whether somebody has opened this end
+                os.set_blocking(master, False)
+                self._masters.append(master)
+            far.symlink_to(devices[1])
+        except OSError:
+            self._release()
+            raise
+        self.near = devices[0]
+        self._ending = False
+        self._thread = threading.Thread(target=self._carry, name="pty-line", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Unplug both ends; may be called twice."""
+        if self._ending:
+            return
+        self._ending = True
+        self._thread.join()
+        with contextlib.suppress(FileNotFoundError):
+            self.far.unlink()
+        self._release()
+
+    def _release(self) -> None:
+        for master in self._masters:
+            os.close(master)
+        self._masters.clear()
+
+    def _carry(self) -> None:
+        poller = select.poll()
+        for master in self._masters:
+            poller.register(master, select.POLLIN)
+        near, far = self._masters
+        other = {near: far, far: near}
+        while not self._ending:
+            events = dict(poller.poll(_POLL_MS))
+            for master, event in events.items():
+                if event & select.POLLIN:
+                    unplugged = events.get(other[master], 0) & select.POLLHUP or _unplugged(other[master])
+                    self._move(master, None if unplugged else other[master])
+            if any(event & select.POLLHUP for event in events.values()):
+                time.sleep(_UNPLUGGED_S)  # an unplugged end would otherwise wake us all the time
+
+    def _move(self, source: int, target: int | None) -> None:
+        with contextlib.suppress(BlockingIOError):
+            try:
+                data = os.read(source, _CHUNK)
+            except OSError:  # EIO: unplugged between the look and the read
+                return
+            if target is not None:
+                os.write(target, data)  # what does not fit is lost, as on a line without handshake
+
+
+def _unplugged(master: int) -> bool:
+    look = select.poll()
+    look.register(master, 0)
+    return any(event & select.POLLHUP for _, event in look.poll(0))
