@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.report.run_data import FlightLog, Record, RunData, Trace, percentile
+from sim_hil.report_style import percentile
+from tools.report.run_data import FlightLog, Record, RunData, Trace
 
 DELTA_T_TOLERANCE_MS = 1.0
 TICKS_PER_60_S = 590

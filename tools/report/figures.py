@@ -2,57 +2,37 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import StrMethodFormatter
 
-from tools.report.run_data import Array, Record, RunData, odometry_in_world, percentile
+from sim_hil.report_style import (
+    COMMAND,
+    INK,
+    MUTED,
+    PERSON,
+    TRUTH,
+    WALL,
+    delay_histogram,
+    legend_above,
+    new_figure,
+    percentile,
+    png,
+    tidy,
+)
+from tools.report.run_data import Array, Record, RunData, odometry_in_world
 
-INK = "#1d2733"
-MUTED = "#6b7785"
-TRUTH = "#1f6f8b"
-COMMAND = "#d1603d"
-WALL = "#46525e"
-PERSON = "#8a5fbf"
+__all__ = ["close_up", "delay_histogram", "tick_histogram", "time_line", "top_down"]
+
 OVERHEAD_KINDS = frozenset({"light", "sign"})  # nobody meets them on the floor
 FLAT_KINDS = frozenset({"door", "window", "notice_board"})  # on a wall
-_DPI = 160
 _DEADLINE_MS = 100.0
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
-
-
-def _tidy(axes: Axes) -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.spines["left"].set_color(MUTED)
-    axes.spines["bottom"].set_color(MUTED)
-    axes.tick_params(colors=INK, labelsize=8)
-    axes.grid(color="#e4e8ec", linewidth=0.6)
-    axes.set_axisbelow(True)
-
-
-def _legend_above(axes: Axes) -> None:
-    axes.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 0.98), ncols=4, borderaxespad=0)
 
 
 def top_down(data: RunData) -> bytes:
@@ -78,7 +58,7 @@ def close_up(data: RunData) -> bytes | None:
 def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
     size = high - low
     width_in = 11.0
-    figure = _figure(width_in, float(np.clip(width_in * size[1] / size[0] + 1.3, 3.0, 12.0)))
+    figure = new_figure(width_in, float(np.clip(width_in * size[1] / size[0] + 1.3, 3.0, 12.0)))
     axes = figure.add_subplot()
     _draw_footprints(axes, data.trace.scene["footprints"], points_per_m=0.92 * width_in * 72 / size[0])
     _draw_people(axes, data.trace.people)
@@ -91,12 +71,12 @@ def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
     axes.set_ylim(low[1], high[1])
     axes.set_xlabel("x in m", fontsize=9)
     axes.set_ylabel("y in m", fontsize=9)
-    _tidy(axes)
+    tidy(axes)
     bar = figure.colorbar(path, ax=axes, location="bottom", aspect=60, shrink=0.6, pad=0.02)
     bar.set_label("true path, coloured by time since the first control tick in s", fontsize=8, color=INK)
     bar.ax.tick_params(labelsize=8)
     figure.legend(handles=_top_down_legend(), loc="outside upper center", fontsize=8, frameon=False, ncols=7)
-    return _png(figure)
+    return png(figure)
 
 
 def _top_down_legend() -> list[Line2D]:
@@ -198,7 +178,7 @@ def _draw_start_goal(axes: Axes, scene: Record, end: Array) -> None:
 
 def tick_histogram(durations_ms: Array) -> bytes:
     """Duration of every control tick with the 100 ms deadline; counts on a log scale, so that one outlier shows."""
-    figure = _figure(5.4, 3.1)
+    figure = new_figure(5.4, 3.1)
     axes = figure.add_subplot()
     p50, p99 = percentile(durations_ms, 50), percentile(durations_ms, 99)
     right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
@@ -212,33 +192,14 @@ def tick_histogram(durations_ms: Array) -> bytes:
     axes.set_ylim(bottom=0.7)
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.set_ylabel("ticks (log)", fontsize=9)
-    _legend_above(axes)
-    _tidy(axes)
-    return _png(figure)
-
-
-def delay_histogram(delays_s: Array) -> bytes:
-    """Age Δt of the semantic state over all ticks that had one."""
-    figure = _figure(5.4, 3.1)
-    axes = figure.add_subplot()
-    if len(delays_s):
-        p50, p99 = percentile(delays_s, 50), percentile(delays_s, 99)
-        # Ticks are 0.1 s apart, so a finer bin would show the comb of the ticks instead of the delay.
-        axes.hist(delays_s, bins=np.arange(0, delays_s.max() + 0.1, 0.1).tolist(), color=PERSON)
-        axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.2f} s")
-        axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.2f} s")
-        axes.axvline(delays_s.max(), color=MUTED, linewidth=1, label=f"max {delays_s.max():.2f} s")
-        _legend_above(axes)
-    axes.set_xlim(left=0)
-    axes.set_xlabel("Δt = now − capture of the anchor frame, in s", fontsize=9)
-    axes.set_ylabel("ticks", fontsize=9)
-    _tidy(axes)
-    return _png(figure)
+    legend_above(axes)
+    tidy(axes)
+    return png(figure)
 
 
 def time_line(data: RunData) -> bytes:
     """Δt, forward speed and turn rate over the run; ticks that did not drive are shaded."""
-    figure = _figure(11.0, 6.2)
+    figure = new_figure(11.0, 6.2)
     delay, speed, turn = figure.subplots(3, 1, sharex=True)
     ticks = data.log.ticks
     tick_s = (np.array([t["now_ns"] for t in ticks], np.int64) - data.log.start_ns) / 1e9
@@ -255,13 +216,13 @@ def time_line(data: RunData) -> bytes:
         axes.plot(pose_s[driven], _smooth(velocity), color=TRUTH, linewidth=1.4, label="true, mean of 1 s")
         axes.step(tick_s, command[:, axis], where="post", color=COMMAND, linewidth=1.2, label="commanded")
         axes.set_ylabel(unit, fontsize=9)
-        _legend_above(axes)
+        legend_above(axes)
     turn.set_xlabel("time since the first control tick in s", fontsize=9)
     for axes in (delay, speed, turn):
         for start_s, end_s in _spans(tick_s, [t["reason"] != "ok" for t in ticks]):
             axes.axvspan(start_s, end_s, color="#f3e3c3", alpha=0.7, linewidth=0)
-        _tidy(axes)
-    return _png(figure)
+        tidy(axes)
+    return png(figure)
 
 
 def _smooth(values: Array, width: int = 10) -> Array:

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from sim_hil.report_style import percentile
 from tools.report.checks import moved_under_command_m
-from tools.report.run_data import Record, RunData, odometry_in_world, percentile, truth_at
+from tools.report.run_data import Record, RunData, odometry_in_world, truth_at
 
 RUNNER = "edge-run, its own clock"
 LOG = "flight log"

@@ -82,11 +82,6 @@ class RunData:
         return float(self.settings["duration_s"])
 
 
-def percentile(samples: Array, percent: float) -> float:
-    """Nearest rank, a value that occurred: the same as the runner's `edge.stats.percentiles`."""
-    return float(np.percentile(samples, percent, method="inverted_cdf"))
-
-
 def load_json(path: Path) -> Record:
     """One JSON object from a file; ReportError names the file otherwise."""
     try:

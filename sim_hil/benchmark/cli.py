@@ -1,0 +1,248 @@
+"""`edge-bench`: runs the benchmark's episodes and measures success, collisions and latency together."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from edge.artifact_files import ArtifactError
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    check_result_target,
+    write_result,
+)
+from firmware_bridge.config import ConfigError
+from sim_hil.benchmark.bench_run import BenchRun, bench_result, choose
+from sim_hil.benchmark.cluster import ClusterError, ClusterJobs
+from sim_hil.benchmark.conditions import (
+    BASELINES,
+    CLOCKS,
+    DEFAULT_LATENCY_S,
+    DRIFTS,
+    MODES,
+    Conditions,
+    ConditionsError,
+    PolicySpec,
+)
+from sim_hil.benchmark.episode import SuiteError, load_suite, suite_names
+from sim_hil.benchmark.external_protocol import Address, ExternalError
+from sim_hil.benchmark.jobs import Backend, RefusedRunError
+from sim_hil.benchmark.latency import LatencyError, LatencyProfile, parse_latency
+from sim_hil.benchmark.local_jobs import LocalJobs
+from sim_hil.benchmark.progress import BenchProgress
+from sim_hil.benchmark.report import write_report
+from sim_hil.benchmark.run_episode import VIDEO_CHOICES
+from sim_hil.benchmark.store import ResultStore, StoreError
+from sim_hil.scene import SceneError
+
+EXAMPLES = """examples:
+  edge-bench --suite dynanav --policy expert --jobs 2 --out out/expert
+  edge-bench --suite dynanav --episodes 'hospital-*' --policy artifacts:out/nano --latency 2 --out out/nano-2s
+  edge-bench --suite dynanav --policy artifacts:out/nano --latency profile:flight.mcap --drift severe --json -
+  edge-bench --suite dynanav --policy external:127.0.0.1:7001 --latency 1.5 --video failed --out out/theirs
+  edge-bench --suite dynanav --policy expert --cluster 10.0.0.5:6379 --out out/expert
+  edge-bench compare out/nano-2s out/nano-5s      # paired differences with intervals
+  edge-bench report out/nano-2s                   # write report.html again
+  edge-bench validate --help                      # check a suite: goals reachable, landmarks visible
+
+docs/benchmark.md has the command of every row of the paper's tables.
+exit codes: 0 done, 1 an episode has no result, 2 bad arguments or input, 3 refused (artifacts), 130 interrupted
+"""
+
+_BAD_INPUT = (
+    ConditionsError,
+    LatencyError,
+    SuiteError,
+    SceneError,
+    StoreError,
+    ExternalError,
+    ClusterError,
+    ConfigError,
+    OSError,
+)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line of a run."""
+    p = argparse.ArgumentParser(
+        "edge-bench", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--suite", required=True, metavar="NAME|FILE", help=f"one of: {', '.join(suite_names())}; or a file")
+    p.add_argument("--episodes", action="append", default=[], metavar="GLOB", help="ids to run; may be repeated")
+    p.add_argument("--policy", required=True, metavar="P", help=f"artifacts:DIR, external:ADDR, {', '.join(BASELINES)}")
+    p.add_argument("--clock", choices=CLOCKS, default="lockstep", help="default lockstep: virtual time, deterministic")
+    p.add_argument("--mode", choices=MODES, help="of a policy from artifacts (default async)")
+    p.add_argument(
+        "--latency", metavar="S|profile:FILE",
+        help="time of a generation (of an external policy's answer): seconds, or a profile, an edge-run result or a "
+        "flight log (default: 2 s, 0.25 s without reasoning; external: none)",
+    )  # fmt: skip
+    p.add_argument("--drift", choices=DRIFTS, default="none", help="of odometry (paper, table 14)")
+    p.add_argument("--variant", metavar="NAME", help="of the model: DIR/NAME, checked against its manifest")
+    p.add_argument("--wording", type=int, default=0, metavar="N", help="which of the instructions, from 0 (default 0)")
+    p.add_argument("--camera", default="auto", metavar="WxH", help="render this picture though no policy looks at it")
+    p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for an answer (default 60)")
+    p.add_argument("--jobs", type=int, default=1, metavar="N", help="episodes at a time, a process each (default 1)")
+    p.add_argument("--cluster", metavar="ADDR", help="hand the episodes to the Ray cluster at HOST:PORT instead")
+    p.add_argument("--out", type=Path, metavar="DIR", help="results, logs, videos, report.html; can be resumed")
+    p.add_argument("--resume", action="store_true", help="continue the run in --out")
+    p.add_argument("--video", choices=VIDEO_CHOICES, default="none", help="of which episodes (default none)")
+    p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; see EXAMPLES for the exit codes."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if argv and argv[0] in ("compare", "report"):
+        from sim_hil.benchmark import compare
+
+        return compare.main(argv)
+    if argv and argv[0] == "validate":
+        from sim_hil.benchmark import validate
+
+        return int(validate.main(argv[1:]))
+    args = parser().parse_args(argv)
+    try:
+        return _run(args)
+    except ArtifactError as error:
+        return _complain(error, EXIT_REFUSED)
+    except RefusedRunError as error:
+        return _complain(error, error.code)
+    except _BAD_INPUT as error:
+        return _complain(error, EXIT_BAD_INPUT)
+
+
+def conditions_of(args: argparse.Namespace) -> Conditions:
+    """What the arguments ask for; raises ConditionsError, LatencyError, ExternalError."""
+    policy = PolicySpec.parse(args.policy)
+    if policy.kind == "external":
+        Address.parse(policy.where)
+    mode = args.mode
+    if policy.kind == "artifacts":
+        mode = mode or "async"
+    latency = None if args.latency is None else parse_latency(args.latency)
+    if latency is None and policy.kind == "artifacts" and args.clock == "lockstep":
+        latency = LatencyProfile.constant(DEFAULT_LATENCY_S[mode])
+    return Conditions(
+        policy=policy,
+        clock=args.clock,
+        mode=mode,
+        latency=latency,
+        drift=args.drift,
+        variant=args.variant,
+        wording=args.wording,
+        camera=args.camera,
+        external_timeout_s=args.external_timeout,
+    )
+
+
+def _run(args: argparse.Namespace) -> int:
+    check_result_target(args.json)
+    if args.out is None and (args.resume or args.video != "none"):
+        raise ConditionsError("--resume and --video: expected --out DIR with them")
+    conditions = conditions_of(args)
+    run = BenchRun.plan(args.suite, choose(load_suite(args.suite), args.episodes), conditions)
+    started_ns = time.monotonic_ns()
+    with _directory(args.out) as folder, stop_flag() as stop:
+        backend = _backend(args)
+        try:
+            store = (ResultStore.resume if args.resume else ResultStore.create)(folder, run.config())
+            with BenchProgress(len(run.episodes), len(store.results)) as progress:
+                finished = run.run(store, backend, args.video, lambda: bool(stop), progress.watcher)
+        finally:
+            backend.close()
+        result = bench_result(run, store, finished=finished, started_ns=started_ns)
+        _tell(args, store, result)
+    if not finished:
+        again = f"; continue with --resume --out {args.out}" if args.out is not None else ""
+        counted = f"{result['summary']['episodes']} of {len(run.episodes)} episodes have a result"
+        return _complain(f"interrupted, {counted}{again}", EXIT_INTERRUPTED)
+    return EXIT_CHECK_FAILED if store.failed else EXIT_DONE
+
+
+def _backend(args: argparse.Namespace) -> Backend:
+    if args.cluster is not None:
+        return ClusterJobs(args.cluster)
+    return LocalJobs(args.jobs)
+
+
+@contextmanager
+def _directory(out: Path | None) -> Iterator[Path]:
+    if out is not None:
+        yield out.absolute()
+        return
+    folder = Path(tempfile.mkdtemp(prefix="edge-bench-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def stop_flag() -> Iterator[list[int]]:
+    """A list that holds the number of the signal that asked for an end; empty until then."""
+    asked: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _tell(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:
+    write_result(args.json, result)
+    if args.out is not None:
+        write_result(str(store.directory / "result.json"), result)
+        report = write_report(store, result["summary"], f"DynaNav: {Path(args.suite).stem}, {args.policy}")
+        sys.stderr.write(f"edge-bench: {report}\n")
+    if args.json != "-":
+        sys.stdout.write(summary_lines(result))
+
+
+def summary_lines(result: dict[str, Any]) -> str:
+    """The numbers of a run for a terminal."""
+    summary = result["summary"]
+    rows = [("all", summary)]
+    rows += [(key, means) for group in ("by_scene", "by_crowd", "by_robot") for key, means in summary[group].items()]
+    lines = [f"{'':<14}{'episodes':>9}{'SR %':>8}{'SPL %':>8}{'NE m':>8}{'CR %':>8}"]
+    for name, means in rows:
+        cells = "".join(
+            f"{'–' if means[key] is None else format(means[key], '.2f'):>8}" for key in ("sr", "spl", "ne_m", "cr")
+        )
+        lines.append(f"{name:<14}{means['episodes']:>9}{cells}")
+    if summary["sr_ci95"] is not None:
+        (a, b), (c, d) = summary["sr_ci95"], summary["cr_ci95"]
+        lines.append(f"95 % intervals: SR {a:.1f} to {b:.1f}, CR {c:.1f} to {d:.1f}")
+    delay = result["latency"]["delay_s"]
+    if delay["mean"] is not None:
+        lines.append(f"delay: mean {delay['mean']:.2f} s, p99 {delay['p99']:.2f} s, max {delay['max']:.2f} s")
+    lines.append(f"{result['simulated_s']:.0f} s simulated in {result['wall_s']:.0f} s")
+    return "\n".join(lines) + "\n"
+
+
+def _complain(what: object, code: int) -> int:
+    sys.stderr.write(f"edge-bench: {what}\n")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

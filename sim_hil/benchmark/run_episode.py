@@ -1,0 +1,156 @@
+"""One episode from beginning to end: a fresh world, a policy, a record. The clocks differ only in who moves time on."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sim_hil.benchmark.conditions import Conditions, ConditionsError
+from sim_hil.benchmark.episode import Episode, SuiteError
+from sim_hil.benchmark.episode_log import EpisodeLog
+from sim_hil.benchmark.policies import camera_for, open_policy
+from sim_hil.benchmark.results import EpisodeResult
+from sim_hil.benchmark.store import EPISODES, VIDEOS
+from sim_hil.benchmark.video import EpisodeVideo
+from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
+
+VIDEO_CHOICES = ("all", "failed", "none")
+Tell = Callable[[float], None]
+"""Told the episode's time, s, now and then."""
+
+
+@dataclass(frozen=True)
+class EpisodeTask:
+    """One episode to run, as it is handed to a worker; files go below `folder`."""
+
+    episode: Episode
+    conditions: Conditions
+    folder: Path
+    video: str = "none"
+    manifest_sha256: str = ""
+    attempt: int = 1
+
+    def __post_init__(self) -> None:
+        if self.video not in VIDEO_CHOICES:
+            raise ConditionsError(f"video {self.video!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        wordings = len(self.episode.instructions)
+        if self.conditions.wording >= wordings:
+            raise ConditionsError(
+                f"wording {self.conditions.wording}: episode {self.episode.id} has {wordings}, counted from 0"
+            )
+
+    @property
+    def instruction(self) -> str:
+        """What the robot is told."""
+        return self.episode.instructions[self.conditions.wording]
+
+    @property
+    def log_path(self) -> Path:
+        """Where the episode's log goes."""
+        return self.folder / EPISODES / f"{self.episode.id}.json"
+
+    @property
+    def video_path(self) -> Path:
+        """Where its video goes."""
+        return self.folder / VIDEOS / f"{self.episode.id}.mp4"
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        values = {key: getattr(self, key) for key in ("video", "manifest_sha256", "attempt")}
+        conditions = self.conditions.as_json()
+        return {**values, "episode": asdict(self.episode), "conditions": conditions, "folder": str(self.folder)}
+
+    @staticmethod
+    def of_json(content: Mapping[str, Any]) -> EpisodeTask:
+        """A task that `as_json` has written; raises ConditionsError, SuiteError."""
+        try:
+            raw = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
+            rest = {key: content[key] for key in ("video", "manifest_sha256", "attempt")}
+            conditions = Conditions.of_json(content["conditions"])
+            return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise SuiteError(f"task: expected what the benchmark hands to a worker ({error!r})") from error
+
+
+def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+    """Virtual time: the world waits for the policy in every control period, so the same task gives the same bytes."""
+    started_ns = time.monotonic_ns()
+    episode, log = task.episode, EpisodeLog()
+    with ExitStack() as cleanup:
+        policy = open_policy(task.conditions, task.manifest_sha256)
+        cleanup.callback(policy.close)
+        options = WorldOptions(camera=camera_for(task.conditions, policy), drift=task.conditions.drift)
+        world = EpisodeWorld(episode, options)
+        cleanup.callback(world.close)
+        video = None if task.video == "none" else EpisodeVideo(task.video_path, episode, task.instruction)
+        if video is not None:
+            cleanup.callback(video.discard)
+        policy.reset(episode, task.instruction, world if policy.privileged else None, episode.seed)
+        while not world.done:
+            observation = world.observe()
+            command = policy.act(observation)
+            notes = policy.notes()
+            delay_s = notes.get("delay_s")
+            log.add(
+                observation.time_s,
+                world.pose(),
+                observation.T_odom_base,
+                command,
+                delay_s if isinstance(delay_s, float) else None,
+            )
+            if video is not None:
+                video.add(world, observation, command, notes)
+            world.step(command)
+            tell(observation.time_s)
+        outcome, notes = world.outcome(), policy.notes()
+        generations = getattr(policy, "generations", lambda: None)()
+        log.write(task.log_path, generations or [], world.people(), episode.goal_xy)
+        if video is not None and (task.video == "all" or not outcome.success or outcome.collided):
+            video.keep()
+        wall_s = (time.monotonic_ns() - started_ns) / 1e9
+        return EpisodeResult(
+            id=episode.id,
+            scene=episode.scene,
+            people=episode.people,
+            robot=episode.robot,
+            seed=episode.seed,
+            wording=task.conditions.wording,
+            instruction=task.instruction,
+            success=outcome.success,
+            ne_m=outcome.ne_m,
+            spl=100 * outcome.spl,
+            collided=outcome.collided,
+            collisions=outcome.collisions,
+            first_collision_s=outcome.first_collision_s,
+            fell=outcome.fell,
+            end=outcome.end,
+            path_m=outcome.path_m,
+            shortest_m=outcome.shortest_m,
+            time_s=outcome.time_s,
+            timeout_s=episode.timeout_s,
+            trajectory_sha256=outcome.trajectory_sha256,
+            delay_s=log.delay_summary(),
+            generations=None if generations is None else len(generations),
+            stopped_by=str(notes.get("stopped_by", "")),
+            clock=task.conditions.clock,
+            wall_s=round(wall_s, 3),
+            attempts=task.attempt,
+            host=platform.node(),
+        )
+
+
+RUNNERS: Mapping[str, Callable[[EpisodeTask, Tell], EpisodeResult]] = {"lockstep": run_lockstep}
+"""Who runs an episode on which clock; all give the same record."""
+
+
+def run_episode(task: EpisodeTask, tell: Tell = lambda _: None) -> EpisodeResult:
+    """Run one episode on its clock. Raises ConditionsError, ArtifactError, ExternalError, SceneError or OSError."""
+    runner = RUNNERS.get(task.conditions.clock)
+    if runner is None:
+        raise ConditionsError(f"--clock {task.conditions.clock}: not in this version; expected {', '.join(RUNNERS)}")
+    return runner(task, tell)

@@ -1,0 +1,94 @@
+"""The process of one episode: a task in, progress and one result out, both as lines of JSON.
+
+Its standard output belongs to the libraries (the physics engine prints), so lines go to a descriptor that it is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+
+from edge.artifact_files import ArtifactError
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
+from edge.prompt import InstructionError
+from firmware_bridge.config import ConfigError
+from sim_hil.benchmark.conditions import ConditionsError
+from sim_hil.benchmark.episode import SuiteError
+from sim_hil.benchmark.external_protocol import ExternalError
+from sim_hil.benchmark.run_episode import EpisodeTask, run_episode
+from sim_hil.scene import SceneError
+
+SINGLE_THREADED: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+"""Environment of every worker: one core each, and sums in one order."""
+TELL_EVERY_NS = 500_000_000
+_PR_SET_PDEATHSIG = 1
+
+_BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionError)
+
+
+def refusal_of(error: Exception) -> tuple[str, int] | None:
+    """The one line and exit code of an error that trying again cannot mend; None for any other."""
+    if isinstance(error, ArtifactError):
+        return str(error), EXIT_REFUSED
+    if isinstance(error, _BAD_INPUT):
+        return str(error), EXIT_BAD_INPUT
+    return None
+
+
+def end_with_parent(parent_pid: int) -> None:
+    """Let the kernel kill this process when its parent has gone, whatever ended that."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:
+        os._exit(1)  # it had gone before
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Read one task from standard input and run it; exit code 0 once the result or a refusal has been told."""
+    parser = argparse.ArgumentParser(prog="python -m sim_hil.benchmark.worker", description=__doc__)
+    parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
+    parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
+    args = parser.parse_args(argv)
+    end_with_parent(args.parent)
+    cv2.setNumThreads(1)
+    with os.fdopen(args.fd, "w", encoding="utf-8") as lines:
+
+        def tell(content: Mapping[str, Any]) -> None:
+            lines.write(json.dumps(content) + "\n")
+            lines.flush()
+
+        told_ns = time.monotonic_ns()
+
+        def tell_time(time_s: float) -> None:
+            nonlocal told_ns
+            if time.monotonic_ns() - told_ns > TELL_EVERY_NS:
+                told_ns = time.monotonic_ns()
+                tell({"time_s": time_s})
+
+        try:
+            task = EpisodeTask.of_json(json.loads(sys.stdin.read()))
+            tell({"result": run_episode(task, tell_time).as_json()})
+        except (ArtifactError, *_BAD_INPUT) as error:
+            line, code = refusal_of(error) or (str(error), EXIT_BAD_INPUT)
+            tell({"refused": line, "code": code})
+        except ExternalError as error:
+            # A policy server that is gone or misbehaves: this run has failed, another attempt may not.
+            tell({"failed": str(error)})
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
