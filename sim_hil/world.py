@@ -6,18 +6,17 @@ Each kind is one function that builds an object in its own frame: origin at the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import ceil, pi, sin
+from math import pi, sin
 
 import numpy as np
 
 from sim_hil import textures
-from sim_hil.mesh import Frame, MeshBuilder, Vec3
-from sim_hil.scene import Scene, SceneObject, Wall
+from sim_hil.mesh import Frame, MeshBuilder
+from sim_hil.scene import Scene, SceneObject
 from sim_hil.textures import rgb
+from sim_hil.world_pieces import Pieces
+from sim_hil.world_shell import add_ceiling, add_floor, add_terrain, add_wall
 from sim_hil.world_stage import Stage
-
-_PATCH_M = 2.0  # large surfaces are cut up: a face that reaches behind the camera costs precision
-_WALL_EDGE = (206, 200, 186)
 
 
 def _textured(
@@ -124,53 +123,17 @@ _BUILDERS: dict[str, Callable[[MeshBuilder, SceneObject], None]] = {
 }
 
 
-def _level_patches(mesh: MeshBuilder, texture: str, scene: Scene, z: float, period_m: float, up: bool) -> None:
-    """A horizontal surface over the whole floor, seen from above or from below."""
-    (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
-    columns, rows = ceil((x1 - x0) / _PATCH_M), ceil((y1 - y0) / _PATCH_M)
-    for i in range(columns):
-        for j in range(rows):
-            a, b = x0 + i * _PATCH_M, min(x0 + (i + 1) * _PATCH_M, x1)
-            c, d = y0 + j * _PATCH_M, min(y0 + (j + 1) * _PATCH_M, y1)
-            corners: list[Vec3] = [(a, c, z), (b, c, z), (b, d, z), (a, d, z)]
-            if not up:
-                corners = [(a, d, z), (b, d, z), (b, c, z), (a, c, z)]
-            mesh.quad(texture, corners, ((b - a) / period_m, (d - c) / period_m))
-
-
-def _wall(mesh: MeshBuilder, wall: Wall) -> None:
-    """Both long faces in patches, plus the ends and the top in a plain colour."""
-    box = wall.box
-    length, thickness, height = box.size_m
-    frame = Frame((box.centre_m[0], box.centre_m[1], 0.0), float(np.arctan2(box.axis[1], box.axis[0])))
-    patches = ceil(length / _PATCH_M)
-    for index in range(patches):
-        a = -length / 2 + index * _PATCH_M
-        b = min(a + _PATCH_M, length / 2)
-        for side in (-1.0, 1.0):
-            left, right = (a, b) if side < 0 else (b, a)
-            y = side * thickness / 2
-            corners = [frame.point(p) for p in ((left, y, 0), (right, y, 0), (right, y, height), (left, y, height))]
-            mesh.quad(wall.texture, corners, ((b - a) / 2.0, 1.0))
-        y = thickness / 2
-        mesh.face(
-            _WALL_EDGE, [frame.point(p) for p in ((a, -y, height), (b, -y, height), (b, y, height), (a, y, height))]
-        )
-    for end in (-1, 1):
-        mesh.box(frame, (end * length / 2, 0, height / 2), (0.01, thickness, height), _WALL_EDGE)
-
-
 def build_scene(stage: Stage, scene: Scene) -> None:
     """Show everything of the scene that does not move."""
-    mesh = MeshBuilder()
-    mesh.picture("floor_tiles", textures.floor_tiles())
-    mesh.picture("wall_wainscot", textures.wall_wainscot())
-    mesh.picture("ceiling_panels", textures.ceiling_panels())
-    _level_patches(mesh, scene.floor_texture, scene, 0.0, 2.0, up=True)
-    if scene.ceiling_height_m > 0:
-        _level_patches(mesh, "ceiling_panels", scene, scene.ceiling_height_m, 1.2, up=False)
+    pieces = Pieces()
+    add_floor(pieces, scene)
+    add_ceiling(pieces, scene)
+    for terrain in scene.terrain:
+        add_terrain(pieces, terrain)
     for wall in scene.walls:
-        _wall(mesh, wall)
+        add_wall(pieces, wall)
     for thing in scene.objects:
-        _BUILDERS[thing.kind](mesh, thing)
-    stage.add(mesh)
+        build = _BUILDERS.get(thing.kind, _light)
+        build(pieces.at(thing.position_m[0], thing.position_m[1]), thing)
+    for mesh in pieces.all():
+        stage.add(mesh)
