@@ -9,7 +9,7 @@ import numpy as np
 from sim_hil.crowd_map import CrowdMap
 from sim_hil.crowd_state import Array, Crowd, Doing
 
-_SIZES, _SHARES = (1, 2, 3, 4), (0.62, 0.24, 0.09, 0.05)  # most people are alone, couples are the most common group
+_SIZES, _SHARES = (1, 2, 3, 4), (0.80, 0.14, 0.04, 0.02)  # most people are alone, couples are the most common group
 # Ahead and to the left of the leader, m, for groups of two, three and four.
 _ABREAST = {
     2: ((0.0, -0.75),),
@@ -18,7 +18,7 @@ _ABREAST = {
 }
 _FILE_M = 0.85
 _CIRCLE_M = {2: 0.42, 3: 0.52, 4: 0.62}
-_LOST_M = 3.5
+_LOST_M, _OWN_WAY_S = 3.5, 4.0
 
 
 class Groups:
@@ -45,6 +45,9 @@ class Groups:
         places = [_ABREAST[int(self.size[k])][int(crowd.place_in_group[k]) - 1] for k in self._followers]
         self._slots = np.array(places, dtype=np.float64).reshape(-1, 2)
         self._furthest = np.zeros(crowd.n)
+        self.settled = np.zeros(crowd.n, dtype=np.bool_)  # followers who stand where they are while the others talk
+        self.onward_s = np.zeros(crowd.n)  # followers who make their own way for so long
+        self._c, self._s = np.cos(crowd.heading), np.sin(crowd.heading)  # where leaders are bound
 
     def patience(self, crowd: Crowd) -> Array:
         """[n]: share of their pace at which leaders walk, so that nobody is left behind."""
@@ -57,7 +60,8 @@ class Groups:
             return
         crowd.doing[who] = Doing.FOLLOW
         x, y = crowd.x[who], crowd.y[who]
-        c, s = np.cos(crowd.heading[lead]), np.sin(crowd.heading[lead])
+        self._bound(like_x, like_y)
+        c, s = self._c[lead], self._s[lead]
         ahead, left = self._slots[:, 0], self._slots[:, 1]
         sx = crowd.x[lead] + c * ahead - s * left
         sy = crowd.y[lead] + s * ahead + c * left
@@ -82,17 +86,41 @@ class Groups:
         lead_x, lead_y = np.where(talks, 0.0, crowd.vx[lead]), np.where(talks, 0.0, crowd.vy[lead])
         want_x, want_y = lead_x + 0.8 * dx, lead_y + 0.8 * dy
         # Round a corner: the way that the leader takes leads there too.
-        lost = np.flatnonzero((gap > _LOST_M) | ~ways.sees(x, y, sx, sy))
+        off_x, off_y = x - crowd.x[lead], y - crowd.y[lead]
+        in_front = ~talks & (off_x * c + off_y * s > 0.2) & (np.abs(off_y * c - off_x * s) < 0.55)
+        in_front |= ~talks & (self.onward_s[who] > crowd.now_s)
+        lost = np.flatnonzero((gap > _LOST_M) | in_front | ~ways.sees(x, y, sx, sy))
+        self.settled[who] &= talks
+        stays = self.settled[who]
+        stays[lost] |= talks[lost]
+        want_x[stays] = want_y[stays] = 0.0
         lost = lost[crowd.doing[lead[lost]] == Doing.WALK]
         if len(lost):
             tx, ty = ways.ahead(crowd.spot[lead[lost]], x[lost], y[lost])
             norm = np.hypot(tx - x[lost], ty - y[lost]) + 1e-9
-            want_x[lost], want_y[lost] = (tx - x[lost]) / norm * 2.0, (ty - y[lost]) / norm * 2.0
+            # In the leader's way one goes ahead, not back through the leader.
+            haste = np.where(in_front[lost], 0.6, 2.0) / norm
+            want_x[lost], want_y[lost] = (tx - x[lost]) * haste, (ty - y[lost]) * haste
         want = np.sqrt(want_x * want_x + want_y * want_y) + 1e-9
         most = 1.3 * crowd.free_mps[who]
         pace = np.where(talks & (gap < 0.25), 0.0, np.minimum(want, most))
         pace = np.where(pace < 0.1, 0.0, pace)
         like_x[who], like_y[who] = want_x / want * pace, want_y / want * pace
-        still = talks & (gap < 0.6)
+        still = talks & ((gap < 0.6) | (pace == 0.0))
         crowd.facing[who] = np.where(still, np.arctan2(middle_y - y, middle_x - x), np.nan)
         crowd.gesture[who] = np.where(still, 1.0, 0.0)
+
+    def lose_patience(self, crowd: Crowd, person: int) -> None:
+        """Who cannot reach the others stays put while they stand, and finds a way alone for a while when they walk."""
+        self.settled[person] = True
+        self.onward_s[person] = crowd.now_s + _OWN_WAY_S
+
+    def _bound(self, like_x: Array, like_y: Array) -> None:
+        """Turn the formations towards where their leaders want to go, which need not be where these look."""
+        norm = np.sqrt(like_x * like_x + like_y * like_y)
+        goes = norm > 0.1
+        self._c[goes] += 0.15 * (like_x[goes] / norm[goes] - self._c[goes])
+        self._s[goes] += 0.15 * (like_y[goes] / norm[goes] - self._s[goes])
+        length = np.sqrt(self._c * self._c + self._s * self._s) + 1e-9
+        self._c /= length
+        self._s /= length

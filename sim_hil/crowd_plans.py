@@ -18,9 +18,11 @@ _WEIGHTS = {"way": 1.0, "stand": 1.6, "queue": 1.6, "sit": 1.2, "door": 1.0}
 _STAY_S = {"way": (4.0, 12.0), "stand": (6.0, 22.0), "door": (1.5, 3.0), "sit": (25.0, 90.0)}
 _SERVED_S = (4.0, 10.0)
 _NEAR_M, _AT_M, _PASSED_M = 1.3, 0.3, 0.9
-_NARROW_M = 0.95  # who stands about does so where others get past
+_OPEN_M, _WALL_SIDE_M = 1.5, 0.5  # who stands about does so in the open, or close by a wall
 _GIVE_WAY_M = 0.75  # from the robot's body axis
 _SEAT_S = 1.2
+_GROUP_GAP_M = 0.9  # groups do not crowd into corners
+_PROGRESS_M = 0.4  # who has not got this far from where one was is stuck
 
 
 class Plans:
@@ -34,13 +36,13 @@ class Plans:
         else:
             self._spots = spots_of(scene, ways, rng)
         ways.add_destinations([spot.reach for spot in self._spots])
+        self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
         self._queues: dict[int, list[int]] = {k: [] for k, s in enumerate(self._spots) if s.kind == "queue"}
         self._taken: dict[tuple[int, int], int] = {}  # (spot, slot) -> person
         self._slot = np.full(crowd.n, -1, dtype=np.int64)
         self._route = np.zeros(crowd.n, dtype=np.int64)
         self._onwards = np.ones(crowd.n, dtype=np.int64)
         self._groups = Groups(crowd, rng, alone=bool(self._routes))
-        self._now_s = 0.0
 
     # -- the beginning ---------------------------------------------------------------------------------------------
 
@@ -60,7 +62,7 @@ class Plans:
             elif int(self._groups.size[person]) > 1 or rng.uniform() < 0.6 or not self._start_at_spot(person, scene):
                 self._put(person, x, y, scene)
                 self._next(person)
-                if rng.uniform() < 0.3 * (self._groups.size[person] > 1):
+                if self._groups.size[person] > 1 and rng.uniform() < 0.3 and self._roomy(person):
                     self._hold(person, float(crowd.heading[person]), (5.0, 30.0))
         crowd.like_x[:] = crowd.like_y[:] = 0.0
 
@@ -186,6 +188,8 @@ class Plans:
                 continue
             if spot.kind != "way" and (together or self._free_slot(k) < 0):
                 continue
+            if together and self._spot_gaps[k] < _GROUP_GAP_M:
+                continue
             weights[k] = _WEIGHTS[spot.kind] / (1.0 + (costs[k] / 30.0) ** 2)
         if away_from is not None:
             everywhere = np.arange(len(self._spots))
@@ -201,7 +205,7 @@ class Plans:
         crowd.doing[person] = Doing.HOLD
         crowd.target_x[person], crowd.target_y[person] = crowd.x[person], crowd.y[person]
         crowd.facing[person] = heading
-        crowd.until_s[person] = self._now_s + float(rng.uniform(*stay_s))
+        crowd.until_s[person] = crowd.now_s + float(rng.uniform(*stay_s))
         if int(self._groups.size[person]) > 1:
             crowd.gesture[person] = TALKING
         else:
@@ -217,7 +221,7 @@ class Plans:
             crowd.doing[person] = Doing.SIT
             crowd.facing[person] = what.heading_rad
             crowd.gesture[person] = PHONE if rng.uniform() < 0.4 else 0.0
-            crowd.until_s[person] = self._now_s + float(rng.uniform(*_STAY_S["sit"]))
+            crowd.until_s[person] = crowd.now_s + float(rng.uniform(*_STAY_S["sit"]))
         elif what.kind == "queue" and self._free_slot(spot) >= 0:
             self._queues[spot].append(person)
             crowd.doing[person], crowd.until_s[person] = Doing.QUEUE, np.inf
@@ -232,14 +236,14 @@ class Plans:
     def _roomy(self, person: int) -> bool:
         at = self._crowd.x[person : person + 1], self._crowd.y[person : person + 1]
         gap = float(self._ways.gaps_at(*at)[0])
-        return gap > _NARROW_M or (int(self._groups.size[person]) == 1 and gap < 0.5)
+        return gap > _OPEN_M or (int(self._groups.size[person]) == 1 and gap < _WALL_SIDE_M)
 
     # -- ten times a second ----------------------------------------------------------------------------------------
 
     def update(self, now_s: float, dt: float, robot: RobotSeen) -> None:
         """Take the decisions that are due and set what velocity everybody would like."""
         crowd = self._crowd
-        self._now_s = now_s
+        crowd.now_s = now_s
         walking = crowd.doing == Doing.WALK
         dx, dy = crowd.target_x - crowd.x, crowd.target_y - crowd.y
         distance = np.sqrt(dx * dx + dy * dy)
@@ -277,7 +281,7 @@ class Plans:
             near = np.hypot(crowd.x - what.reach[0], crowd.y - what.reach[1]) < 0.55
             near[person] = False
             if near.any():  # somebody stands before the chair
-                crowd.until_s[person] = self._now_s + 1.0
+                crowd.until_s[person] = crowd.now_s + 1.0
                 return
             crowd.until_s[person] = -1.0  # getting up; _sit does the rest
             return
@@ -295,17 +299,19 @@ class Plans:
             crowd.until_s[first] == np.inf
             and hypot(crowd.x[first] - what.slots[0][0], crowd.y[first] - what.slots[0][1]) < 0.4
         ):
-            crowd.until_s[first] = self._now_s + float(self._rng.uniform(*_SERVED_S))
+            crowd.until_s[first] = crowd.now_s + float(self._rng.uniform(*_SERVED_S))
 
     def _unstick(self, dt: float) -> None:
         """Who wants to move and cannot loses patience, sooner or later: squeezes, turns back, or settles for here."""
         crowd = self._crowd
-        speed2 = crowd.vx * crowd.vx + crowd.vy * crowd.vy
-        wants = crowd.like_x * crowd.like_x + crowd.like_y * crowd.like_y > 0.04
-        blocked = wants & (speed2 < 0.03)
-        crowd.stuck_s = np.where(blocked, crowd.stuck_s + dt, np.maximum(crowd.stuck_s - 0.5 * dt, 0.0))
+        wants = crowd.like_x * crowd.like_x + crowd.like_y * crowd.like_y > 0.02
+        got_on = np.hypot(crowd.x - crowd.anchor_x, crowd.y - crowd.anchor_y) > _PROGRESS_M
+        fresh = got_on | ~wants
+        crowd.anchor_x = np.where(fresh, crowd.x, crowd.anchor_x)
+        crowd.anchor_y = np.where(fresh, crowd.y, crowd.anchor_y)
+        crowd.stuck_s = np.where(fresh, 0.0, crowd.stuck_s + dt)
         crowd.squeeze_s -= dt
-        for person in np.flatnonzero(blocked & (crowd.stuck_s > crowd.patience_s)):
+        for person in np.flatnonzero(crowd.stuck_s > crowd.patience_s):
             self._lose_patience(int(person))
 
     def _lose_patience(self, person: int) -> None:
@@ -315,11 +321,13 @@ class Plans:
         if crowd.doing[person] == Doing.WALK:
             spot = self._spots[int(crowd.spot[person])]
             left = hypot(crowd.target_x[person] - crowd.x[person], crowd.target_y[person] - crowd.y[person])
-            if left < 1.2 and spot.kind in ("stand", "door", "way") and not self._routes:
+            if left < 1.2 and spot.kind == "stand":
                 self._hold(person, float(crowd.heading[person]), (3.0, 8.0))
                 return
             norm = hypot(crowd.like_x[person], crowd.like_y[person]) or 1.0
             self._next(person, away_from=(crowd.like_x[person] / norm, crowd.like_y[person] / norm))
+        elif crowd.doing[person] == Doing.FOLLOW:
+            self._groups.lose_patience(crowd, person)
         elif crowd.doing[person] == Doing.HOLD:
             crowd.target_x[person], crowd.target_y[person] = crowd.x[person], crowd.y[person]
 

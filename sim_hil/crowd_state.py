@@ -28,6 +28,7 @@ class Crowd:
     def __init__(self, count: int, rng: np.random.Generator) -> None:
         n = count
         self.n = n
+        self.now_s = 0.0
         self.x, self.y, self.vx, self.vy = (np.zeros(n) for _ in range(4))
         self.wish_x, self.wish_y = np.zeros(n), np.zeros(n)  # the velocity picked last
         self.meet_s = np.full(n, 1e3)  # when it would run into somebody
@@ -55,6 +56,7 @@ class Crowd:
         self.leader = np.full(n, -1, dtype=np.int64)
         self.group = np.arange(n, dtype=np.int64)
         self.place_in_group = np.zeros(n, dtype=np.int64)
+        self.anchor_x, self.anchor_y = np.zeros(n), np.zeros(n)  # where one last got on
         self.stuck_s, self.squeeze_s = np.zeros(n), np.zeros(n)
 
         self.seen_s, self.lost_s = np.zeros(n), np.zeros(n)
