@@ -34,6 +34,8 @@ ROBOT_FIELDS = 19  # render_state of a Go2: position, quaternion xyzw, 12 joint 
 _CONTACT_S = 0.01  # how often contacts are looked at: they last longer than this
 _NEAR_M = 2.5  # people this close have a body that can be walked into; the others only a place
 _MAX_BODIES = 24  # more people do not fit into that circle
+_SHARED = 16  # boxes in one body: as many as the engine takes
+_BLOCK_M = 8.0  # boxes this close to each other count as neighbours
 _SETTLE_S = 6.0  # what a robot may take to get ready before it counts as broken
 _FOOTING: Final = 0.9  # friction of what is walked on
 # Slippery sides: with friction, a foot that brushes a wall climbs it and the robot topples over its own leg.
@@ -106,7 +108,7 @@ class Simulation:
         self._floor = self._static(ground, friction=_FOOTING)
         for piece in scene.terrain_pieces():
             self._raised(piece)
-        self._labels = {self._static(box, friction=_SIDES): label for label, box in scene.obstacles()}
+        self._solids = self._obstacles(scene.obstacles())
         self._aside = (x1 + 50.0, y1 + 50.0)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_HEIGHT_M, physicsClientId=client
@@ -114,10 +116,12 @@ class Simulation:
         hidden = self._hidden()
         bodies = min(len(self._walkers), _MAX_BODIES)
         self._person_bodies = [
-            pybullet.createMultiBody(0, shape, hidden, self._parking(slot), physicsClientId=client)
+            pybullet.createMultiBody(
+                0, shape, hidden, self._parking(slot), useMaximalCoordinates=1, physicsClientId=client
+            )
             for slot in range(bodies)
         ]
-        self._labels.update((body, "person") for body in self._person_bodies)
+        self._is_person = frozenset(self._person_bodies)
         self._embodied = [-1] * bodies
         if self._gui:
             stage = BulletStage(client, folder)
@@ -148,6 +152,24 @@ class Simulation:
         turn = pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0])))
         return self._immovable(shape, box.centre_m, turn, friction)
 
+    def _obstacles(self, boxes: list[tuple[str, Box]]) -> dict[int, list[tuple[str, Box]]]:
+        """Make bodies of the boxes, neighbours sharing one: every body costs time in every step."""
+        ordered = sorted(boxes, key=lambda item: (item[1].centre_m[0] // _BLOCK_M, item[1].centre_m[1] // _BLOCK_M))
+        solids = {}
+        for first in range(0, len(ordered), _SHARED):
+            group = ordered[first : first + _SHARED]
+            shape = pybullet.createCollisionShapeArray(
+                shapeTypes=[pybullet.GEOM_BOX] * len(group),
+                halfExtents=[[extent / 2 for extent in box.size_m] for _, box in group],
+                collisionFramePositions=[box.centre_m for _, box in group],
+                collisionFrameOrientations=[
+                    pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0]))) for _, box in group
+                ],
+                physicsClientId=self._client,
+            )
+            solids[self._immovable(shape, (0, 0, 0), (0, 0, 0, 1), _SIDES)] = group
+        return solids
+
     def _raised(self, piece: ConvexPiece) -> int:
         corners = np.array(piece.vertices_m)
         middle = corners.mean(axis=0)
@@ -160,7 +182,12 @@ class Simulation:
         self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float
     ) -> int:  # fmt: skip
         client = self._client
-        body = int(pybullet.createMultiBody(0, shape, self._hidden(), position, turn, physicsClientId=client))
+        # As a plain rigid body: a multi-body that cannot move would be solved for in every step all the same.
+        body = int(
+            pybullet.createMultiBody(
+                0, shape, self._hidden(), position, turn, useMaximalCoordinates=1, physicsClientId=client
+            )
+        )
         pybullet.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
         return body
 
@@ -248,10 +275,12 @@ class Simulation:
     def _watch(self) -> None:
         labels = set()
         for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self._client):
-            label = self._labels.get(contact[2])
             # The engine also lists what is about to touch, up to 2 cm away.
-            if label is not None and (contact[9] > 0.0 or contact[8] < 0.0):
-                labels.add(label)
+            if contact[9] > 0.0 or contact[8] < 0.0:
+                if contact[2] in self._is_person:
+                    labels.add("person")
+                elif contact[2] in self._solids:
+                    labels.add(_nearest_label(self._solids[contact[2]], contact[6]))
         (x, y, _), _ = self._robot.pose()
         if len(self._people) and bool(
             np.any(np.hypot(self._people[:, 0] - x, self._people[:, 1] - y) < PERSON_COLLISION_M)
@@ -339,3 +368,18 @@ class Simulation:
             with suppress(pybullet.error):
                 pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
+
+
+def _nearest_label(boxes: list[tuple[str, Box]], point: tuple[float, float, float]) -> str:
+    """Label of the box whose surface is nearest to a point, or that holds it."""
+
+    def gap_m(box: Box) -> float:
+        dx, dy, dz = (p - c for p, c in zip(point, box.centre_m, strict=True))
+        c, s = box.axis
+        return max(
+            abs(c * dx + s * dy) - box.size_m[0] / 2,
+            abs(c * dy - s * dx) - box.size_m[1] / 2,
+            abs(dz) - box.size_m[2] / 2,
+        )
+
+    return min(boxes, key=lambda item: gap_m(item[1]))[0]
