@@ -20,10 +20,11 @@ HORIZON_S = 2.6  # collisions further off than this worry nobody
 # Turns, rad (left positive), and shares of the own pace; then standing, half a step back, and going on as now.
 _TURNS = np.array((0.0, 0.18, -0.18, 0.4, -0.4, 0.7, -0.7, 1.05, -1.05, 1.6, -1.6))
 _FAST = len(_TURNS)
-_SLOW = np.array((0.0, 0.25, -0.25, 0.7, -0.7, 1.3, -1.3))
+_SLOW = np.array((0.0, 0.25, -0.25, 0.7, -0.7, 1.3, -1.3, 2.1, -2.1))
 _ANGLES = np.concatenate((_TURNS, _SLOW, (0.0, np.pi)))
 _SHARES = np.concatenate((np.full(_FAST, 1.0), np.full(len(_SLOW), 0.5), (0.0, 0.3)))
 _COS, _SIN = np.cos(_ANGLES) * _SHARES, np.sin(_ANGLES) * _SHARES
+_IDLE = np.append(1.0 - _SHARES, 0.5)
 _LEFT = np.append(np.where((_ANGLES > 0) & (_ANGLES < 3), 0.05, 0.0), 0.0)  # passing on the right is the habit
 
 _COLLISION, _CLOSE, _INERTIA, _WALL, _WALL_AIR = 3.2, 0.9, 0.35, 2.6, 0.45
@@ -53,11 +54,12 @@ class Nearby:
 
 def choose(
     ways: CrowdMap, position: tuple[Array, Array], velocity: tuple[Array, Array], liking: tuple[Array, Array],
-    pace_mps: Array, nearby: Nearby,
+    pace_mps: Array, hurry: Array, nearby: Nearby,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Velocities picked by m people, and when they would run into somebody at that, s.
 
-    position, velocity, liking: x and y of each [m], m and m/s; pace_mps [m] is the speed of the fastest candidates.
+    position, velocity, liking: x and y of each [m], m and m/s; pace_mps [m] is the speed of the fastest candidates;
+    hurry [m] is what standing still costs beyond not getting on: who has waited long rather goes round about.
     """
     (x, y), (vx, vy), (lx, ly) = position, velocity, liking
     norm = np.sqrt(lx * lx + ly * ly)
@@ -69,6 +71,7 @@ def choose(
     cost = np.hypot(cx - lx[:, None], cy - ly[:, None]) * per_pace
     cost += np.hypot(cx - vx[:, None], cy - vy[:, None]) * (_INERTIA * per_pace)
     cost += _LEFT
+    cost += hurry[:, None] * _IDLE
 
     meet_s, closeness = _meetings(cx, cy, nearby)
     cost += _COLLISION * np.maximum(1.0 / (meet_s + _SOON_S) - 1.0 / (HORIZON_S + _SOON_S), 0.0)

@@ -41,8 +41,9 @@ _BODIES_M = 0.45  # two people are never closer
 _ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
 _ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
 _WALL_M = 0.22
+_HURRY_PER_S = 0.3  # see crowd_steering.choose
 _SPEED_UP_MPS2, _BRAKE_MPS2 = 1.8, 3.5
-_FASTEST_MPS = 1.9
+_FASTEST_MPS, _SIT_DOWN_MPS = 1.9, 0.6
 _TURN_RADPS = 2.8
 _STEP_PER_ROOT_SPEED = 0.6245  # step length m = this * sqrt(speed): a walk ratio of 0.0065 m min (Sekiya et al. 1996)
 _FULL_STEP_M = 0.71  # of an amplitude of 1
@@ -136,8 +137,9 @@ class People:
         nearby = self._around(me, near, dx[active[:, None], near], dy[active[:, None], near], gap2[rows, near], robot)
         liking = crowd.like_x[me], crowd.like_y[me]
         pace = np.maximum(np.sqrt(liking[0] * liking[0] + liking[1] * liking[1]), 0.35)
+        hurry = _HURRY_PER_S * np.minimum(crowd.stuck_s[me], 5.0)
         picked = choose(
-            self._ways, (crowd.x[me], crowd.y[me]), (crowd.vx[me], crowd.vy[me]), liking, pace, nearby
+            self._ways, (crowd.x[me], crowd.y[me]), (crowd.vx[me], crowd.vy[me]), liking, pace, hurry, nearby
         )  # fmt: skip
         crowd.wish_x[me], crowd.wish_y[me], crowd.meet_s[me] = picked
 
@@ -190,9 +192,9 @@ class People:
         sits = np.flatnonzero(crowd.doing == Doing.SIT)
         if len(sits):
             # Onto a seat and off it is a movement of its own, at the pace of sitting down.
-            pull = min(3.5 * dt, 1.0)
-            x[sits] = crowd.x[sits] + (crowd.target_x[sits] - crowd.x[sits]) * pull
-            y[sits] = crowd.y[sits] + (crowd.target_y[sits] - crowd.y[sits]) * pull
+            dx, dy = crowd.target_x[sits] - crowd.x[sits], crowd.target_y[sits] - crowd.y[sits]
+            share = np.minimum(_SIT_DOWN_MPS * dt / (np.sqrt(dx * dx + dy * dy) + 1e-9), 1.0)
+            x[sits], y[sits] = crowd.x[sits] + dx * share, crowd.y[sits] + dy * share
         dx, dy = x - crowd.x, y - crowd.y
         most = _FASTEST_MPS * dt
         share = np.minimum(most / (np.sqrt(dx * dx + dy * dy) + 1e-9), 1.0)
