@@ -11,10 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from edge.geometry import SE2, wrap_angle
+from edge.geometry import wrap_angle
 from sim_hil.can import frames
 from sim_hil.can.e2e import Frame, Verdict
 from sim_hil.can.frames import Decoder, Encoder, Received
+from sim_hil.carter_sensors import Sensors
 
 COMMAND_TIMEOUT_S: Final = 0.100
 HEARTBEAT_TIMEOUT_S: Final = 0.500
@@ -25,6 +26,7 @@ BATTERY_LOW_PERCENT: Final = 10.0
 # Error classes of the kernel's error frames (linux/can/error.h).
 ERROR_BUS_OFF: Final = 0x040
 ERROR_RESTARTED: Final = 0x100
+_TICK_S: Final = 1e-6  # a sum of steps is not exact
 _LEVELS: Final = ("CommandTimeout", "HeartbeatLost", "BatteryLow", "DriveOverload")
 _SIDES: Final = ("Front", "Rear", "Left", "Right")
 
@@ -58,25 +60,6 @@ class Base(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Sensors:
-    """What the base measures: pairs are (left, right), vectors in the base frame; bumpers front, rear, left, right."""
-
-    T_odom_base: SE2
-    v_mps: float
-    w_radps: float
-    wheel_radps: tuple[float, float]
-    wheel_nm: tuple[float, float]
-    wheel_counts: tuple[int, int]
-    gyro_radps: tuple[float, float, float]
-    accel_mps2: tuple[float, float, float]
-    charge_percent: float
-    voltage_v: float
-    current_a: float
-    bumpers: tuple[bool, bool, bool, bool]
-    overload: bool
-
-
 @dataclass
 class Counts:
     """What was received and not obeyed, and how often the bus was off."""
@@ -91,8 +74,8 @@ class Counts:
 
     @property
     def malformed(self) -> int:
-        """Frames that no correct sender makes."""
-        return self.wrong_crc + self.wrong_length + self.unknown
+        """Frames that no correct sender makes; one for somebody else on the bus is none of them."""
+        return self.wrong_crc + self.wrong_length
 
 
 class CanNode:
@@ -200,7 +183,7 @@ class CanNode:
         return self._heartbeat_s is not None and now_s - self._heartbeat_s <= HEARTBEAT_TIMEOUT_S
 
     def _timed_out(self, now_s: float) -> bool:
-        return self._command_s is None or now_s - self._command_s > COMMAND_TIMEOUT_S
+        return self._command_s is None or now_s - self._command_s > COMMAND_TIMEOUT_S + _TICK_S
 
     def step(self, now_s: float) -> None:
         """Stop when nobody has commanded in time; come back to the bus; heed the red button."""
