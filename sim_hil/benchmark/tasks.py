@@ -1,0 +1,121 @@
+"""Tasks drawn from a scene: a start, a landmark to go to, and the way between them told; for episodes and training."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from math import atan2, cos, hypot, pi, sin
+
+import numpy as np
+
+from sim_hil.benchmark.openings import LINEAR, bounds_of
+from sim_hil.benchmark.route import RouteError, Told, tell
+from sim_hil.nav_grid import NavGrid
+from sim_hil.scene import Area, Scene, SceneObject, Vec2, Vec3
+
+GOAL_GAP_M = 0.95  # from a landmark's front to the goal: a robot stands there without touching it
+_LYING = frozenset(("carpet",))
+_NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "clock", "planter"))
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where to go: `path` is the shortest way from `start` to `goal`, m, for the grid's robot; `told` is what to say."""
+
+    start: Vec3
+    goal: Vec2
+    goal_label: str
+    path: tuple[Vec2, ...]
+    told: Told
+
+
+def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
+    """Where to stop at a landmark, on the grid's free floor: before its front, or on a carpet; None: nowhere."""
+    x, y, _ = thing.position_m
+    if thing.kind in _LYING:
+        return (round(x, 2), round(y, 2)) if grid.is_free(x, y) else None
+    for gap in (GOAL_GAP_M, GOAL_GAP_M - 0.2, GOAL_GAP_M + 0.2, GOAL_GAP_M - 0.4):
+        reach = thing.size_m[0] / 2 + gap
+        for turn in (0.0, 0.4, -0.4):
+            angle = thing.heading_rad + turn
+            px, py = round(x + reach * cos(angle), 2), round(y + reach * sin(angle), 2)
+            if grid.is_free(px, py):
+                return (px, py)
+    return None
+
+
+def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> Task:
+    """The task to go from a start to a landmark; raises RouteError when it cannot be done or told."""
+    goal = goal_before(grid, thing)
+    if goal is None:
+        raise RouteError(f"there is no room before the {thing.landmark}")
+    path = grid.path((start[0], start[1]), goal)
+    if path is None:
+        raise RouteError(f"there is no way to the {thing.landmark}")
+    told = tell(scene, grid, path, thing)
+    return Task(start, goal, thing.label, tuple(path), told)
+
+
+def goals(scene: Scene) -> list[SceneObject]:
+    """Landmarks that one can be sent to."""
+    return [thing for thing in scene.landmarks() if thing.kind not in _NOT_GOALS]
+
+
+def starts(scene: Scene) -> list[Area]:
+    """Areas in which one can begin: those that one walks along, and rooms that one leaves."""
+    return [area for area in scene.areas if area.kind in (*LINEAR, "room") and area.kind != "crossing"]
+
+
+def draw_start(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Vec3:
+    """A free pose along a corridor, looking one way, or in a room. Raises RouteError when none was found."""
+    areas = starts(scene)
+    # Corridors by their length; a room now and then.
+    weights = np.array([_weight(area) for area in areas])
+    for _ in range(50):
+        area = areas[int(rng.choice(len(areas), p=weights / weights.sum()))]
+        box = bounds_of(area)
+        x = round(float(rng.uniform(box.x0 + 0.6, box.x1 - 0.6)), 2)
+        y = round(float(rng.uniform(box.y0 + 0.6, box.y1 - 0.6)), 2)
+        flip = bool(rng.integers(2))
+        if area.kind == "room":
+            heading = float(round(float(rng.uniform(-pi, pi)), 2))
+        else:
+            heading = (pi if flip else 0.0) if box.along_x else (-pi / 2 if flip else pi / 2)
+        if grid.clearance_m(x, y) >= grid.required_m + 0.15:
+            return (x, y, heading)
+    raise RouteError("no free start was found")
+
+
+def _weight(area: Area) -> float:
+    box = bounds_of(area)
+    return 2.0 if area.kind == "room" else max(box.x1 - box.x0, box.y1 - box.y0)
+
+
+def sample_task(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Task:
+    """One task by chance; raises RouteError when what was drawn cannot be told unmistakably (draw again)."""
+    start = draw_start(scene, grid, rng)
+    found = goals(scene)
+    thing = found[int(rng.integers(len(found)))]
+    task = make_task(scene, grid, start, thing)
+    away = _first_direction(task.path)
+    if abs(_wrapped(away - start[2])) <= pi / 3:
+        return task
+    if task.told.leaves_room:  # stand so that the door is ahead
+        return Task((start[0], start[1], round(away, 3)), task.goal, task.goal_label, task.path, task.told)
+    raise RouteError("the way begins behind the robot")
+
+
+def _first_direction(path: tuple[Vec2, ...]) -> float:
+    """Where a path leads in its first two metres."""
+    left, at = 2.0, path[0]
+    for a, b in itertools.pairwise(path):
+        length = hypot(b[0] - a[0], b[1] - a[1])
+        at = b if length <= left else (a[0] + (b[0] - a[0]) * left / length, a[1] + (b[1] - a[1]) * left / length)
+        left -= length
+        if left <= 0:
+            break
+    return atan2(at[1] - path[0][1], at[0] - path[0][0])
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + pi) % (2 * pi) - pi
