@@ -1,0 +1,144 @@
+"""`python -m sim_hil.network`: the command line of the network shim."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from sim_hil.network.config import KINDS, NetworkConfig, NetworkError, load_network
+from sim_hil.network.namespaces import Sides, cable
+from sim_hil.network.relay import Relay
+
+_INSIDE: Final = "SIM_HIL_NETWORK_INSIDE"
+
+EPILOG: Final = """links.toml:
+  seed = 1
+  [[links]]
+  name = "telemetry"
+  kind = "udp"                   # {kinds}
+  left = "127.0.0.1:14550"
+  right = "127.0.0.1:14540"
+  impairment = {{ loss_percent = 5, delay_ms = 40, jitter_ms = 10 }}   # both directions
+  back = {{ partitions = [[10, 12.5]] }}                               # right to left only, beside the above
+  keys: loss_percent loss_burst delay_ms jitter_ms duplicate_percent reorder_percent reorder_ms rate_kbps queue_bytes
+  partitions
+examples:
+  python -m sim_hil.network run links.toml --duration 60 --json -
+  python -m sim_hil.network run links.toml --control net.sock
+  python -m sim_hil.network between cable.toml --left "edge-hil --robot go2 --scene corridor --protocol unitree
+    --interface eth0" --right "edge-run --robot robot.toml ..."
+with --control, one JSON object a datagram changes a link: {{"link": "telemetry", "cut": true}}, or {{"link": "*",
+"there": {{"loss_percent": 30}}}}; the answer says when it took effect
+between: left is 192.168.123.161, right is .99, both on eth0 in network namespaces of their own (needs root); it ends
+with the right command and ends the left one
+exit codes: 0 done, of `between` the right command's own; 1 the result could not be written; 2 bad input"""
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    received: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _frame: received.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _parser() -> argparse.ArgumentParser:
+    kinds = "\n                                 # ".join(f"{kind}: {says}" for kind, says in KINDS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m sim_hil.network",
+        description="Carries the packets of other programs over links as bad as a file says.",
+        epilog=EPILOG.format(kinds=kinds),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="carry packets until a signal or --duration")
+    between = commands.add_parser("between", help="run two commands with one bad cable between them")
+    for sub in (run, between):
+        sub.add_argument("config", type=Path, metavar="LINKS.toml")
+        sub.add_argument("--duration", type=float, metavar="S", help="end after S seconds")
+        sub.add_argument("--control", type=Path, metavar="PATH", help="take changes at this local datagram socket")
+        sub.add_argument("--json", metavar="FILE|-", help="write what happened to the packets as JSON")
+    for side in ("left", "right"):
+        between.add_argument(f"--{side}", required=True, metavar="COMMAND", help="one text, split as a shell would")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; see EPILOG for the exit codes."""
+    args = _parser().parse_args(argv)
+    try:
+        config = load_network(args.config)
+        check_result_target(args.json)
+        if args.duration is not None and not 0 < args.duration < float("inf"):
+            raise NetworkError(f"--duration: expected seconds above 0, found {args.duration}")
+        if args.command == "between":
+            return _between(args, cable(config), argv)
+        with _stop_signals() as stop:
+            relay = Relay(config, control=args.control)
+            sys.stderr.write(f"network: ready, {', '.join(link.name for link in config.links)}\n")
+            sys.stderr.flush()
+            with contextlib.closing(relay):
+                relay.run(lambda: bool(stop), args.duration)
+    except (NetworkError, OSError, subprocess.CalledProcessError) as error:
+        return _complain(error, EXIT_BAD_INPUT)
+    return _written(args, relay, EXIT_DONE)
+
+
+def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | None) -> int:
+    if os.environ.get(_INSIDE) is None:
+        # Again, in a namespace of its own: the cable's ends must not appear on the machine's network.
+        command = [sys.executable, "-m", "sim_hil.network", *(sys.argv[1:] if argv is None else argv)]
+        with _stop_signals() as stop:
+            inside = subprocess.Popen(["unshare", "--net", "--", *command], env={**os.environ, _INSIDE: "1"})
+            while inside.poll() is None:
+                time.sleep(0.05)
+                if stop:
+                    inside.send_signal(stop.pop())
+        return inside.returncode
+    commands = (shlex.split(args.left), shlex.split(args.right))
+    if not all(commands):
+        raise NetworkError("--left, --right: expected a command each, found an empty text")
+    environment = os.environ.pop(_INSIDE)
+    assert environment
+    with _stop_signals() as stop:
+        sides = Sides(commands)
+        with contextlib.ExitStack() as ends:
+            ends.callback(sides.end)
+            relay = ends.enter_context(contextlib.closing(Relay(config, control=args.control)))
+            sides.connect()
+            relay.run(lambda: bool(stop) or sides.right_code() is not None, args.duration)
+            code = sides.right_code()
+    return _written(args, relay, EXIT_DONE if code is None else code)
+
+
+def _written(args: argparse.Namespace, relay: Relay, code: int) -> int:
+    try:
+        write_result(args.json, relay.summary())
+    except OSError as error:
+        return _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
+    return code
+
+
+def _complain(what: object, code: int) -> int:
+    sys.stderr.write(f"network: {what}\n")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""Two commands, each in a network namespace of its own, joined by nothing but one impaired cable.
+
+For protocols that cannot be relayed address by address, such as DDS, which finds its peers by multicast and opens ports
+as it likes. Whoever starts it must be root; the machine's own network is not touched, because even the relay runs in a
+namespace of its own.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from sim_hil.network.config import LinkConfig, NetworkConfig, NetworkError
+from sim_hil.network.side import INTERFACE
+
+# The addresses of a Go2 and of a computer beside it (protocol facts, section 1).
+ADDRESSES: Final = ("192.168.123.161/24", "192.168.123.99/24")
+_OURS: Final = ("left0", "right0")
+_END_S: Final = 10.0
+
+
+class Sides:
+    """The two commands, waiting for their cable until `connect`."""
+
+    def __init__(self, commands: tuple[list[str], list[str]]) -> None:
+        """`commands`: left and right. Raises OSError or subprocess.CalledProcessError without the rights to."""
+        self._processes: list[subprocess.Popen[bytes]] = []
+        try:
+            for address, ours, command in zip(ADDRESSES, _OURS, commands, strict=True):
+                self._processes.append(self._start(address, command))
+                self._lay(ours, self._processes[-1].pid)
+        except BaseException:
+            self.end()
+            raise
+
+    def _start(self, address: str, command: list[str]) -> subprocess.Popen[bytes]:
+        side = [sys.executable, "-m", "sim_hil.network.side", address, *command]
+        process = subprocess.Popen(["unshare", "--net", "--", *side], stdin=subprocess.PIPE)
+        deadline = time.monotonic() + _END_S
+        while _namespace(process.pid) == _namespace("self"):  # unshare itself has not got there yet
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise OSError("unshare --net: expected a new network namespace; it needs root")
+            time.sleep(0.01)
+        return process
+
+    def _lay(self, ours: str, pid: int) -> None:
+        for arguments in (
+            ["link", "add", ours, "type", "veth", "peer", "name", INTERFACE, "netns", str(pid)],
+            ["link", "set", ours, "up"],
+        ):
+            subprocess.run(["ip", *arguments], check=True)
+
+    def connect(self) -> None:
+        """Let the commands begin; the cable must be carried by now."""
+        for process in self._processes:
+            assert process.stdin is not None
+            process.stdin.write(b"go\n")
+            process.stdin.close()
+
+    def right_code(self) -> int | None:
+        """Exit status of the right command, None while it runs."""
+        return self._processes[-1].poll()
+
+    def end(self) -> None:
+        """End both commands, at first politely."""
+        for process in self._processes:
+            if process.poll() is None:
+                process.terminate()
+        for process in self._processes:
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def cable(config: NetworkConfig) -> NetworkConfig:
+    """The configuration's only link, laid between the two namespaces. Raises NetworkError."""
+    if len(config.links) != 1 or config.links[0].kind != "frames":
+        raise NetworkError("between: expected exactly one link, of kind frames, whatever its left and right are")
+    link: LinkConfig = replace(config.links[0], left=_OURS[0], right=_OURS[1])
+    return replace(config, links=(link,))
+
+
+def _namespace(pid: int | str) -> str:
+    try:
+        return str(Path(f"/proc/{pid}/ns/net").readlink())
+    except OSError:
+        return ""
