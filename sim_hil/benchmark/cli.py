@@ -158,13 +158,15 @@ def _run(args: argparse.Namespace) -> int:
     run = BenchRun.plan(args.suite, choose(load_suite(args.suite), args.episodes), conditions)
     started_ns = time.monotonic_ns()
     with _directory(args.out) as folder, stop_flag() as stop:
-        backend = _backend(args)
+        backend, store = _backend(args), None
         try:
             store = (ResultStore.resume if args.resume else ResultStore.create)(folder, run.config())
             with BenchProgress(len(run.episodes), len(store.results)) as progress:
                 finished = run.run(store, backend, args.video, lambda: bool(stop), progress.watcher)
         finally:
             backend.close()
+            if store is not None:
+                store.close()
         result = bench_result(run, store, finished=finished, started_ns=started_ns)
         _tell(args, store, result)
     if not finished:

@@ -28,6 +28,8 @@ LONGEST_NS = 7_200_000_000_000
 """An episode that takes more than two hours of real time hangs."""
 GRACE_S = 2.0
 TAIL_CHARS = 400
+_GREETING = "pybullet build time"
+"""What every process says that loads the engine; no reason to die."""
 WORKER: Sequence[str] = (sys.executable, "-m", "sim_hil.benchmark.worker")
 
 
@@ -185,5 +187,5 @@ def _tail(log: Path) -> str:
         text = log.read_text(encoding="utf-8", errors="replace")[-TAIL_CHARS:]
     except OSError:
         return ""
-    last = [line.strip() for line in text.splitlines() if line.strip()]
+    last = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith(_GREETING)]
     return f": {last[-1]}" if last else ""

@@ -1,32 +1,26 @@
-"""From the conditions of a run to a policy that drives, and to what the world has to render for it."""
+"""From the conditions of a run to a policy that drives, and to what the world has to render for it.
+
+Each kind of policy is imported when it is asked for: an episode has a process of its own, and one that drives by itself
+need not wait for ONNX Runtime.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import firmware_bridge
 from edge.artifact_files import ArtifactError
-from edge.manifest import Artifacts, load_artifacts
 from firmware_bridge.config import RobotConfig, load_robot_config
-from sim_hil.benchmark.artifacts_policy import ArtifactsPolicy, check_suits
 from sim_hil.benchmark.baselines import PointGoalPolicy, RandomPolicy, StillPolicy
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
-from sim_hil.benchmark.expert import ExpertPolicy
-from sim_hil.benchmark.external import ExternalPolicy
-from sim_hil.benchmark.external_protocol import Address
 from sim_hil.benchmark.policy import Policy
-from sim_hil.benchmark.variants import artifact_directory, check_variant
+
+if TYPE_CHECKING:
+    from edge.manifest import Artifacts
 
 ROBOT_FILE: Final = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
 """Its limits hold for both robots, so that a policy is compared on them under the same ones."""
-BASELINE_POLICIES: Final[Mapping[str, Callable[[], Policy]]] = {
-    "expert": ExpertPolicy,
-    "point-goal": PointGoalPolicy,
-    "random": RandomPolicy,
-    "still": StillPolicy,
-}
 BASELINE_CAMERA: Final = (128, 128)
 
 
@@ -37,23 +31,37 @@ def robot_config() -> RobotConfig:
 
 def open_policy(conditions: Conditions, manifest_sha256: str = "") -> Policy:
     """A policy ready for `reset`; with a hash, artifacts must be those. Raises ArtifactError, ExternalError, …"""
-    spec = conditions.policy
-    if spec.kind == "external":
-        return ExternalPolicy(
-            Address.parse(spec.where),
-            robot_config().limits,
-            timeout_s=conditions.external_timeout_s,
-            latency=conditions.latency,
-        )
-    if spec.kind != "artifacts":
-        return BASELINE_POLICIES[spec.kind]()
+    kind = conditions.policy.kind
+    if kind == "artifacts":
+        return _artifacts(conditions, manifest_sha256)
+    if kind == "external":
+        return _external(conditions)
+    if kind == "expert":
+        from sim_hil.benchmark.expert import ExpertPolicy
+
+        return ExpertPolicy()
+    return {"point-goal": PointGoalPolicy, "random": RandomPolicy, "still": StillPolicy}[kind]()
+
+
+def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:
+    from sim_hil.benchmark.artifacts_policy import ArtifactsPolicy
+    from sim_hil.benchmark.variants import artifact_directory
+
     if conditions.mode is None or conditions.latency is None:
         raise ConditionsError("a policy from artifacts needs a mode and a latency in lockstep")
-    directory = artifact_directory(Path(spec.where), conditions.variant)
+    directory = artifact_directory(Path(conditions.policy.where), conditions.variant)
     policy = ArtifactsPolicy(directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config())
     if manifest_sha256 and policy.manifest_sha256 != manifest_sha256:
         raise ArtifactError(f"{directory}: not the artifacts that this run was started with; copy them to this machine")
     return policy
+
+
+def _external(conditions: Conditions) -> Policy:
+    from sim_hil.benchmark.external import ExternalPolicy
+    from sim_hil.benchmark.external_protocol import Address
+
+    address, timeout_s = Address.parse(conditions.policy.where), conditions.external_timeout_s
+    return ExternalPolicy(address, robot_config().limits, timeout_s=timeout_s, latency=conditions.latency)
 
 
 def camera_for(conditions: Conditions, policy: Policy) -> tuple[int, int] | None:
@@ -68,6 +76,10 @@ def check_artifacts(conditions: Conditions) -> Artifacts | None:
     """Verify the artifacts of a run before any episode; None without any. Raises ArtifactError, ConditionsError."""
     if conditions.policy.kind != "artifacts":
         return None
+    from edge.manifest import load_artifacts
+    from sim_hil.benchmark.artifacts_policy import check_suits
+    from sim_hil.benchmark.variants import artifact_directory, check_variant
+
     directory = artifact_directory(Path(conditions.policy.where), conditions.variant)
     artifacts = load_artifacts(directory)
     check_suits(artifacts, conditions.mode or "async")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.episode import Episode, SuiteError
@@ -16,8 +16,10 @@ from sim_hil.benchmark.episode_log import EpisodeLog
 from sim_hil.benchmark.policies import camera_for, open_policy
 from sim_hil.benchmark.results import EpisodeResult
 from sim_hil.benchmark.store import EPISODES, VIDEOS
-from sim_hil.benchmark.video import EpisodeVideo
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
+
+if TYPE_CHECKING:
+    from sim_hil.benchmark.video import EpisodeVideo
 
 VIDEO_CHOICES = ("all", "failed", "none")
 Tell = Callable[[float], None]
@@ -87,7 +89,7 @@ def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         options = WorldOptions(camera=camera_for(task.conditions, policy), drift=task.conditions.drift)
         world = EpisodeWorld(episode, options)
         cleanup.callback(world.close)
-        video = None if task.video == "none" else EpisodeVideo(task.video_path, episode, task.instruction)
+        video = None if task.video == "none" else _video(task)
         if video is not None:
             cleanup.callback(video.discard)
         policy.reset(episode, task.instruction, world if policy.privileged else None, episode.seed)
@@ -142,6 +144,12 @@ def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
             attempts=task.attempt,
             host=platform.node(),
         )
+
+
+def _video(task: EpisodeTask) -> EpisodeVideo:
+    from sim_hil.benchmark.video import EpisodeVideo  # here: fonts and drawing are only needed for this
+
+    return EpisodeVideo(task.video_path, task.episode, task.instruction)
 
 
 RUNNERS: Mapping[str, Callable[[EpisodeTask, Tell], EpisodeResult]] = {"lockstep": run_lockstep}

@@ -8,12 +8,13 @@ episodes/ID.json, videos/ID.mp4    written before their line in results.jsonl
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from edge.cli import write_whole
 from sim_hil.benchmark.results import EpisodeResult, FailedRun, ResultError
@@ -29,7 +30,15 @@ class StoreError(ValueError):
 class ResultStore:
     """One writer; results are in the order in which they came. Methods raise OSError when the disk fails."""
 
-    def __init__(self, directory: Path, config: Mapping[str, Any], results: Sequence[EpisodeResult]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        config: Mapping[str, Any],
+        results: Sequence[EpisodeResult],
+        lock: IO[bytes] | None = None,
+    ) -> None:
+        """`lock` keeps other runs out for as long as it is open."""
+        self._lock = lock
         self.directory = directory
         self.config = config
         self._results = {result.id: result for result in results}
@@ -45,7 +54,7 @@ class ResultStore:
             )
         _make(directory)
         write_whole(directory / CONFIG, json.dumps(config, indent=1) + "\n")
-        return ResultStore(directory, config, ())
+        return ResultStore(directory, config, (), _locked(directory))
 
     @staticmethod
     def resume(directory: Path, config: Mapping[str, Any]) -> ResultStore:
@@ -59,10 +68,18 @@ class ResultStore:
                 f"--resume: {different[0]} of the run in {directory} differs from what is asked for now; repeat the "
                 f"first command, or name another directory ({_difference(found, asked, different[0])})"
             )
+        lock = _locked(directory)
         _make(directory)
         _cut_torn_line(directory / RESULTS)
         (directory / FAILED).unlink(missing_ok=True)
-        return ResultStore(directory, found, read_results(directory))
+        for partial in directory.glob("*/*.partial*"):
+            partial.unlink()
+        return ResultStore(directory, found, read_results(directory), lock)
+
+    def close(self) -> None:
+        """Let other runs in."""
+        if self._lock is not None:
+            self._lock.close()
 
     @property
     def results(self) -> list[EpisodeResult]:
@@ -119,6 +136,19 @@ def read_results(directory: Path) -> list[EpisodeResult]:
             raise StoreError(f"{path}:{number}: episode {result.id} is there twice")
         results[result.id] = result
     return list(results.values())
+
+
+def _locked(directory: Path) -> IO[bytes]:
+    """The run's directory is one process's; raises StoreError when it is another's. The kernel frees a dead one's."""
+    file = (directory / CONFIG).open("rb")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise StoreError(
+            f"--out {directory}: another edge-bench is running in it; wait for it, or name another"
+        ) from error
+    return file
 
 
 def _make(directory: Path) -> None:

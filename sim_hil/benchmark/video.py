@@ -6,6 +6,7 @@ Every second control period is a picture, ten pictures a second: twice real time
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from math import cos, hypot, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -237,5 +238,6 @@ def _wrapped(text: str, columns: int) -> list[str]:
     return [*lines, line] if line else lines
 
 
+@cache
 def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(_FONTS / name), size)
