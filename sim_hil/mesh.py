@@ -110,23 +110,43 @@ class MeshBuilder:
         colour: Colour,
         front: str = "",
         sides: str = "",
+        back: str = "",
+        top: str = "",
+        bottom: bool = True,
     ) -> None:
-        """A box in a frame; its +x face may show a picture, and so may its +y and -y faces."""
+        """A box in a frame; its faces may show pictures: front is +x, sides are +y and -y. `bottom`: whether seen."""
         (x, y, z), (a, b, c) = centre, (extent / 2 for extent in size)
         at = lambda i, j, k: frame.point((x + i * a, y + j * b, z + k * c))  # noqa: E731 - eight corners, one rule
-        faces = (
+        faces = [
             (front, (at(1, -1, -1), at(1, 1, -1), at(1, 1, 1), at(1, -1, 1))),
-            ("", (at(-1, 1, -1), at(-1, -1, -1), at(-1, -1, 1), at(-1, 1, 1))),
+            (back, (at(-1, 1, -1), at(-1, -1, -1), at(-1, -1, 1), at(-1, 1, 1))),
             (sides, (at(1, 1, -1), at(-1, 1, -1), at(-1, 1, 1), at(1, 1, 1))),
             (sides, (at(-1, -1, -1), at(1, -1, -1), at(1, -1, 1), at(-1, -1, 1))),
-            ("", (at(-1, -1, 1), at(1, -1, 1), at(1, 1, 1), at(-1, 1, 1))),
-            ("", (at(-1, 1, -1), at(1, 1, -1), at(1, -1, -1), at(-1, -1, -1))),
-        )
+            (top, (at(-1, 1, 1), at(-1, -1, 1), at(1, -1, 1), at(1, 1, 1))),
+        ]
+        if bottom:
+            faces.append(("", (at(-1, 1, -1), at(1, 1, -1), at(1, -1, -1), at(-1, -1, -1))))
         for texture, corners in faces:
             if texture:
                 self.quad(texture, corners)
             else:
                 self.face(colour, corners)
+
+    def wheel(
+        self, frame: Frame, centre: Sequence[float], radius: float, width: float, colour: Colour, sides: int = 10
+    ) -> None:
+        """A disc that stands upright, its axis along y."""
+        sides = max(round(sides * self._detail), 5)
+        (x, y, z), turns = centre, [2 * pi * (k + 0.5) / sides for k in range(sides)]
+        right, left = (
+            [frame.point((x + radius * cos(t), y + side * width / 2, z + radius * sin(t))) for t in turns]
+            for side in (-1, 1)
+        )
+        for k in range(sides):
+            n = (k + 1) % sides
+            self.face(colour, (right[k], left[k], left[n], right[n]))
+        self.face(colour, right)
+        self.face(colour, left[::-1])
 
     def prism(
         self, frame: Frame, rings: Sequence[tuple[Sequence[float], float, float]], colour: Colour, sides: int = 8
