@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, sin
+from math import cos, hypot, sin
 from types import MappingProxyType
 from typing import Final
 
@@ -30,6 +30,9 @@ PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)  # where a reasoning model is asked to say
 _REPLAN_TICKS: Final = 5
 _REACH_M: Final = 10.0  # length of the way looked at: 9 s of it, and what the last steps need to aim at
 _SIGHT_M: Final = 7.0  # people further away do not matter yet
+_VIEW_M: Final = 12.0  # who stands about within this is led round
+_STANDING_MPS: Final = 0.25
+_OFF_ROUTE_M: Final = 0.6
 _STUCK_S: Final = 6.0
 _STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
 
@@ -45,7 +48,7 @@ class Build:
 BUILDS: Final[Mapping[str, Build]] = MappingProxyType(
     {
         "go2": Build(Driving(), 0.06),
-        "carter": Build(Driving(body_radius_m=0.33, body_reach_m=0.04, margin_m=0.17), 0.03),
+        "carter": Build(Driving(body_radius_m=0.31, body_reach_m=0.12, margin_m=0.17), 0.03),
     }
 )
 
@@ -76,20 +79,29 @@ class ExpertPolicy:
         self._ticks = 0
         self._choice = None
         self._left: list[float] = []
+        self._paces = np.ones(episode.people)  # nobody is known to stand before having been watched
 
     def act(self, observation: Observation) -> Velocity:
         """The next velocity, by the world as it is now."""
         world = self._running()
         pose = world.pose()
-        people, velocities = self._seen(pose)
+        people, velocities = self._watch(world)
+        gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
+        self._route = _from_here(self._route, pose)
         if self._ticks % _REPLAN_TICKS == 0:
-            self._route = self._planner.route((pose.x_m, pose.y_m), people, velocities, _REACH_M)
-        else:
-            self._route = _from_here(self._route, pose)
+            standing = people[(gaps < _VIEW_M) & (self._paces < _STANDING_MPS)]
+            here = (pose.x_m, pose.y_m)
+            self._route = self._planner.route(here, standing, _REACH_M, self._route if self._on_route(pose) else None)
         self._ticks += 1
+        near = gaps < _SIGHT_M
         self._left.append(self._planner.left(pose.x_m, pose.y_m))
         self._choice = self._motion.choose(
-            pose.as_tuple(), observation.state[0], self._route, people, velocities, patience=self._patience()
+            pose.as_tuple(),
+            observation.state[0],
+            self._route,
+            people[near],
+            velocities[near],
+            patience=self._patience(),
         )
         return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
 
@@ -98,12 +110,15 @@ class ExpertPolicy:
             raise RuntimeError("expert: expected reset first")
         return self._world
 
-    def _seen(self, pose: SE2) -> tuple[Array, Array]:
-        """Positions and velocities of the people who matter."""
-        world = self._running()
+    def _watch(self, world: EpisodeWorld) -> tuple[Array, Array]:
+        """Where everybody is and how they walk; keeps each one's pace over the last second or two."""
         people, velocities = world.people()[:, :2], world.people_velocities()
-        near = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m) < _SIGHT_M
-        return people[near], velocities[near]
+        self._paces += 0.1 * (np.hypot(velocities[:, 0], velocities[:, 1]) - self._paces)
+        return people, velocities
+
+    def _on_route(self, pose: SE2) -> bool:
+        x, y = self._route[0]
+        return hypot(x - pose.x_m, y - pose.y_m) < _OFF_ROUTE_M
 
     def _patience(self) -> float:
         """1 while it comes on; less and less, down to 0.3, the longer it is stuck."""

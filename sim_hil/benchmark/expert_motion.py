@@ -38,7 +38,7 @@ class Driving:
     brake_mps2: float = 1.6
     turn_accel_radps2: float = 3.0
     body_radius_m: float = 0.27
-    body_reach_m: float = 0.08
+    body_reach_m: float = 0.1
     margin_m: float = 0.15
     comfort_m: float = 0.55
 
@@ -166,9 +166,9 @@ class Motion:
         room = np.minimum(nose, tail) - driving.body_radius_m
         # From where it stands now it may always leave, also a place that is too narrow.
         here = float(np.min(room[0])) if len(room) else 0.0
-        hit = np.clip((min(0.05, here) - room) / 0.1, 0.0, 2.0)
+        hit = np.clip((min(0.08, here) - room) / 0.1, 0.0, 2.0)
         tight = np.clip(1.0 - room / 0.25, 0.0, 1.0)
-        return np.asarray(6.0 * np.max(hit * self._near_term[:, None], axis=0) + 0.25 * np.mean(tight * tight, axis=0))
+        return np.asarray(9.0 * np.max(hit * self._near_term[:, None], axis=0) + 0.25 * np.mean(tight * tight, axis=0))
 
     def _people(self, x: Array, y: Array, v: Array, people: Array, velocities: Array, patience: float) -> Array:
         """What passing near people costs; [futures]."""

@@ -1,12 +1,12 @@
 """Where the expert means to go: the cheapest way to the goal with room to spare, led round people who stand in it.
 
-One tree over the whole scene, built once, knows the way from everywhere. Twice a second a window around the robot is
-searched anew with a price on the places that people take up, its border being worth what the tree says.
+Ways are searched for on cells twice as wide as the navigation grid's, each standing for its roomiest point, so that the
+whole scene can be searched anew, with a price on the places that people take up, twice a second.
 """
 
 from __future__ import annotations
 
-from math import ceil, hypot
+from math import hypot
 from typing import Final
 
 import cv2
@@ -20,17 +20,15 @@ from sim_hil.scene import Scene, Vec2
 
 Array = NDArray[np.float64]
 
-WINDOW_M: Final = 6.0  # half the side of the window searched anew
 SPACING_M: Final = 0.1  # between the points of a route
 ROOM_M: Final = 0.5  # nearer than this beyond its clearance to a wall, a metre costs more
 _WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
 _STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
-_STANDING_PRICE: Final = 15.0  # a metre through somebody who stands there costs so much more
-_WALKING_PRICE: Final = 3.0
-_PERSON_M: Final = 0.75  # as far as that price reaches in full; it ends twice as far
-_SLOW_MPS: Final = 0.25
+_STANDING_PRICE: Final = 12.0  # a metre through somebody who stands there costs so much more
+_PERSON_M: Final = 0.7  # as far as that price reaches in full; it ends twice as far
 _NO_ROOM: Final = 1000.0
 _DETOUR: Final = 1.01  # a straight piece may cost so much more than the crooked one
+_KEEP: Final = (1.1, 1.5)  # the way so far is kept while it costs at most so many times a better one, and so much more
 
 
 class RoutePlanner:
@@ -43,7 +41,9 @@ class RoutePlanner:
         self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
         self._goal = goal_xy
         self._price = self._static_price(scene)
-        self._tree = self.grid.cost_tree(goal_xy, self._price)
+        self._coarsen()
+        self._costs, self._onwards = self._search(np.zeros((0, 2)))
+        self._empty_costs = self._costs
 
     def _static_price(self, scene: Scene) -> Array:
         lack = np.clip(1.0 - (self.grid.clearances - self.grid.required_m) / ROOM_M, 0.0, 1.0)
@@ -57,90 +57,115 @@ class RoutePlanner:
                     cv2.fillPoly(street, [np.array(cells, np.int32)], value)
         return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
 
+    def _coarsen(self) -> None:
+        """Join every two by two cells to one: free where one of them is, and standing for the roomiest of them."""
+        grid = self.grid
+        rows, columns = (size + size % 2 for size in grid.shape)
+        room = np.full((rows, columns), -np.inf)
+        room[: grid.shape[0], : grid.shape[1]] = np.where(grid.free, grid.clearances, -np.inf)
+        quads = room.reshape(rows // 2, 2, columns // 2, 2).transpose(0, 2, 1, 3).reshape(rows // 2, columns // 2, 4)
+        pick = np.argmax(quads, axis=2)
+        free = np.isfinite(quads.max(axis=2))
+        row = 2 * np.arange(rows // 2)[:, None] + pick // 2
+        column = 2 * np.arange(columns // 2)[None, :] + pick % 2
+        self._ids, source, target, _ = links(free, 2 * grid.resolution_m)
+        self._nodes = np.stack(
+            (
+                grid.origin_m[0] + (column[free] + 0.5) * grid.resolution_m,
+                grid.origin_m[1] + (row[free] + 0.5) * grid.resolution_m,
+            ),
+            axis=1,
+        )
+        self._node_price = self._price[row[free], column[free]]
+        gaps = self._nodes[source] - self._nodes[target]
+        count = len(self._nodes)
+        self._links = csr_matrix((np.hypot(gaps[:, 0], gaps[:, 1]), (source, target)), shape=(count, count))
+        self._link_source = np.repeat(np.arange(count), np.diff(self._links.indptr))
+        self._goal_node = self._node(*self._goal)
+
+    def _node(self, x_m: float, y_m: float) -> int:
+        """The node of the free cell nearest to a point; -1 where there is none within reach."""
+        point = self.grid.nearest_free(x_m, y_m)
+        if point is None:
+            return -1
+        row, column = self.grid.free_cell(*point)
+        return int(self._ids[row // 2, column // 2])
+
+    def _search(self, standing: Array) -> tuple[Array, NDArray[np.int32]]:
+        """Cost of the way to the goal from every node, and each one's next, people standing at [k, 2]."""
+        if self._goal_node < 0:
+            return np.full(len(self._nodes), np.inf), np.full(len(self._nodes), -1, np.int32)
+        price = self._node_price + _crowd_price(self._nodes, standing)
+        joins = self._links
+        data = joins.data * 0.5 * (price[self._link_source] + price[joins.indices])
+        priced = csr_matrix((data, joins.indices, joins.indptr), shape=joins.shape)
+        costs, onwards = dijkstra(priced, directed=False, indices=self._goal_node, return_predecessors=True)
+        return costs, onwards
+
     def reachable(self, x_m: float, y_m: float) -> bool:
         """Whether there is a way to the goal from a point."""
-        return bool(np.isfinite(self.grid.field_at(self._tree.cost, x_m, y_m)))
+        return bool(np.isfinite(self.left(x_m, y_m)))
 
     def left(self, x_m: float, y_m: float) -> float:
         """Price of the way left to the goal, nobody being in it; a metre with room costs 1."""
-        return self.grid.field_at(self._tree.cost, x_m, y_m)
+        node = self._node(x_m, y_m)
+        return float(self._empty_costs[node]) if node >= 0 else float("inf")
 
-    def route(self, start: Vec2, people: Array, velocities: Array, reach_m: float) -> Array:
+    def route(self, start: Vec2, standing: Array, reach_m: float, before: Array | None = None) -> Array:
         """[n, 2]: points SPACING_M apart from `start` towards the goal, up to `reach_m` of way, led round people.
 
-        `people` [k, 2] m and `velocities` [k, 2] m/s. Just the start where there is no way.
+        `standing` [k, 2]: who stands about, m. `before`: the route so far, from here on; it is kept unless another is
+        clearly better. Just the start where there is no way.
         """
-        first = self.grid.nearest_free(*start)
-        if first is None or not self.reachable(*first):
+        self._costs, self._onwards = self._search(standing)
+        node = self._node(*start)
+        if node < 0 or not np.isfinite(self._costs[node]):
             return np.array([start])
-        cells = self._cells(first, people, velocities, reach_m)
-        points = [first, *(self.grid.centre(*divmod(cell, self.grid.shape[1])) for cell in cells)]
-        if hypot(points[-1][0] - self._goal[0], points[-1][1] - self._goal[1]) < 2 * self.grid.resolution_m:
-            points[-1] = self._goal
-        taut = self._relaxed(self._straightened(_spaced(points), people, velocities))
-        return taut if first == start else np.vstack((np.array(start), taut))
-
-    def _cells(self, first: Vec2, people: Array, velocities: Array, reach_m: float) -> list[int]:
-        """Flat cells from `first` on: through the window where somebody is in it, then along the tree."""
-        grid = self.grid
-        row, column = grid.free_cell(*first)
-        cell, width = row * grid.shape[1] + column, grid.shape[1]
-        near = np.max(np.abs(people - np.array(first)), axis=1) < WINDOW_M if len(people) else np.zeros(0, bool)
-        cells = [cell]
-        if near.any():
-            cells = self._through_window(row, column, people[near], velocities[near])
-            cell = cells[-1]
-        limit = ceil(reach_m / grid.resolution_m)
-        while len(cells) < limit:
-            cell = int(self._tree.onwards[divmod(cell, width)])
-            if cell < 0:
+        points, end = [start], node
+        for _ in range(round(reach_m / (2 * self.grid.resolution_m))):
+            points.append((float(self._nodes[end, 0]), float(self._nodes[end, 1])))
+            if self._onwards[end] < 0:
+                points.append(self._goal)
                 break
-            cells.append(cell)
-        return cells
+            end = int(self._onwards[end])
+        fresh = self._relaxed(self._straightened(_spaced(points), standing))
+        if before is None or len(before) < 5:
+            return fresh
+        kept = self._extended(before, reach_m)
+        share, more = _KEEP
+        worth = self._price_of(fresh, standing)
+        return kept if self._price_of(kept, standing) <= share * worth + more else fresh
 
-    def _through_window(self, row: int, column: int, people: Array, velocities: Array) -> list[int]:
-        grid, reach = self.grid, round(WINDOW_M / self.grid.resolution_m)
-        rows = slice(max(row - reach, 0), min(row + reach + 1, grid.shape[0]))
-        columns = slice(max(column - reach, 0), min(column + reach + 1, grid.shape[1]))
-        free = grid.free[rows, columns]
-        price = self._price[rows, columns] + self._crowd_price(rows, columns, people, velocities)
-        ids, source, target, length = links(free, grid.resolution_m)
-        cells = price[free]
-        lengths = length * 0.5 * (cells[source] + cells[target])
-        worth = self._tree.cost[rows, columns]
-        rim = free & np.isfinite(worth)
-        rim[1:-1, 1:-1] = False
-        goal_row, goal_column = grid.free_cell(*self._goal)
-        if rows.start <= goal_row < rows.stop and columns.start <= goal_column < columns.stop:
-            rim[goal_row - rows.start, goal_column - columns.start] = True
-        # One more node stands for the goal: the rim is joined to it by what the way from there costs.
-        count = int(free.sum())
-        ends = ids[rim]
-        graph = csr_matrix(
-            (
-                np.concatenate((lengths, worth[rim] + 1e-6)),
-                (np.concatenate((source, ends)), np.concatenate((target, np.full(len(ends), count)))),
-            ),
-            shape=(count + 1, count + 1),
-        )
-        _, onwards = dijkstra(graph, directed=False, indices=count, return_predecessors=True)
-        where = np.argwhere(free)
-        node, way = int(ids[row - rows.start, column - columns.start]), []
-        while 0 <= node < count:
-            way.append(int((where[node, 0] + rows.start) * grid.shape[1] + where[node, 1] + columns.start))
-            node = int(onwards[node])
-        return way
+    def _extended(self, line: Array, reach_m: float) -> Array:
+        """A route lengthened to its reach along the newest search."""
+        missing = reach_m - SPACING_M * (len(line) - 1)
+        node = self._node(float(line[-1, 0]), float(line[-1, 1]))
+        if missing < 1.0 or node < 0 or hypot(*(line[-1] - np.array(self._goal))) < 2 * SPACING_M:
+            return line
+        points = [(float(line[-1, 0]), float(line[-1, 1]))]
+        for _ in range(round(missing / (2 * self.grid.resolution_m))):
+            node = int(self._onwards[node])
+            if node < 0:
+                points.append(self._goal)
+                break
+            points.append((float(self._nodes[node, 0]), float(self._nodes[node, 1])))
+        return np.vstack((line, self._relaxed(_spaced(points))[1:]))
 
-    def _straightened(self, line: Array, people: Array, velocities: Array) -> Array:
+    def _price_of(self, line: Array, standing: Array) -> float:
+        """What a route costs, and the way from its end on to the goal."""
+        node = self._node(float(line[-1, 0]), float(line[-1, 1]))
+        rest = float(self._costs[node]) if node >= 0 else float("inf")
+        return float(np.sum(self._prices_at(line, standing))) * SPACING_M + rest
+
+    def _straightened(self, line: Array, standing: Array) -> Array:
         """The way with every detour of the grid replaced by a straight piece that costs no more."""
-        prices = self._prices_at(line, people, velocities)
+        prices = self._prices_at(line, standing)
         paid = np.concatenate(((0.0,), np.cumsum(0.5 * (prices[1:] + prices[:-1])))) * SPACING_M
 
         def cheap(i: int, j: int) -> bool:
             a, b = line[i], line[j]
             points = a + (b - a) * np.linspace(0.0, 1.0, j - i + 1)[:, None]
-            price = self._prices_at(points, people, velocities)
-            cost = float(np.mean(price)) * hypot(b[0] - a[0], b[1] - a[1])
+            cost = float(np.mean(self._prices_at(points, standing))) * hypot(b[0] - a[0], b[1] - a[1])
             return cost <= float(paid[j] - paid[i]) * _DETOUR + 1e-3
 
         corners, at, last = [0], 0, len(line) - 1
@@ -158,19 +183,13 @@ class RoutePlanner:
             corners.append(at)
         return _spaced([(float(x), float(y)) for x, y in line[corners]])
 
-    def _prices_at(self, points: Array, people: Array, velocities: Array) -> Array:
+    def _prices_at(self, points: Array, standing: Array) -> Array:
         """Price of a metre at each point [n, 2], people included; prohibitive where there is no room."""
         column = ((points[:, 0] - self.grid.origin_m[0]) / self.grid.resolution_m).astype(np.int64)
         row = ((points[:, 1] - self.grid.origin_m[1]) / self.grid.resolution_m).astype(np.int64)
         row, column = np.clip(row, 0, self.grid.shape[0] - 1), np.clip(column, 0, self.grid.shape[1] - 1)
         price = np.where(self.grid.free[row, column], self._price[row, column], _NO_ROOM)
-        if len(people):
-            slow = np.hypot(velocities[:, 0], velocities[:, 1]) < _SLOW_MPS
-            there = people + velocities * ~slow[:, None]
-            gap = np.hypot(points[:, None, 0] - there[:, 0], points[:, None, 1] - there[:, 1])
-            weight = np.where(slow, _STANDING_PRICE, _WALKING_PRICE)
-            price = price + np.sum(weight * np.clip(2.0 - gap / _PERSON_M, 0.0, 1.0), axis=1)
-        return np.asarray(price)
+        return np.asarray(price + _crowd_price(points, standing))
 
     def _relaxed(self, line: Array) -> Array:
         """The same way with its corners rounded, as far as there is room."""
@@ -180,19 +199,16 @@ class RoutePlanner:
         fits = self.grid.clearances_at(rounded) >= self.grid.required_m - 0.02
         return np.asarray(np.where(fits[:, None], rounded, line))
 
-    def _crowd_price(self, rows: slice, columns: slice, people: Array, velocities: Array) -> Array:
-        size = self.grid.resolution_m
-        x = self.grid.origin_m[0] + (np.arange(columns.start, columns.stop) + 0.5) * size
-        y = self.grid.origin_m[1] + (np.arange(rows.start, rows.stop) + 0.5) * size
-        price = np.zeros((len(y), len(x)))
-        for (px, py), (vx, vy) in zip(people, velocities, strict=True):
-            slow = hypot(vx, vy) < _SLOW_MPS
-            # Somebody who walks will have gone on when the robot gets there; somebody who stands will not.
-            ahead = 0.0 if slow else 1.0
-            gap = np.hypot(x[None, :] - (px + ahead * vx), y[:, None] - (py + ahead * vy))
-            weight = _STANDING_PRICE if slow else _WALKING_PRICE
-            price += weight * np.clip(2.0 - gap / _PERSON_M, 0.0, 1.0)
-        return price
+
+def _crowd_price(points: Array, standing: Array) -> Array:
+    """What a metre at each point [n, 2] costs more for those who stand about [k, 2]."""
+    price = np.zeros(len(points))
+    for x, y in standing:
+        near = np.flatnonzero((np.abs(points[:, 0] - x) < 2 * _PERSON_M) & (np.abs(points[:, 1] - y) < 2 * _PERSON_M))
+        gap = np.hypot(points[near, 0] - x, points[near, 1] - y)
+        # The dearest of those around: in a dense group a metre is no worse than in the middle of one person.
+        price[near] = np.maximum(price[near], _STANDING_PRICE * np.clip(2.0 - gap / _PERSON_M, 0.0, 1.0))
+    return price
 
 
 def _spaced(points: list[Vec2]) -> Array:
