@@ -123,7 +123,7 @@ KINDS: dict[str, Kind] = {
         _solid("drum", "drum", (0.58, 0.58, 0.88), (0.10, 0.30, 0.66), _round(1.0, (0.0, 1.0))),
         _solid("barrier", "barrier", (0.4, 1.6, 1.0), (0.92, 0.20, 0.12)),
         # Outdoors
-        _solid("fountain", "fountain", (4.0, 4.0, 1.9), (0.74, 0.72, 0.68), _round(1.0, (0.0, 1.0))),
+        _solid("fountain", "fountain", (4.0, 4.0, 2.4), (0.74, 0.72, 0.68), _round(1.0, (0.0, 1.0))),
         _solid("umbrella", "umbrella", (2.8, 2.8, 2.5), (0.90, 0.16, 0.14), _UMBRELLA),
         _solid(
             "umbrella_table", "table with an umbrella", (2.8, 2.8, 2.5), (0.14, 0.50, 0.80),

@@ -11,24 +11,24 @@ from sim_hil.textures import Colour
 from sim_hil.world_kit import BLACK, DARK, STEEL, WHITE, WOOD, Kit
 
 _STONE: Colour = (188, 184, 174)
-_WATER: Colour = (96, 176, 214)
+_WATER: Colour = (70, 150, 205)
 _BARK: Colour = (104, 74, 48)
 
 
 def _fountain(kit: Kit) -> None:
     """A basin of stone, a bowl on a pedestal, and the water's jet."""
-    rim = 0.5 / kit.height
+    rim = 0.42 / kit.height
     kit.rings(((0.0, 0.5), (rim, 0.5)), kit.paint(), 16)
     kit.rings(((rim, 0.5), (rim * 1.12, 0.49)), kit.paint(1.15), 16)
     kit.rings(((rim * 1.13, 0.42), (rim * 1.14, 0.42)), _WATER, 16)
     kit.rings(((rim, 0.10), (0.50, 0.06)), kit.paint(0.9), 8)
     kit.rings(((0.48, 0.08), (0.58, 0.24)), kit.paint(1.05), 12)
     kit.rings(((0.575, 0.21), (0.585, 0.21)), _WATER, 12)
-    kit.rings(((0.58, 0.035), (0.86, 0.05), (0.95, 0.09), (1.0, 0.03)), (206, 232, 244), 8)
+    kit.rings(((0.58, 0.03), (0.84, 0.05), (0.94, 0.10), (1.0, 0.03)), (150, 208, 240), 8)
     for k in range(8):
         turn = 2 * pi * (k + 0.5) / 8
         x, y = 0.20 * cos(turn), 0.20 * sin(turn)
-        kit.post(x, y, (rim * 1.1, 0.60), 0.03, (196, 226, 240), 4)
+        kit.post(x, y, (rim * 1.1, 0.60), 0.055, (120, 190, 232), 4)
 
 
 def _canopy(kit: Kit) -> None:
@@ -87,7 +87,7 @@ def _kiosk(kit: Kit) -> None:
     kit.part((-0.5, 0.42), (-0.5, 0.5), (0.0, 0.94), kit.paint(0.8), kit.picture(world_prints.kiosk_face))
     kit.part((0.42, 0.56), (-0.46, 0.46), (0.34, 0.38), (226, 214, 190))
     kit.part((-0.56, 0.5), (-0.54, 0.54), (0.94, 1.0), kit.paint(0.5))
-    _awning_on(kit, (0.42, 0.86), (-0.5, 0.5), (0.70, 0.80))
+    _awning_on(kit, (0.42, 0.66), (-0.5, 0.5), (0.66, 0.72))
 
 
 def _park_bench(kit: Kit) -> None:
@@ -114,12 +114,12 @@ def _lamp_post(kit: Kit) -> None:
 def _tree(kit: Kit) -> None:
     kit.post(0, 0, (0.0, 0.55), 0.05 * kit.depth, _BARK, 7)
     rng = kit.rng()
-    kit.ball(0, 0, 0.72, (0.38 * kit.depth, 0.38 * kit.width, 0.22 * kit.height), kit.paint(), 8)
+    kit.ball(0, 0, 0.74, (0.42 * kit.depth, 0.42 * kit.width, 0.25 * kit.height), kit.paint(), 8)
     for k in range(5):
         turn = 2 * pi * k / 5 + rng.random()
-        size = 0.24 + 0.06 * rng.random()
-        radii = (size * kit.depth, size * kit.width, 0.15 * kit.height)
-        z = 0.60 + 0.18 * rng.random()
+        size = 0.26 + 0.06 * rng.random()
+        radii = (size * kit.depth, size * kit.width, 0.17 * kit.height)
+        z = 0.58 + 0.20 * rng.random()
         kit.ball(0.26 * cos(turn), 0.26 * sin(turn), z, radii, kit.paint(0.8 + 0.5 * rng.random()), 7)
 
 
