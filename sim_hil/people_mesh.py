@@ -37,9 +37,10 @@ def _rings(k: float, wide: float, *rows: tuple[float, float, float]) -> tuple[Ri
     return tuple(((0.0, 0.0, z * k), rx * k * wide, ry * k * wide) for z, rx, ry in rows)
 
 
-def trunk(look: Appearance, detail: float) -> MeshBuilder:
+def trunk(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Pelvis to neck, and what is worn and carried on it; origin between the hip joints, x to the front."""
-    mesh, frame, k = MeshBuilder(detail), Frame((0.0, 0.0, -HIP_M * look.scale)), look.scale
+    k = look.scale
+    frame = frame.at((0.0, 0.0, -HIP_M * k))
     wide = look.build
     over = _SIDE_SHARE.get(look.top, 1.0)
     mesh.prism(
@@ -79,14 +80,14 @@ def trunk(look: Appearance, detail: float) -> MeshBuilder:
     elif look.carries == "bag":
         mesh.box(frame, (0.02, -0.215 * k * wide, 0.98 * k), (0.26, 0.09, 0.22 * k), look.bag)
         mesh.box(frame, (0.0, -0.19 * k * wide, 1.25 * k), (0.03, 0.03, 0.36 * k), darker(look.bag, 0.75))
-    return mesh
 
 
-def head(look: Appearance, detail: float) -> MeshBuilder:
-    """Head, hair and what is worn on it; origin at the top of the neck's base."""
-    mesh, frame, k = MeshBuilder(detail), Frame((0.0, 0.0, -NECK_M * look.scale)), look.scale
+def head(mesh: MeshBuilder, frame: Frame, look: Appearance, face: bool = True) -> None:
+    """Head, hair and what is worn on it, with or without a face; origin at the neck's base."""
+    k = look.scale
+    frame = frame.at((0.0, 0.0, -NECK_M * k))
     mesh.ball(frame, (0.012 * k, 0, 1.605 * k), (0.098 * k, 0.078 * k, 0.122 * k), look.skin, 10)
-    if detail >= 1:
+    if face:
         for side in (-1, 1):
             mesh.box(frame, (0.100 * k, side * 0.031 * k, 1.622 * k), (0.018, 0.026, 0.010), (226, 222, 216))
             mesh.box(frame, (0.103 * k, side * 0.031 * k, 1.622 * k), (0.018, 0.013, 0.013), _DARK)
@@ -119,14 +120,13 @@ def head(look: Appearance, detail: float) -> MeshBuilder:
         )  # fmt: skip
         mesh.prism(frame, dome, look.head, 10)
         mesh.box(frame, (0.14 * k, 0, 1.65 * k), (0.07, 0.16 * k, 0.014), darker(look.head, 0.9))
-    return mesh
 
 
-def thigh(look: Appearance, detail: float) -> MeshBuilder:
+def thigh(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Hip to knee; origin at the hip joint."""
-    mesh, frame, k = MeshBuilder(detail), Frame(), look.scale
+    k = look.scale
     bare = look.legs in ("shorts", "skirt", "dress")
-    w = k * look.build * (0.78 if _tail_m(look) else 1.0)  # what cloth hides need not press against it
+    w = k * look.build * (0.78 if tail_m(look) else 1.0)  # what cloth hides need not press against it
     rings = (
         ((0, 0, -THIGH_M * k), 0.062 * w, 0.060 * w),
         ((0, 0, -0.20 * k), 0.078 * w, 0.075 * w),
@@ -137,12 +137,11 @@ def thigh(look: Appearance, detail: float) -> MeshBuilder:
         mesh.prism(
             frame, (((0, 0, -0.30 * k), 0.09 * w, 0.088 * w), ((0, 0, 0.02), 0.098 * w, 0.09 * w)), look.trousers, 8
         )
-    return mesh
 
 
-def shin(look: Appearance, detail: float) -> MeshBuilder:
+def shin(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Knee to sole; origin at the knee joint."""
-    mesh, frame, k = MeshBuilder(detail), Frame(), look.scale
+    k = look.scale
     w = k * look.build
     if look.legs == "trousers":
         shade = darker(look.trousers, 0.94)
@@ -168,12 +167,11 @@ def shin(look: Appearance, detail: float) -> MeshBuilder:
         (0.262 * k, 0.092 * k, 0.016),
         (236, 236, 232) if sum(look.shoes) < 400 else _DARK,
     )
-    return mesh
 
 
-def upper_arm(look: Appearance, detail: float) -> MeshBuilder:
+def upper_arm(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Shoulder to elbow; origin at the shoulder joint."""
-    mesh, frame, k = MeshBuilder(detail), Frame(), look.scale
+    k = look.scale
     over = _SIDE_SHARE.get(look.top, 1.0) if look.top != "vest" else 1.0
     w = k * look.build * over
     sleeve = _sleeve(look)
@@ -184,12 +182,11 @@ def upper_arm(look: Appearance, detail: float) -> MeshBuilder:
         frame, (((0, 0, -UPPER_ARM_M * k), 0.042 * w, 0.040 * w), ((0, 0, -0.16 * k), 0.047 * w, 0.045 * w)), low, 7
     )
     mesh.prism(frame, (((0, 0, -0.19 * k), 0.052 * w, 0.049 * w), ((0, 0, 0.0), 0.057 * w, 0.053 * w)), sleeve, 7)
-    return mesh
 
 
-def forearm(look: Appearance, detail: float) -> MeshBuilder:
+def forearm(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Elbow to fingertips; origin at the elbow joint."""
-    mesh, frame, k = MeshBuilder(detail), Frame(), look.scale
+    k = look.scale
     w = k * look.build
     colour = look.skin if _bare_arms(look) else darker(_sleeve(look), 0.95)
     mesh.prism(
@@ -201,21 +198,18 @@ def forearm(look: Appearance, detail: float) -> MeshBuilder:
         ((0, 0, -FOREARM_M * k), 0.028 * k, 0.024 * k),
     )
     mesh.prism(frame, hand, look.skin, 6)
-    return mesh
 
 
 def _bare_arms(look: Appearance) -> bool:
     return look.top == "scrubs" or (look.top == "shirt" and sum(look.shirt) % 2 == 0)
 
 
-def tail(look: Appearance, detail: float) -> MeshBuilder | None:
-    """What hangs from the waist round both legs: skirt, dress, coat; origin between the hip joints. None for others."""
-    length = _tail_m(look)
-    if not length:
-        return None
+def tail(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
+    """What hangs from the waist round both legs: skirt, dress, coat; origin between the hip joints."""
+    length = tail_m(look)
     hangs_from_legs = look.legs in ("skirt", "dress")
     colour, flare = (look.trousers, 1.06) if hangs_from_legs else (look.over, 1.0)
-    mesh, frame, k = MeshBuilder(detail), Frame(), look.scale
+    k = look.scale
     w = k * look.build
     rings = (
         ((0, 0, -length * k), 0.235 * w * flare, 0.195 * w * flare),
@@ -224,10 +218,9 @@ def tail(look: Appearance, detail: float) -> MeshBuilder | None:
         ((0, 0, 0.09 * k), 0.116 * w, 0.166 * w),
     )
     mesh.prism(frame, rings, colour, 10)
-    return mesh
 
 
-def _tail_m(look: Appearance) -> float:
+def tail_m(look: Appearance) -> float:
     """How far a skirt, dress or coat hangs below the hips, m; 0 for other clothes."""
     lengths = {"skirt": 0.46, "dress": 0.50}
     return lengths.get(look.legs, {"coat": 0.48, "lab_coat": 0.38}.get(look.top, 0.0))
