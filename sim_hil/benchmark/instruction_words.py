@@ -5,6 +5,11 @@ from __future__ import annotations
 from sim_hil.benchmark.route import COLOUR_WORDS
 from sim_hil.scene import KINDS
 
+# Areas that are called by their names rather than counted.
+AREAS = (
+    "reception", "waiting area", "service area", "open office", "elevator lobby", "loading area", "main aisle",
+    "back aisle", "plaza", "park",
+)  # fmt: skip
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 # What landmarks may be called: every kind's own name, and what a scene's maker calls them besides.
 NOUNS = tuple(

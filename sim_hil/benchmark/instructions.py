@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from sim_hil.benchmark.instruction_words import NAME, ORDINALS
+from sim_hil.benchmark.instruction_words import AREAS, NAME, ORDINALS
 from sim_hil.benchmark.route import Passed, Step, Told
 
 HELD_OUT_SHARE = 0.2  # of all sentence patterns
@@ -92,15 +92,19 @@ def _compose(w: _Writer, told: Told) -> str:
         end = w.pick("stop there", "stop when you get there", "wait there", f"stop at the {goal}")
         body = _joined(w, [*clauses, *_last_leg(w, told)])
         if not body:
-            body = _straight(w, told.goal_area_kind)
+            body = _straight(w, told.goal_area_kind, told.goal_area_name)
         return _polite(w, f"{opening}{w.pick('. ', ': ')}{body}{w.pick(' and ', ', then ', '. Then ')}{end}")
     stop = _stop(w, told, goal)
     if style == "short":
         parts = [*clauses, w.pick(f"stop at the {goal}", f"stop by the {goal}", f"then the {goal}")]
-        return _sentence(", ".join(parts) if len(parts) > 1 else f"{_straight(w, told.goal_area_kind)}, {parts[0]}")
+        return _sentence(
+            ", ".join(parts)
+            if len(parts) > 1
+            else f"{_straight(w, told.goal_area_kind, told.goal_area_name)}, {parts[0]}"
+        )
     rest = _last_leg(w, told) if w.chance(0.6) else []
     if not clauses and not rest:
-        rest = [_straight(w, told.goal_area_kind)]
+        rest = [_straight(w, told.goal_area_kind, told.goal_area_name)]
     return _polite(w, f"{_joined(w, [*clauses, *rest])}{w.pick(' and ', ', then ', '. Then ', ', and ')}{stop}")
 
 
@@ -121,11 +125,12 @@ def _sentence(text: str) -> str:
 
 def _polite(w: _Writer, text: str) -> str:
     kind = w.pick("plain", "plain", "plain", "please", "robot", "could", "now")
-    if kind == "please":
+    statement = text.startswith(("your goal", "we need", "at ", "when ", "where "))
+    if kind == "please" and not statement:
         return _sentence(f"please {text}" if w.chance(0.6) else f"{text}, please")
     if kind == "robot":
         return _sentence(f"{w.pick('robot', 'hey robot', 'hello')}, {text}")
-    if kind == "could" and not text.startswith(("your goal", "we need", "at ", "when ", "where ")):
+    if kind == "could" and not statement:
         return _sentence(f"{w.pick('could you', 'would you', 'I want you to', 'you should')} {text}")
     if kind == "now":
         return _sentence(f"{w.pick('now', 'okay', 'all right')}, {text}")
@@ -189,8 +194,8 @@ def _steps(w: _Writer, told: Told) -> list[str]:
         leave = index == 0 and told.leaves_room
         if leave:
             out.append(w.pick("leave the room", "go out of the room", "exit the room", "leave this room"))
-        elif step.passed and w.chance(0.3):
-            out.append(_pass(w, step.passed[int(w.rng.integers(len(step.passed)))]))
+        elif (passed := [thing for thing in step.passed if thing not in step.near]) and w.chance(0.3):
+            out.append(_pass(w, passed[int(w.rng.integers(len(passed)))]))
         elif index == 0 and step.before_m > 3.0 and w.chance(0.4):
             out.append(_straight(w, step.before_kind, step.before_name))
         out.append(_step(w, step, leave))
@@ -209,6 +214,8 @@ def _step(w: _Writer, step: Step, leaving: bool) -> str:
         modes = ["named"]
     elif leaving or step.before_kind in ("crossing", "plaza"):
         modes = ["plain"]
+    elif step.kind == "corridor" and step.name in AREAS:
+        modes = ["named"]
     else:
         if 0 < step.ordinal <= len(ORDINALS) - 1:
             modes += ["count"] * 3
@@ -226,9 +233,7 @@ def _step(w: _Writer, step: Step, leaving: bool) -> str:
 
 def _count(w: _Writer, step: Step) -> str:
     count, side = ORDINALS[step.ordinal - 1], step.side
-    noun = _noun(w, step.kind, "aisle" if step.kind == "aisle" else "cross aisle")
-    if step.kind == "corridor" and not step.name.endswith("aisle"):
-        noun = w.pick("corridor", "hallway", "hall", "passage")
+    noun = _noun(w, step.kind, step.name)
     beside = w.pick("on your", "on the", "to the", "to your")
     return w.pick(
         f"take the {count} {noun} {beside} {side}", f"turn {side} into the {count} {noun}",

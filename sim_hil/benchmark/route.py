@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from math import hypot
+from math import cos, hypot, sin
 
 from sim_hil.benchmark.openings import LINEAR, Bounds, Frame, Opening, bounds_of, is_open, side_openings
 from sim_hil.nav_grid import NavGrid
@@ -129,8 +129,10 @@ def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:
     runs: list[_Run] = []
     for point in points:
         area = scene.area_at(*point)
-        if area is None:
-            raise RouteError(f"the way leaves all areas at ({point[0]:.1f}, {point[1]:.1f})")
+        if area is None:  # a niche between two houses belongs to whatever one comes from
+            if not runs:
+                raise RouteError("the start lies in no area")
+            area = runs[-1].area
         if runs and runs[-1].area is area:
             runs[-1].points.append(point)
         else:
@@ -313,8 +315,11 @@ def _beside(scene: Scene, leg: _Leg) -> list[tuple[float, float, SceneObject]]:
 
 
 def _near_box(box: Bounds, thing: SceneObject) -> bool:
+    """Whether a thing stands in an area, or shows its front to it as a shop does to the sidewalk."""
     x, y, _ = thing.position_m
-    return box.x0 - 0.1 <= x <= box.x1 + 0.1 and box.y0 - 0.1 <= y <= box.y1 + 0.1
+    reach = thing.size_m[0] / 2 + 0.25
+    front = (x + reach * cos(thing.heading_rad), y + reach * sin(thing.heading_rad))
+    return any(box.x0 <= px <= box.x1 and box.y0 <= py <= box.y1 for px, py in ((x, y), front))
 
 
 def _passed(scene: Scene, leg: _Leg, until: float) -> tuple[Passed, ...]:

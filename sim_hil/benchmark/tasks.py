@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, cos, hypot, pi, sin
 
 import numpy as np
@@ -20,7 +20,7 @@ _NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "
 
 @dataclass(frozen=True)
 class Task:
-    """Where to go: `path` is the shortest way from `start` to `goal`, m, for the grid's robot; `told` is what to say."""
+    """Where to go: `path` is the shortest way from `start` to `goal`, m, for the grid's robot; `told` says it."""
 
     start: Vec3
     goal: Vec2
@@ -98,11 +98,13 @@ def sample_task(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Task:
     thing = found[int(rng.integers(len(found)))]
     task = make_task(scene, grid, start, thing)
     away = _first_direction(task.path)
-    if abs(_wrapped(away - start[2])) <= pi / 3:
-        return task
     if task.told.leaves_room:  # stand so that the door is ahead
-        return Task((start[0], start[1], round(away, 3)), task.goal, task.goal_label, task.path, task.told)
-    raise RouteError("the way begins behind the robot")
+        return replace(task, start=(start[0], start[1], round(away, 3)))
+    if abs(_wrapped(away - start[2])) > pi / 2:  # look the other way along the corridor
+        start = (start[0], start[1], _wrapped(start[2] + pi))
+    if abs(_wrapped(away - start[2])) > pi / 3:
+        raise RouteError("the way begins to the robot's side")
+    return replace(task, start=start)
 
 
 def _first_direction(path: tuple[Vec2, ...]) -> float:

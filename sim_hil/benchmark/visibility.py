@@ -1,0 +1,122 @@
+"""How large a thing is in the robot's picture, by rays: no renderer, so that every landmark of a suite can be checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, radians, sin, tan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.scene import Scene, SceneObject, Vec2
+
+Array = NDArray[np.float64]
+
+PICTURE_PX = 128  # the policy's square picture, into which a 16:9 view is squeezed
+HFOV_RAD = radians(100.0)
+ASPECT = 16 / 9
+EYE_M = 0.36  # height of the robot's camera
+_SAMPLES = 6  # a side of each face's grid of rays
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The best view of a thing along a way: its size in the picture, px (of 128 x 128), and from how far."""
+
+    pixels: float
+    range_m: float
+    at_m: float  # how far along the way
+
+
+class Sightlines:
+    """Who can be seen from where in one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        rows = []
+        self._owners: list[str] = []
+        for label, box in scene.obstacles():
+            rows.append((*box.centre_m, *box.axis, *box.size_m))
+            self._owners.append(label)
+        self._boxes = np.array(rows, dtype=np.float64).reshape(-1, 8)
+
+    def pixels(self, eye: tuple[float, float, float], heading_rad: float, thing: SceneObject, range_m: float) -> float:
+        """Area of the part of a thing's bounding box that is seen, px of a 128 x 128 picture; 0 beyond the range."""
+        points, areas = _faces(thing, eye)
+        origin = np.array(eye)
+        away = points - origin
+        c, s = cos(heading_rad), sin(heading_rad)
+        depth = away[:, 0] * c + away[:, 1] * s
+        across = -away[:, 0] * s + away[:, 1] * c
+        half_x = tan(HFOV_RAD / 2)
+        half_y = half_x / ASPECT
+        near = depth > 0.05
+        inside = near & (np.abs(across) < half_x * depth) & (np.abs(away[:, 2]) < half_y * depth)
+        inside &= np.linalg.norm(away, axis=1) < range_m
+        if not inside.any():
+            return 0.0
+        others = np.array([owner != thing.label for owner in self._owners])
+        seen = inside.copy()
+        seen[inside] = ~_blocked(origin, points[inside], self._boxes[others])
+        # A patch of area A whose normal meets the ray covers fx fy A |n . d| / depth^3 of the picture.
+        scale = (PICTURE_PX / 2) ** 2 / (half_x * half_y)
+        return float(np.sum(scale * areas[seen] / depth[seen] ** 3))
+
+    def best(self, path: list[tuple[float, float, float]], thing: SceneObject, range_m: float) -> Sight:
+        """The best view along poses (x, y, heading)."""
+        best, walked = Sight(0.0, 0.0, 0.0), 0.0
+        last: Vec2 | None = None
+        for x, y, heading in path:
+            if last is not None:
+                walked += float(np.hypot(x - last[0], y - last[1]))
+            last = (x, y)
+            found = self.pixels((x, y, EYE_M), heading, thing, range_m)
+            if found > best.pixels:
+                gap = float(np.hypot(thing.position_m[0] - x, thing.position_m[1] - y))
+                best = Sight(found, gap, walked)
+        return best
+
+
+def _faces(thing: SceneObject, eye: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Points on the faces that look at the eye, and each one's area times |n . d| (d: from the eye to the point)."""
+    depth, width, height = thing.size_m
+    c, s = cos(thing.heading_rad), sin(thing.heading_rad)
+    base = np.array(thing.position_m)
+    ahead, left, up = np.array((c, s, 0.0)), np.array((-s, c, 0.0)), np.array((0.0, 0.0, 1.0))
+    middle = base + up * height / 2
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    u, v = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps))
+    points, areas = [], []
+    for normal, reach, a, la, b, lb in (
+        (ahead, depth, left, width, up, height), (-ahead, depth, left, width, up, height),
+        (left, width, ahead, depth, up, height), (-left, width, ahead, depth, up, height),
+        (up, height, ahead, depth, left, width),
+    ):  # fmt: skip
+        face = middle + normal * (reach / 2 + 0.005) + u * a * la + v * b * lb
+        toward = (np.array(eye) - face) @ normal
+        keep = toward > 0
+        points.append(face[keep])
+        areas.append(la * lb / _SAMPLES**2 * toward[keep])
+    return np.concatenate(points), np.concatenate(areas)
+
+
+def _blocked(origin: Array, points: Array, boxes: Array) -> NDArray[np.bool_]:
+    """For each point whether a box lies between it and the origin (slab test in each box's frame)."""
+    if not len(boxes):
+        return np.zeros(len(points), bool)
+    cx, cy, cz, ax, ay = (boxes[:, i] for i in range(5))
+    half = boxes[:, 5:8] / 2
+    dx, dy, dz = origin[0] - cx, origin[1] - cy, origin[2] - cz
+    start = np.stack([dx * ax + dy * ay, -dx * ay + dy * ax, dz], axis=1)  # [m, 3]
+    ray = points - origin  # [n, 3]
+    run = np.stack(
+        [np.outer(ray[:, 0], ax) + np.outer(ray[:, 1], ay), np.outer(ray[:, 1], ax) - np.outer(ray[:, 0], ay),
+         np.repeat(ray[:, 2:3], len(boxes), axis=1)], axis=2,
+    )  # fmt: skip
+    run = np.where(np.abs(run) < 1e-9, 1e-9, run)
+    first = (-half - start) / run
+    second = (half - start) / run
+    enter = np.minimum(first, second).max(axis=2)
+    leave = np.maximum(first, second).min(axis=2)
+    hit = (enter < leave) & (leave > 0) & (enter < 0.995)
+    return np.asarray(hit.any(axis=1))
