@@ -133,7 +133,7 @@ class Go2Behaviour:
             return
         moves = any((vx_mps, vy_mps, wz_radps))
         if self._script is not None and self._script.mode == MODE_BALANCE_STAND and moves:
-            self._stand_again()
+            self._stand_again()  # the velocity is obeyed as soon as it stands level
         elif self._busy:
             return
         top_mps = self.gait.top_mps
@@ -250,6 +250,9 @@ class Go2Behaviour:
             self._awaited = None
             if afterwards is not None:
                 afterwards()
+            return
+        if self._afterwards is not None:  # it is on its way: a request that is repeated does not begin anew
+            self._afterwards = afterwards if afterwards is not None else self._afterwards
             return
         back: tuple[Keyframe, ...] = ((_RETURN_S, self._home),)
         self._begin(self._script._replace(keyframes=back, stays=False))
