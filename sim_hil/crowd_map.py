@@ -48,6 +48,7 @@ class CrowdMap:
         self._flat = self._gaps.ravel()
         self._skip = max(1, round(sqrt(area / _COARSE_CELLS) / fine))
         self._coarse = fine * self._skip
+        self._ground = _ground(scene, self._gaps.shape, grid.origin_m, fine) if scene.terrain else None
         self._build_ways(scene)
         self._ahead: list[NDArray[np.int32]] = []
         self._lengths: list[NDArray[np.float32]] = []
@@ -123,24 +124,35 @@ class CrowdMap:
         """Distance to the nearest obstacle from points of any shape, m, exact to a grid cell."""
         column = ((x - self._origin[0]) * (1.0 / self._fine)).astype(np.int64)
         row = ((y - self._origin[1]) * (1.0 / self._fine)).astype(np.int64)
-        np.clip(column, 0, self._columns - 1, out=column)
-        np.clip(row, 0, self._rows - 1, out=row)
+        column = np.minimum(np.maximum(column, 0), self._columns - 1)
+        row = np.minimum(np.maximum(row, 0), self._rows - 1)
         return np.asarray(self._flat[row * self._columns + column])
 
     def slopes_at(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Distance to the nearest obstacle, m, and the direction (x, y; not normalised) in which it grows fastest."""
-        u = (x - self._origin[0]) * (1.0 / self._fine) - 0.5
-        v = (y - self._origin[1]) * (1.0 / self._fine) - 0.5
-        np.clip(u, 0.0, self._columns - 1.001, out=u)
-        np.clip(v, 0.0, self._rows - 1.001, out=v)
-        column, row = u.astype(np.int64), v.astype(np.int64)
-        a, b = u - column, v - row
-        first = row * self._columns + column
-        g00, g10 = self._flat[first], self._flat[first + 1]
-        g01, g11 = self._flat[first + self._columns], self._flat[first + self._columns + 1]
+        g00, g10, g01, g11, a, b = self._around(self._flat, x, y)
         low, high = g00 + (g10 - g00) * a, g01 + (g11 - g01) * a
         slope_x = (g10 - g00) + ((g11 - g01) - (g10 - g00)) * b
         return low + (high - low) * b, slope_x, high - low
+
+    def heights_at(self, x: Array, y: Array) -> Array:
+        """[n]: height of the ground, m; a kerb is gone up within one cell of the grid, as by a step."""
+        if self._ground is None:
+            return np.zeros(len(x))
+        g00, g10, g01, g11, a, b = self._around(self._ground, x, y)
+        low, high = g00 + (g10 - g00) * a, g01 + (g11 - g01) * a
+        return low + (high - low) * b
+
+    def _around(self, flat: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """A grid's values at the four cells around each point, and how far the point is towards the upper ones."""
+        u = (x - self._origin[0]) * (1.0 / self._fine) - 0.5
+        v = (y - self._origin[1]) * (1.0 / self._fine) - 0.5
+        u = np.minimum(np.maximum(u, 0.0), self._columns - 1.001)
+        v = np.minimum(np.maximum(v, 0.0), self._rows - 1.001)
+        column, row = u.astype(np.int64), v.astype(np.int64)
+        first = row * self._columns + column
+        above = first + self._columns
+        return flat[first], flat[first + 1], flat[above], flat[above + 1], u - column, v - row
 
     # -- destinations ----------------------------------------------------------------------------------------------
 
@@ -148,8 +160,8 @@ class CrowdMap:
         """The walkable cell nearest to each point."""
         column = ((x - self._origin[0]) * (1.0 / self._coarse)).astype(np.int64)
         row = ((y - self._origin[1]) * (1.0 / self._coarse)).astype(np.int64)
-        np.clip(column, 0, self._shape[1] - 1, out=column)
-        np.clip(row, 0, self._shape[0] - 1, out=row)
+        column = np.minimum(np.maximum(column, 0), self._shape[1] - 1)
+        row = np.minimum(np.maximum(row, 0), self._shape[0] - 1)
         return np.asarray(self._node[row * self._shape[1] + column])
 
     def point(self, node: int) -> Vec2:
@@ -207,6 +219,22 @@ class CrowdMap:
         # Half the distance between samples: no wall is so thin that it fits between two of them.
         reach = np.maximum(np.hypot(dx, dy) * (0.5 / (_SIGHT_SAMPLES - 1)), 0.06)
         return np.asarray(gaps.min(axis=1) > reach)
+
+
+def _ground(scene: Scene, shape: tuple[int, int], origin: Vec2, resolution: float) -> Array:
+    """[rows * columns]: height of the ground at every cell's centre, m."""
+    heights = np.zeros(shape)
+    y, x = (origin[axis] + (np.arange(shape[1 - axis]) + 0.5) * resolution for axis in (1, 0))
+    for terrain in scene.terrain:
+        corners = np.array(terrain.corners())
+        rows = np.flatnonzero((y >= corners[:, 1].min()) & (y <= corners[:, 1].max()))
+        columns = np.flatnonzero((x >= corners[:, 0].min()) & (x <= corners[:, 0].max()))
+        for row in rows:
+            for column in columns:
+                height = terrain.height_m(float(x[column]), float(y[row]))
+                if height is not None:
+                    heights[row, column] = max(heights[row, column], height)
+    return heights.ravel()
 
 
 def _pair(grid: NDArray, dx: int, dy: int) -> tuple[NDArray, NDArray]:  # type: ignore[type-arg]

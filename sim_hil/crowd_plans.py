@@ -34,7 +34,7 @@ class Plans:
         if scene.routes and not scene.places:
             self._spots, self._routes = route_spots(scene)
         else:
-            self._spots = spots_of(scene, ways, rng)
+            self._spots = spots_of(scene, ways, crowd.n, rng)
         ways.add_destinations([spot.reach for spot in self._spots])
         self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
         self._queues: dict[int, list[int]] = {k: [] for k, s in enumerate(self._spots) if s.kind == "queue"}

@@ -13,7 +13,8 @@ from sim_hil.scene import Place, Scene, Vec2
 _REACH_M = 1.3  # a place further than this from any walkable floor is of no use
 _QUEUE_STEP_M = 0.75
 _SIDE_M = 0.8
-_WANDER_M2, _WANDER_MIN, _WANDER_MAX = 35.0, 10, 26
+_WANDER_M2, _WANDER_MIN, _WANDER_MAX = 35.0, 10, 20
+_PLACES_MIN, _PLACES_MAX = 10, 40  # each costs a field of ways over the whole floor
 _WANDER_GAP_M = 0.55
 
 
@@ -30,10 +31,12 @@ class Spot:
     heading_rad: float
 
 
-def spots_of(scene: Scene, ways: CrowdMap, rng: np.random.Generator) -> list[Spot]:
-    """Every spot of a scene that people can get to."""
-    found = [spot for spot in (_of_place(place, ways) for place in scene.places) if spot is not None]
-    return found + _scattered(ways, rng)
+def spots_of(scene: Scene, ways: CrowdMap, people: int, rng: np.random.Generator) -> list[Spot]:
+    """Where so many people go: some of a large scene's places, drawn from the seed, and points of its floor."""
+    most = int(np.clip(people + _PLACES_MIN, _PLACES_MIN, _PLACES_MAX))
+    drawn = sorted(rng.permutation(len(scene.places))[:most].tolist())
+    found = (_of_place(scene.places[k], ways) for k in drawn)
+    return [spot for spot in found if spot is not None] + _scattered(ways, rng)
 
 
 def _of_place(place: Place, ways: CrowdMap) -> Spot | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,14 @@ Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-class Doing(IntEnum):
-    """What a person is about."""
+class Doing:
+    """What a person is about; plain numbers, because arrays of them are compared all the time."""
 
-    WALK = 0  # on the way to a spot
-    FOLLOW = 1  # in the group of somebody
-    HOLD = 2  # standing at a spot: looking, talking, on the phone
-    QUEUE = 3  # in a queue
-    SIT = 4  # sitting, sitting down or getting up
+    WALK: Final = 0  # on the way to a spot
+    FOLLOW: Final = 1  # in the group of somebody
+    HOLD: Final = 2  # standing at a spot: looking, talking, on the phone
+    QUEUE: Final = 3  # in a queue
+    SIT: Final = 4  # sitting, sitting down or getting up
 
 
 class Crowd:

@@ -68,8 +68,8 @@ def choose(
     cx = np.concatenate((ex[:, None] * _COS - ey[:, None] * _SIN, vx[:, None]), axis=1)
     cy = np.concatenate((ey[:, None] * _COS + ex[:, None] * _SIN, vy[:, None]), axis=1)
     per_pace = (1.0 / pace_mps)[:, None]
-    cost = np.hypot(cx - lx[:, None], cy - ly[:, None]) * per_pace
-    cost += np.hypot(cx - vx[:, None], cy - vy[:, None]) * (_INERTIA * per_pace)
+    cost = _length(cx - lx[:, None], cy - ly[:, None]) * per_pace
+    cost += _length(cx - vx[:, None], cy - vy[:, None]) * (_INERTIA * per_pace)
     cost += _LEFT
     cost += hurry[:, None] * _IDLE
 
@@ -80,6 +80,10 @@ def choose(
     best = np.argmin(cost, axis=1)
     rows = np.arange(len(x))
     return cx[rows, best], cy[rows, best], meet_s[rows, best]
+
+
+def _length(x: Array, y: Array) -> Array:
+    return np.sqrt(x * x + y * y)
 
 
 def _meetings(cx: Array, cy: Array, near: Nearby) -> tuple[Array, Array]:
@@ -96,11 +100,11 @@ def _meetings(cx: Array, cy: Array, near: Nearby) -> tuple[Array, Array]:
     hits = (toward > 0) & (inside > 0)
     meet = np.where(hits, (toward - np.sqrt(np.maximum(inside, 0.0))) / square, _NONE_S)
     meet_s = np.maximum(meet, 0.0)
-    nearest_s = np.clip(toward / square, 0.0, 1.6)
+    nearest_s = np.minimum(np.maximum(toward / square, 0.0), 1.6)
     pass_m = np.sqrt(np.maximum(gap2 + nearest_s * (nearest_s * square - 2.0 * toward), 0.0))
     touch = near.touch[:, None, :]
     close = (near.close[:, None, :] - pass_m) / (near.close[:, None, :] - touch)
-    close = np.clip(close, 0.0, 1.0) * (1.0 - nearest_s * (0.7 / 1.6))
+    close = np.minimum(np.maximum(close, 0.0), 1.0) * (1.0 - nearest_s * (0.7 / 1.6))
     return meet_s.min(axis=2), close.max(axis=2)
 
 
@@ -113,5 +117,5 @@ def _walls(ways: CrowdMap, x: Array, y: Array, cx: Array, cy: Array) -> Array:
     # Who stands closer to a wall than that already may walk along it and away from it.
     limit = np.minimum(_WALL_M, here - 0.03)
     hit = np.where(gaps < limit, _WALL_COSTS, 0.0).max(axis=2)
-    air = np.clip((_AIR_M - gaps[:, :, 1]) / _AIR_M, 0.0, 1.0)
+    air = np.minimum(np.maximum((_AIR_M - gaps[:, :, 1]) * (1.0 / _AIR_M), 0.0), 1.0)
     return np.asarray(hit + _WALL_AIR * air)

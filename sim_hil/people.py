@@ -7,6 +7,7 @@ a wall, another person or the robot; ten times a second they look around, decide
 from __future__ import annotations
 
 from math import pi
+from typing import Final
 
 import numpy as np
 
@@ -40,11 +41,12 @@ _SQUEEZE_TOUCH_M, _SQUEEZE_CLOSE_M = 0.45, 0.55
 _BODIES_M = 0.45  # two people are never closer
 _ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
 _ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
+_PUSHED: Final = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
 _WALL_M = 0.22
 _HURRY_PER_S = 0.3  # see crowd_steering.choose
 _SPEED_UP_MPS2, _BRAKE_MPS2 = 1.8, 3.5
 _FASTEST_MPS, _SIT_DOWN_MPS = 1.9, 0.6
-_TURN_RADPS = 2.8
+_TURN_RADPS, _TURN = 2.8, 2 * pi
 _STEP_PER_ROOT_SPEED = 0.6245  # step length m = this * sqrt(speed): a walk ratio of 0.0065 m min (Sekiya et al. 1996)
 _FULL_STEP_M = 0.71  # of an amplitude of 1
 
@@ -62,7 +64,6 @@ class People:
         self._crowd = Crowd(count, rng)
         self._steps = 0
         self._watch = RobotWatch(_ROBOT_AXIS_M)
-        self._scene = scene
         if count:
             self._ways = CrowdMap(scene)
             self._plans = Plans(scene, self._ways, self._crowd, rng)
@@ -84,10 +85,7 @@ class People:
     def render_rows(self) -> Array:
         """[n, RENDER_FIELDS]: what a renderer needs of each person."""
         crowd = self._crowd
-        ground = np.zeros(crowd.n)
-        if self._scene.terrain:
-            places = zip(crowd.x.tolist(), crowd.y.tolist(), strict=True)
-            ground[:] = [self._scene.ground_height_m(x, y) for x, y in places]
+        ground = self._ways.heights_at(crowd.x, crowd.y) if crowd.n else np.zeros(0)
         columns = (crowd.x, crowd.y, crowd.heading, crowd.phase, crowd.swing, ground, crowd.sitting, crowd.gesture)
         return np.stack(columns, axis=1)
 
@@ -215,8 +213,7 @@ class People:
         if not len(over):
             return
         me, other = me[over], other[over]
-        firm = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
-        mine, theirs = firm[crowd.doing[me]], firm[crowd.doing[other]]
+        mine, theirs = _PUSHED[crowd.doing[me]], _PUSHED[crowd.doing[other]]
         push = (_BODIES_M - gap[over]) * mine / (mine + theirs + 1e-9) / gap[over]
         x += np.bincount(me, dx[over] * push, crowd.n)
         y += np.bincount(me, dy[over] * push, crowd.n)
@@ -255,16 +252,20 @@ class People:
         crowd = self._crowd
         speed = np.sqrt(crowd.vx * crowd.vx + crowd.vy * crowd.vy)
         walks = speed > 0.2
-        want = np.where(walks, np.arctan2(crowd.vy, crowd.vx), crowd.facing)
-        off = (want - crowd.heading + pi) % (2 * pi) - pi
+        off = np.where(walks, np.arctan2(crowd.vy, crowd.vx), crowd.facing) - crowd.heading
+        off -= _TURN * np.rint(off * (1.0 / _TURN))
         # A step back or aside is not turning round; whoever has nowhere to look keeps looking there.
-        keeps = np.isnan(off) | (walks & (np.abs(off) > 2.0) & (speed < 0.6))
-        off = np.where(keeps, 0.0, off)
-        crowd.heading += np.clip(off * min(6.0 * dt, 1.0), -_TURN_RADPS * dt, _TURN_RADPS * dt)
-        crowd.heading = (crowd.heading + pi) % (2 * pi) - pi
-        walking = np.where(crowd.sitting > 0, 0.0, speed)
-        step = _STEP_PER_ROOT_SPEED * np.sqrt(walking) * crowd.stride
-        talks = np.where(crowd.gesture == 1.0, 0.35 * dt, 0.0)  # hands move while one stands and talks
-        rate = np.where(walking > 0.05, walking * dt / (2.0 * step + 1e-9), talks)
-        crowd.phase = (crowd.phase + rate) % 1.0
-        crowd.swing += (np.minimum(step / _FULL_STEP_M, 1.2) - crowd.swing) * min(dt / 0.2, 1.0)
+        turns = (np.abs(off) < 2.0) | (speed > 0.6) | ~walks
+        off = np.where(turns & (off == off), off, 0.0) * (6.0 * dt)
+        heading = crowd.heading + np.minimum(np.maximum(off, -_TURN_RADPS * dt), _TURN_RADPS * dt)
+        crowd.heading = heading - _TURN * np.rint(heading * (1.0 / _TURN))
+        walking = speed * (crowd.sitting == 0.0)
+        root = np.sqrt(walking) * crowd.stride
+        # One cycle is two steps: speed / (2 step). Hands of who stands and talks move by the phase, too.
+        rate = np.where(
+            walking > 0.05, root * (dt / (2.0 * _STEP_PER_ROOT_SPEED)), (crowd.gesture == 1.0) * (0.35 * dt)
+        )
+        phase = crowd.phase + rate
+        crowd.phase = phase - np.floor(phase)
+        step = np.minimum(root * (_STEP_PER_ROOT_SPEED / _FULL_STEP_M), 1.2)
+        crowd.swing += (step - crowd.swing) * (dt / 0.2)
