@@ -15,7 +15,8 @@ from typing import Any
 from sim_hil.benchmark.conditions import Conditions, PolicySpec
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.results import EpisodeResult
-from sim_hil.benchmark.run_episode import EpisodeTask
+from sim_hil.benchmark.task import EpisodeTask
+from sim_hil.benchmark.worker_process import end_with_parent
 
 STILL = Conditions(PolicySpec("still"))
 
@@ -84,11 +85,14 @@ def main() -> int:
     options = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
     asked = EpisodeTask.of_json(json.loads(sys.stdin.read()))
     name = asked.episode.id
+    end_with_parent(int(options["--parent"]))
     if name == "dies" or (name == "dies-once" and asked.attempt == 1):
         sys.stderr.write("out of luck\n")
         sys.stderr.flush()
         os.kill(os.getpid(), signal.SIGKILL)
-    if name == "hangs":
+    if "--pids" in options:
+        (Path(options["--pids"]) / f"{name}.{asked.attempt}").write_text(options["--parent"])
+    if name == "hangs" or (name == "hangs-once" and asked.attempt == 1):
         time.sleep(600)
     with os.fdopen(int(options["--fd"]), "w") as lines:
         if name == "refuses":

@@ -11,8 +11,8 @@ import pytest
 
 from sim_hil.benchmark.jobs import Ended, RefusedRunError, RunWatcher, run_all
 from sim_hil.benchmark.local_jobs import LocalJobs
-from sim_hil.benchmark.run_episode import EpisodeTask
 from sim_hil.benchmark.store import ResultStore, read_results
+from sim_hil.benchmark.task import EpisodeTask
 from tests import dynanav_fakes as fakes
 
 FAKE_WORKER = (sys.executable, "-m", "tests.dynanav_fakes")

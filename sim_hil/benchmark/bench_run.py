@@ -21,9 +21,10 @@ from sim_hil.benchmark.episode_log import read_log
 from sim_hil.benchmark.jobs import Backend, RunWatcher, run_all
 from sim_hil.benchmark.policies import check_artifacts
 from sim_hil.benchmark.results import EpisodeResult
-from sim_hil.benchmark.run_episode import RUNNERS, EpisodeTask
+from sim_hil.benchmark.run_episode import RUNNERS
 from sim_hil.benchmark.store import EPISODES, ResultStore
 from sim_hil.benchmark.summary import summarise
+from sim_hil.benchmark.task import EpisodeTask
 
 SCHEMA = 1
 _PACKAGES = ("tic-vla-edge", "numpy", "pybullet", "scipy", "pyrvo", "onnxruntime", "opencv-python-headless")

@@ -44,8 +44,8 @@ from sim_hil.benchmark.latency import LatencyError, LatencyProfile, parse_latenc
 from sim_hil.benchmark.local_jobs import LocalJobs
 from sim_hil.benchmark.progress import BenchProgress
 from sim_hil.benchmark.report import write_report
-from sim_hil.benchmark.run_episode import VIDEO_CHOICES
 from sim_hil.benchmark.store import ResultStore, StoreError
+from sim_hil.benchmark.task import VIDEO_CHOICES
 from sim_hil.scene import SceneError
 
 EXAMPLES = """examples:

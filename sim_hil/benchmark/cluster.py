@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from sim_hil.benchmark.jobs import Ended
-from sim_hil.benchmark.local_jobs import LocalJobs
+from sim_hil.benchmark.local_jobs import WORKER, LocalJobs
 from sim_hil.benchmark.results import EpisodeResult
-from sim_hil.benchmark.run_episode import EpisodeTask
 from sim_hil.benchmark.store import EPISODES, VIDEOS
+from sim_hil.benchmark.task import EpisodeTask
 
 ATTEMPTS = 4
 """On a cluster a node takes its episodes along when it dies, which says nothing of the episode."""
@@ -36,7 +36,8 @@ class ClusterJobs:
 
     attempts = ATTEMPTS
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, worker: Sequence[str] | None = None) -> None:
+        """`worker`: the command of a worker process on a node, if it is not its own interpreter's."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             import ray
@@ -55,6 +56,7 @@ class ClusterJobs:
             ) from error
         # The driver retries, so that every death is told and counted in one place.
         self._remote = ray.remote(num_cpus=CPUS_PER_EPISODE, max_retries=0)(run_on_node)
+        self._worker = None if worker is None else list(worker)
         self._running: dict[Any, str] = {}
         self._open = True
 
@@ -65,7 +67,7 @@ class ClusterJobs:
 
     def start(self, task: EpisodeTask) -> None:
         """Hand out a task."""
-        self._running[self._remote.remote(json.dumps(task.as_json()))] = task.episode.id
+        self._running[self._remote.remote(json.dumps(task.as_json()), self._worker)] = task.episode.id
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
         """Tasks that have ended, with or without a result."""
@@ -102,13 +104,13 @@ class ClusterJobs:
         self._ray.shutdown()
 
 
-def run_on_node(task_json: str) -> tuple[str, list[tuple[str, bytes]]]:
+def run_on_node(task_json: str, worker: Sequence[str] | None) -> tuple[str, list[tuple[str, bytes]]]:
     """Run a task in a process of this node; (what came of it as JSON, files by their path below the run's folder)."""
     with tempfile.TemporaryDirectory(prefix="edge-bench-") as folder:
         for name in (EPISODES, VIDEOS):
             (Path(folder) / name).mkdir()
         task = replace(EpisodeTask.of_json(json.loads(task_json)), folder=Path(folder))
-        ended = _one(task)
+        ended = _one(task, worker)
         found = [path for path in sorted(Path(folder).rglob("*")) if path.suffix in (".json", ".mp4")]
         files = [(path.relative_to(folder).as_posix(), path.read_bytes()) for path in found]
     told = {
@@ -120,8 +122,8 @@ def run_on_node(task_json: str) -> tuple[str, list[tuple[str, bytes]]]:
     return json.dumps(told), files
 
 
-def _one(task: EpisodeTask) -> Ended:
-    jobs = LocalJobs(1)
+def _one(task: EpisodeTask, worker: Sequence[str] | None) -> Ended:
+    jobs = LocalJobs(1, worker or WORKER)
     try:
         jobs.start(task)
         while True:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Protocol
 
 from sim_hil.benchmark.results import EpisodeResult, FailedRun
-from sim_hil.benchmark.run_episode import EpisodeTask
 from sim_hil.benchmark.store import ResultStore
+from sim_hil.benchmark.task import EpisodeTask
 
 POLL_S = 0.2
 

@@ -18,9 +18,9 @@ from typing import IO
 from sim_hil.benchmark.conditions import ConditionsError
 from sim_hil.benchmark.jobs import Ended
 from sim_hil.benchmark.results import EpisodeResult, ResultError
-from sim_hil.benchmark.run_episode import EpisodeTask
 from sim_hil.benchmark.store import EPISODES
-from sim_hil.benchmark.worker import SINGLE_THREADED
+from sim_hil.benchmark.task import EpisodeTask
+from sim_hil.benchmark.worker_process import SINGLE_THREADED
 
 ATTEMPTS = 2
 """An episode whose process died is run once more."""

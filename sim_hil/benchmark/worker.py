@@ -6,10 +6,8 @@ Its standard output belongs to the libraries (the physics engine prints), so lin
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import os
-import signal
 import sys
 import time
 from collections.abc import Mapping
@@ -24,17 +22,12 @@ from firmware_bridge.config import ConfigError
 from sim_hil.benchmark.conditions import ConditionsError
 from sim_hil.benchmark.episode import SuiteError
 from sim_hil.benchmark.external_protocol import ExternalError
-from sim_hil.benchmark.run_episode import EpisodeTask, run_episode
+from sim_hil.benchmark.run_episode import run_episode
+from sim_hil.benchmark.task import EpisodeTask
+from sim_hil.benchmark.worker_process import end_with_parent
 from sim_hil.scene import SceneError
 
-SINGLE_THREADED: Mapping[str, str] = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
-"""Environment of every worker: one core each, and sums in one order."""
 TELL_EVERY_NS = 500_000_000
-_PR_SET_PDEATHSIG = 1
 
 _BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionError)
 
@@ -46,14 +39,6 @@ def refusal_of(error: Exception) -> tuple[str, int] | None:
     if isinstance(error, _BAD_INPUT):
         return str(error), EXIT_BAD_INPUT
     return None
-
-
-def end_with_parent(parent_pid: int) -> None:
-    """Let the kernel kill this process when its parent has gone, whatever ended that."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent_pid:
-        os._exit(1)  # it had gone before
 
 
 def main(argv: list[str] | None = None) -> int:
