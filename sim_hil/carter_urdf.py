@@ -91,7 +91,7 @@ def _base() -> str:
         # Low shell with cut corners, a deck on it, and the mast that carries camera and lidar.
         _shape("visual", _box(LENGTH_M - 0.01, _NOSE_WIDTH_M, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
         _shape("visual", _box(_MIDDLE_LENGTH_M, 0.36, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
-        _shape("visual", _box(0.24, WIDTH_M - 0.02, tall - 0.03), (-0.18, 0, middle - 0.015), rgba=_SHELL),
+        _shape("visual", _box(0.13, WIDTH_M - 0.02, tall - 0.03), (-0.235, 0, middle - 0.015), rgba=_SHELL),
         _shape("visual", _box(0.13, WIDTH_M - 0.02, tall - 0.03), (0.235, 0, middle - 0.015), rgba=_SHELL),
         _shape("visual", _box(_MIDDLE_LENGTH_M, WIDTH_M - 0.02, 0.03), (0, 0, DECK_M - 0.015), rgba=_DECK),
         _shape("visual", _box(0.015, _NOSE_WIDTH_M - 0.04, 0.025), (LENGTH_M / 2 - 0.004, 0, 0.22), rgba=_GREEN),

@@ -26,6 +26,9 @@ _SEND_QUEUE: Final = 256
 _RECEIVE_QUEUE: Final = 4096
 _SERIAL_TIMEOUT_S: Final = 0.05
 _END_S: Final = 1.0
+_SERIAL_START: Final = 0xAA
+_SERIAL_END: Final = 0xBB
+_SERIAL_HEAD: Final = struct.Struct("<BIBI")
 
 
 class BusError(RuntimeError):
@@ -56,25 +59,70 @@ class BusAddress:
         return f"{self.interface}:{self.channel}"
 
 
+class SerialFrames:
+    """Cuts the bytes of python-can's serial format into messages, and finds the next one after lost or false bytes.
+
+    0xAA, time stamp (4 bytes), length, identifier (4 bytes, little endian, flags as in the kernel), data, 0xBB.
+    """
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.errors = 0
+
+    def put(self, data: bytes) -> None:
+        """Add what was read."""
+        self._bytes += data
+
+    def take(self) -> can.Message | None:
+        """The next message; None until more bytes come."""
+        while (start := self._bytes.find(_SERIAL_START)) >= 0:
+            del self._bytes[:start]
+            if len(self._bytes) < _SERIAL_HEAD.size:
+                return None
+            _, stamp_ms, length, identifier = _SERIAL_HEAD.unpack_from(self._bytes)
+            end = _SERIAL_HEAD.size + length
+            if length <= 8 and len(self._bytes) <= end:
+                return None
+            if length <= 8 and self._bytes[end] == _SERIAL_END:
+                data = bytes(self._bytes[_SERIAL_HEAD.size : end])
+                del self._bytes[: end + 1]
+                return _message(stamp_ms / 1000, identifier, data)
+            del self._bytes[0]  # not a beginning, though it looked like one
+            self.errors += 1
+        self._bytes.clear()
+        return None
+
+
+def _message(stamp_s: float, identifier: int, data: bytes) -> can.Message:
+    return can.Message(
+        timestamp=stamp_s,
+        arbitration_id=identifier & 0x1FFFFFFF,
+        data=data,
+        is_extended_id=bool(identifier & 0x80000000),
+        is_remote_frame=bool(identifier & 0x40000000),
+        is_error_frame=bool(identifier & 0x20000000),
+    )
+
+
 class _SerialBus(SerialBus):
     """python-can's serial bus that neither waits for ever for a peer that does not read, nor trips over lost bytes."""
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel, timeout=_SERIAL_TIMEOUT_S)
         self._ser.write_timeout = _SERIAL_TIMEOUT_S
-        self.line_errors = 0
+        self._frames = SerialFrames()
+
+    @property
+    def line_errors(self) -> int:
+        """Places where a frame was expected and none was."""
+        return self._frames.errors
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        try:
-            return super()._recv_internal(timeout)
-        except can.CanOperationError as error:
-            if error.__cause__ is not None:  # the device has gone
-                raise
-        except (ValueError, TypeError, struct.error):
-            pass
-        # A frame that is not one: bytes were lost, or we began to listen in the middle.
-        self.line_errors += 1
-        return None, False
+        message = self._frames.take()
+        if message is None:
+            self._frames.put(self._ser.read(max(1, self._ser.in_waiting)))
+            message = self._frames.take()
+        return message, False
 
 
 def open_bus(address: BusAddress) -> can.BusABC:
@@ -111,6 +159,11 @@ class BusLink:
     def line_errors(self) -> int:
         """Broken frames of a serial line."""
         return int(getattr(self._bus, "line_errors", 0))
+
+    @property
+    def pending(self) -> int:
+        """Frames that wait to be sent."""
+        return self._to_send.qsize()
 
     def send(self, frame: Frame) -> None:
         """Queue a frame; counted in `unsent` when the queue is full, because nobody takes frames off the line."""

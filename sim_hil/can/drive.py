@@ -15,7 +15,7 @@ from sim_hil.can.client import CanClient, Odometry
 _ANSWER_S: Final = 5.0
 _REPORT_S: Final = 0.5
 
-EPILOG: Final = """examples, while `edge-hil --robot carter --protocol can --scene corridor --link serial:carter-can` runs:
+EPILOG: Final = """examples, beside `edge-hil --robot carter --protocol can --scene corridor --link serial:carter-can`:
   python -m sim_hil.can.drive --channel carter-can --vx 0.5 --duration 5
   python -m sim_hil.can.drive --interface socketcan --channel can0 --vx 0 --wz 0.5 --duration 3 --json -
 exit codes: 0 driven and stopped; 1 the base did not answer, arm or stop; 2 bad arguments or no such bus"""

@@ -32,6 +32,7 @@ from sim_hil.front_end import FrontEndError, FrontEndOptions, Heard
 from sim_hil.simulation import Simulation
 
 CAMERA_PORT: Final = 8090
+_EVENT_S: Final = 0.1
 _SHOWN: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
 
 
@@ -59,12 +60,18 @@ class LinkOptions:
             camera = [setting for setting in settings if setting.startswith("camera=")]
             faults = [setting for setting in settings if not setting.startswith("camera=")]
             if camera:
-                given["camera_port"] = int(camera[-1].removeprefix("camera="))
+                given["camera_port"] = _port(camera[-1].removeprefix("camera="))
             if faults:
                 given["faults"] = FaultPlan.parse(",".join(faults))
             return LinkOptions(BusAddress.parse(where), **given)
         except ValueError as error:
             raise FrontEndError(f"--link {text}: {error}") from error
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdecimal()):
+        raise ValueError(f"camera: expected a port of 0..65535, found {text!r}")
+    return int(text)
 
 
 class CommandLog:
@@ -112,6 +119,7 @@ class CanFrontEnd:
         self._outwards = FaultShim(link.faults, options.seed, 1)
         self._log = CommandLog()
         self._heard: list[Heard] = []
+        self._last_event: tuple[tuple[str, float], float] | None = None
         self._now_s = 0.0
         self._states = 0
         self._line: PtyLine | None = None
@@ -191,10 +199,18 @@ class CanFrontEnd:
         if received is None or received.name not in _SHOWN:
             return
         stop = received.name == "EstopControl" and received.signals.get("Request") == frames.ESTOP_STOP
-        if received.good or stop:
+        if (received.good or stop) and not self._again(received):
             self._log.note(received)
             content = " ".join(f"{key}={received.signals[key]:g}" for key in _SHOWN[received.name])
             self._heard.append(Heard(received_ns, "can", frame.identifier, received.name, content))
+
+    def _again(self, received: Received) -> bool:
+        """Whether this is one more frame of an event that is sent three times."""
+        if received.name == "VelocityCommand":
+            return False
+        event, last = (received.name, received.signals["Request"]), self._last_event
+        self._last_event = (event, self._now_s)
+        return last is not None and last[0] == event and self._now_s - last[1] < _EVENT_S
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Let the node's clock go on, and send what is due."""
@@ -211,6 +227,11 @@ class CanFrontEnd:
         for frame in due:
             self._states += frame.identifier == _MOTION_ID
             self._link.send(frame)
+
+    @property
+    def pending(self) -> int:
+        """Frames that wait for the bus."""
+        return 0 if self._link is None else self._link.pending
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
