@@ -26,9 +26,10 @@ _WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
 _STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
 _STANDING_PRICE: Final = 12.0  # a metre through somebody who stands there costs so much more
 _PERSON_M: Final = 0.7  # as far as that price reaches in full; it ends twice as far
+_SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
 _NO_ROOM: Final = 1000.0
 _DETOUR: Final = 1.01  # a straight piece may cost so much more than the crooked one
-_KEEP: Final = (1.1, 1.5)  # the way so far is kept while it costs at most so many times a better one, and so much more
+_KEEP: Final = (1.2, 2.5)  # the way so far is kept while it costs at most so many times a better one, and so much more
 
 
 class RoutePlanner:
@@ -44,6 +45,7 @@ class RoutePlanner:
         self._coarsen()
         self._costs, self._onwards = self._search(np.zeros((0, 2)))
         self._empty_costs = self._costs
+        self._searched = b""
 
     def _static_price(self, scene: Scene) -> Array:
         lack = np.clip(1.0 - (self.grid.clearances - self.grid.required_m) / ROOM_M, 0.0, 1.0)
@@ -117,7 +119,10 @@ class RoutePlanner:
         `standing` [k, 2]: who stands about, m. `before`: the route so far, from here on; it is kept unless another is
         clearly better. Just the start where there is no way.
         """
-        self._costs, self._onwards = self._search(standing)
+        searched = np.round(standing / _SHUFFLE_M).tobytes()
+        if searched != self._searched:
+            self._costs, self._onwards = self._search(standing)
+            self._searched = searched
         node = self._node(*start)
         if node < 0 or not np.isfinite(self._costs[node]):
             return np.array([start])
