@@ -12,7 +12,7 @@ from sim_hil.can import frames
 from sim_hil.can.buses import INTERFACES, BusAddress, BusError, BusLink, open_bus
 from sim_hil.can.client import CanClient, Odometry
 
-_ANSWER_S: Final = 5.0
+_ANSWER_S: Final = 3.0
 _REPORT_S: Final = 0.5
 
 EPILOG: Final = """examples, beside `edge-hil --robot carter --protocol can --scene corridor --link serial:carter-can`:
