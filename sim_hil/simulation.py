@@ -34,6 +34,7 @@ ROBOT_FIELDS = 19  # render_state of a Go2: position, quaternion xyzw, 12 joint 
 _CONTACT_S = 0.01  # how often contacts are looked at: they last longer than this
 _NEAR_M = 2.5  # people this close have a body that can be walked into; the others only a place
 _MAX_BODIES = 24  # more people do not fit into that circle
+_TOUCHING_S = 0.1
 _SHARED = 16  # boxes in one body: as many as the engine takes
 _BLOCK_M = 8.0  # boxes this close to each other count as neighbours
 _SETTLE_S = 6.0  # what a robot may take to get ready before it counts as broken
@@ -84,8 +85,7 @@ class Simulation:
         self._seed = seed
         self._steps = 0
         self._contact_every = max(1, round(_CONTACT_S * rate_hz))
-        self._touched: set[str] = set()
-        self._touching: frozenset[str] = frozenset()
+        self._touched: dict[str, int] = {}  # label -> the latest step in which it was touched
         self._fell = False
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
@@ -286,8 +286,7 @@ class Simulation:
             np.any(np.hypot(self._people[:, 0] - x, self._people[:, 1] - y) < PERSON_COLLISION_M)
         ):
             labels.add("person")
-        self._touching = frozenset(labels)
-        self._touched |= labels
+        self._touched.update((label, self._steps) for label in labels)
         self._fell = self._fell or self._robot.up() < 0.5
 
     @property
@@ -349,8 +348,9 @@ class Simulation:
 
     @property
     def touching(self) -> frozenset[str]:
-        """The same for now, as of the latest look (100 a second)."""
-        return self._touching
+        """The same for the last 0.1 s: legs that push against something touch it on and off."""
+        since = self._steps - _TOUCHING_S * self.rate_hz
+        return frozenset(label for label, step in self._touched.items() if step > since)
 
     @property
     def fell(self) -> bool:
