@@ -19,7 +19,7 @@ from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.episode_log import read_log
 from sim_hil.benchmark.jobs import Backend, RunWatcher, run_all
-from sim_hil.benchmark.policies import check_artifacts
+from sim_hil.benchmark.policies import check_artifacts, open_policy
 from sim_hil.benchmark.results import EpisodeResult
 from sim_hil.benchmark.run_episode import RUNNERS
 from sim_hil.benchmark.store import EPISODES, ResultStore
@@ -42,7 +42,10 @@ class BenchRun:
 
     @staticmethod
     def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions) -> BenchRun:
-        """Check everything that can be known before the first episode. Raises ArtifactError, ConditionsError."""
+        """Check everything that can be known before the first episode; an external policy is asked who it is.
+
+        Raises ArtifactError, ConditionsError, ExternalError.
+        """
         if conditions.clock not in RUNNERS:
             raise ConditionsError(
                 f"--clock {conditions.clock}: not in this version; expected {', '.join(sorted(RUNNERS))}"
@@ -51,6 +54,8 @@ class BenchRun:
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
         run.tasks(Path())
+        if conditions.policy.kind == "external":
+            open_policy(conditions).close()
         return run
 
     def config(self) -> dict[str, Any]:
