@@ -38,12 +38,17 @@ def crc_of_words(data: bytes) -> int:
 
 def low_state_crc(state: LowState_) -> int:
     """Value that belongs into `state.crc`."""
+    return crc_of_words(LOW_STATE_LAYOUT.pack(*low_state_values(state)))
+
+
+def low_state_values(state: LowState_) -> tuple[float, ...]:
+    """The numbers of a LowState in the order of the wire, without the checksum."""
     imu, bms = state.imu_state, state.bms_state
     motors: list[float] = []
     for motor in state.motor_state:
         motors += (motor.mode, motor.q, motor.dq, motor.ddq, motor.tau_est, motor.q_raw, motor.dq_raw, motor.ddq_raw)
         motors += (motor.temperature, motor.lost, *motor.reserve)
-    packed = LOW_STATE_LAYOUT.pack(
+    return (
         *(*state.head, state.level_flag, state.frame_reserve, *state.sn, *state.version, state.bandwidth),
         *(*imu.quaternion, *imu.gyroscope, *imu.accelerometer, *imu.rpy, imu.temperature),
         *motors,
@@ -52,4 +57,3 @@ def low_state_crc(state: LowState_) -> int:
         *(state.adc_reel, state.temperature_ntc1, state.temperature_ntc2, state.power_v, state.power_a),
         *(*state.fan_frequency, state.reserve),
     )
-    return crc_of_words(packed)

@@ -7,14 +7,16 @@ under the name by which makers' other robots and bindings know the odometry.
 from __future__ import annotations
 
 import math
+import struct
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from cyclonedds._clayer import ddspy_write
 from cyclonedds.pub import DataWriter
 
 from firmware_bridge.unitree import ids
-from firmware_bridge.unitree.crc import low_state_crc
+from firmware_bridge.unitree.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_crc, low_state_values
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
 from firmware_bridge.unitree.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.idl_low import BmsState_, LowState_, MotorState_
@@ -33,6 +35,12 @@ LF_HZ: Final = 20  # the maker names no number; owners report 15 to 20
 _MATCH_CHECK_HZ: Final = 10
 _MOTORS: Final = 20
 _MOTORS_USED: Final = 12
+# LowState_ as CDR: members aligned to their own size, no padding behind a struct. The binding's own serializer takes a
+# quarter of a millisecond for it, which at 500 Hz is an eighth of a core.
+_CDR_LITTLE_ENDIAN: Final = b"\0\1\0\0"
+_LOW_STATE_CDR: Final = struct.Struct(
+    "<4B4IH2x" + "13fB" + "B2x7fB3x3I" + "B3x7fB3x3I" * (_MOTORS - 1) + "4BiH4B15H" + "8hI41B3xf2B2x2f4HII"
+)
 _FOOT_RAISE_M: Final = 0.09  # the maker's sample
 
 
@@ -173,6 +181,18 @@ class LowStateMessage:
 
     def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
         """The message for this instant, checksum included."""
+        message = self.update(truth, odometry)
+        message.crc = low_state_crc(message)
+        return message
+
+    def encode(self) -> bytes:
+        """The message as it goes over the wire, with a fresh checksum: what `serialize` makes of it, much faster."""
+        values = low_state_values(self.message)
+        self.message.crc = crc_of_words(LOW_STATE_LAYOUT.pack(*values))
+        return _CDR_LITTLE_ENDIAN + _LOW_STATE_CDR.pack(*values, self.message.crc)
+
+    def update(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
+        """The message for this instant, without its checksum."""
         message = self.message
         message.imu_state = imu_state(truth, odometry)
         rows = zip(truth.joint_q_rad.tolist(), truth.joint_dq_radps.tolist(), truth.joint_tau_nm.tolist(), strict=True)
@@ -182,7 +202,6 @@ class LowStateMessage:
             motor.tau_est = tau_nm
         message.foot_force = message.foot_force_est = _foot_force(truth)
         message.tick = round(truth.time_s * 1000) & 0xFFFFFFFF
-        message.crc = low_state_crc(message)
         return message
 
 
@@ -210,6 +229,11 @@ class _Periodic:
         except DDS_ERRORS:
             return  # a reader's queue is full: the next sample replaces this one
         self.sent += 1
+
+    def write_encoded(self, data: bytes) -> None:
+        """What `DataWriter.write` does once it has serialized a message; data is a multiple of 4 bytes long."""
+        if ddspy_write(self._writer._ref, data) >= 0:
+            self.sent += 1
 
 
 class StatePublishers:
@@ -278,13 +302,12 @@ class StatePublishers:
 
     def _write_low(self, topics: list[_Periodic], truth: RobotTruth) -> None:
         self._low_message.message.wireless_remote = self._remote.as_bytes()
-        message = self._low_message.fill(truth, self._odometry)
-        if self._faults is not None:
-            if not self._faults.alter_low(message):
-                return
-            message.crc = low_state_crc(message)
+        message = self._low_message.update(truth, self._odometry)
+        if self._faults is not None and not self._faults.alter_low(message):
+            return
+        data = self._low_message.encode()
         for topic in topics:
-            topic.write(message)
+            topic.write_encoded(data)
 
     def _empty_battery(self, truth: RobotTruth) -> None:
         elapsed_s, self._loaded_s = truth.time_s - self._loaded_s, truth.time_s
