@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
+import socket
 import stat
 import time
 from collections import Counter
@@ -212,6 +214,74 @@ def test_a_link_with_faults_counts_them_and_still_drives(tmp_path: Path) -> None
         assert counts["wrong_crc"] > 0 and counts["wrong_counter"] > 0 and counts["lost"] > 0
     finally:
         rig.close()
+
+
+@pytest.fixture
+def ask(tmp_path: Path) -> Iterator[tuple[Rig, Callable[..., dict[str, object]]]]:
+    """A rig with --faults, and how to ask it for one."""
+    name, path = f"contract-{next(_numbers)}", tmp_path / "faults"
+    rig = open_rig(f"virtual:{name}", BusAddress("virtual", name), faults=path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asker:
+        asker.bind(str(tmp_path / "asker"))
+        asker.settimeout(10)
+
+        def switch(**command: object) -> dict[str, object]:
+            asker.sendto(json.dumps(command).encode(), str(path))
+            rig.run(0.02)
+            answer: dict[str, object] = json.loads(asker.recv(2000))
+            return answer
+
+        yield rig, switch
+    rig.close()
+    assert not path.exists()
+
+
+def test_the_red_button_stops_it_and_a_reset_needs_it_released(ask: tuple[Rig, Callable[..., object]]) -> None:
+    rig, switch = ask
+    rig.make_ready()
+    switch(fault="button", on=True)
+    rig.until(lambda: _can(rig).state == frames.STATE_ESTOP, 2.0, "the emergency stop")
+    rig.until(lambda: _can(rig).latest("EstopState")["Button"] == 1, 2.0, "the button")
+    rig.tell(_can(rig).reset)
+    rig.run(0.3)
+    assert _can(rig).state == frames.STATE_ESTOP
+    switch(fault="button", on=False)
+    rig.tell(_can(rig).reset)
+    rig.until(lambda: _can(rig).state == frames.STATE_IDLE, 2.0, "idle")
+
+
+def test_a_bus_that_is_switched_off_stops_the_base_and_comes_back(ask: tuple[Rig, Callable[..., object]]) -> None:
+    rig, switch = ask
+    rig.make_ready()
+    rig.run(0.5, lambda: rig.tell(lambda: rig.client.drive(0.4, 0.0)))
+    switch(fault="bus_off", on=True)
+    rig.run(0.5, lambda: rig.client.drive(0.4, 0.0))
+    assert rig.simulation.commanded == (0.0, 0.0, 0.0) and rig.speed_mps() < 0.05
+    switch(fault="bus_off", on=False)
+    assert _counts(rig)["bus_offs"] == 1
+    rig.run(0.2)
+    rig.make_ready()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [{}, {"fault": "drip"}, {"fault": "drop"}, {"fault": "drop", "value": 2}, {"fault": "drop", "value": "x"},
+     {"fault": "button", "on": 1}, {"fault": "drop", "value": 0.1, "colour": "red"}, {"fault": "button", "value": 1}],
+)  # fmt: skip
+def test_a_fault_that_there_is_not_is_answered_with_what_there_is(
+    ask: tuple[Rig, Callable[..., dict[str, object]]], command: dict[str, object]
+) -> None:
+    assert "expected" in str(ask[1](**command)["error"])
+
+
+def test_a_fault_is_switched_on_and_off_and_all_are_cleared(ask: tuple[Rig, Callable[..., dict[str, object]]]) -> None:
+    rig, switch = ask
+    assert switch(fault="drop", value=1.0)["on"] is True
+    rig.client.get_ready()
+    rig.run(0.5)
+    assert not rig.client.is_ready()
+    switch(fault="clear")
+    rig.make_ready()
 
 
 @pytest.mark.parametrize(

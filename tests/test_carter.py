@@ -10,62 +10,16 @@ import numpy as np
 import pybullet
 import pytest
 
-from sim_hil.carter import TYRE_GRIP, Carter, CarterTruth, load_carter, place_carter
+from sim_hil.carter import TYRE_GRIP, load_carter, place_carter
 from sim_hil.carter_odometry import WheelCalibration
 from sim_hil.carter_sensors import CarterSensors
 from sim_hil.carter_urdf import LENGTH_M, MASS_KG, RADIUS_M, WHEEL_RADIUS_M, WIDTH_M
 from sim_hil.gait import GRAVITY_MPS2
 from sim_hil.scene import load_scene
 from sim_hil.simulation import Simulation
+from tools.bench.wheeled_course import World, forward_mps
 
-Vec3 = tuple[float, float, float]
 RATES_HZ = (240, 480, 500)
-
-
-class World:
-    """A floor, boxes on it, and a Carter at the origin."""
-
-    def __init__(self, folder: Path, rate_hz: int = 240, calibration: WheelCalibration | None = None) -> None:
-        self.client = pybullet.connect(pybullet.DIRECT)
-        self.dt_s = 1.0 / rate_hz
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.dt_s, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=self.client
-        )
-        pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=self.client)
-        self.box((0, 0, -0.5), (60, 60, 1))
-        self.robot = Carter(self.client, folder, (0.0, 0.0, 0.0), self.dt_s, calibration=calibration)
-        self.steps = 0
-
-    def box(self, centre: Vec3, size: Vec3, pitch_rad: float = 0.0, grip: float = 0.9) -> None:
-        half = [extent / 2 for extent in size]
-        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
-        turn = pybullet.getQuaternionFromEuler((0, pitch_rad, 0))
-        body = pybullet.createMultiBody(0, shape, -1, centre, turn, physicsClientId=self.client)
-        pybullet.changeDynamics(body, -1, lateralFriction=grip, physicsClientId=self.client)
-
-    def ramp(self, start_x: float, degrees: float, length_m: float) -> None:
-        """Rises along x from the floor at `start_x`."""
-        a = math.radians(degrees)
-        x, z = length_m / 2 * math.cos(a) + 0.5 * math.sin(a), length_m / 2 * math.sin(a) - 0.5 * math.cos(a)
-        self.box((start_x + x, 0, z), (length_m, 6, 1), -a)
-
-    def run(self, seconds: float, v: float | None = None, w: float = 0.0) -> CarterTruth:
-        for step in range(round(seconds / self.dt_s)):
-            if v is not None and step % round(0.1 / self.dt_s) == 0:
-                self.robot.command(v, 0.0, w)
-            self.robot.drive()
-            pybullet.stepSimulation(physicsClientId=self.client)
-            self.robot.observe()
-            self.steps += 1
-        return self.truth()
-
-    def truth(self) -> CarterTruth:
-        return self.robot.truth(self.steps * self.dt_s)
-
-    def go(self) -> World:
-        self.run(0.2)
-        self.robot.stand()
-        return self
 
 
 Make = Callable[..., World]
@@ -81,13 +35,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
     yield build
     for world in worlds:
-        pybullet.disconnect(physicsClientId=world.client)
-
-
-def forward_mps(truth: CarterTruth) -> float:
-    heading = float(truth.rpy_rad[2])
-    vx, vy, _ = truth.velocity_world_mps
-    return float(math.cos(heading) * vx + math.sin(heading) * vy)
+        world.close()
 
 
 def test_the_body_has_the_published_mass_and_fits_its_own_circle(make: Make) -> None:

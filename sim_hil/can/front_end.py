@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ from sim_hil.carter import Carter
 from sim_hil.carter_sensors import CarterSensors, Sensors
 from sim_hil.front_end import FrontEndError, FrontEndOptions, Heard
 from sim_hil.simulation import Simulation
+
+if TYPE_CHECKING:
+    from sim_hil.can.faults import CanFaults
 
 CAMERA_PORT: Final = 8090
 _EVENT_S: Final = 0.1
@@ -114,7 +117,8 @@ class CanFrontEnd:
         self._options, self._address = options, link.address
         self._node = CanNode(robot)
         self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
-        self._faulty = link.faults != FaultPlan()
+        self._faulty = link.faults != FaultPlan() or options.faults is not None
+        self._faults: CanFaults | None = None
         self._inwards = FaultShim(link.faults, options.seed, 0)
         self._outwards = FaultShim(link.faults, options.seed, 1)
         self._log = CommandLog()
@@ -126,6 +130,8 @@ class CanFrontEnd:
         self._link: BusLink | None = None
         self._camera: CameraStream | None = None
         try:
+            if options.faults is not None:
+                self._faults = _faults(options.faults, link.faults)
             self._link = BusLink(open_bus(self._plugged_in(link.address)))
             if options.camera_size is not None:
                 self._camera = CameraStream(
@@ -216,6 +222,7 @@ class CanFrontEnd:
         """Let the node's clock go on, and send what is due."""
         assert self._link is not None
         self._now_s = stamp_s
+        self._heed_faults()
         self._hear_late()
         self._node.step(stamp_s)
         due = self._node.due(stamp_s, self._read)
@@ -227,6 +234,14 @@ class CanFrontEnd:
         for frame in due:
             self._states += frame.identifier == _MOTION_ID
             self._link.send(frame)
+
+    def _heed_faults(self) -> None:
+        if self._faults is None:
+            return
+        self._faults.poll()
+        self._node.button = self._faults.button
+        for shim in (self._inwards, self._outwards):
+            shim.plan, shim.held_off = self._faults.plan, self._faults.bus_off
 
     @property
     def pending(self) -> int:
@@ -242,7 +257,9 @@ class CanFrontEnd:
             self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process, leave the bus, remove the pty."""
+        """End the camera process, leave the bus, remove the pty and the faults' socket."""
+        if self._faults is not None:
+            self._faults.close()
         if self._camera is not None:
             self._camera.close()
         if self._link is not None:
@@ -273,13 +290,18 @@ class CanFrontEnd:
         }
 
 
+def _faults(path: Path, plan: FaultPlan) -> CanFaults:
+    # Imported here: without --faults nobody can press anything from outside.
+    from sim_hil.can.faults import CanFaults
+
+    return CanFaults(path, plan)
+
+
 _MOTION_ID: Final = frames.database().get_message_by_name("OdometryMotion").frame_id
 
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> CanFrontEnd:
     """The front end of `--protocol can`. Raises FrontEndError or OSError."""
-    if options.faults is not None:
-        raise FrontEndError("--faults: unitree's; on CAN faults are part of --link, such as ,drop=0.05")
     robot = simulation.robot
     if not isinstance(robot, Carter):
         raise FrontEndError(f"--protocol can: expected the Carter, found a {type(robot).__name__}")

@@ -71,8 +71,12 @@ class FaultShim:
     """One direction of a faulty bus: `put` frames in, `take` what arrives; both with a clock that never goes back."""
 
     def __init__(self, plan: FaultPlan, seed: int, direction: int) -> None:
-        """`direction`: 0 to the base, 1 from it; the two go wrong independently."""
-        self._plan = plan
+        """`direction`: 0 to the base, 1 from it; the two go wrong independently.
+
+        `plan` may be replaced while it runs; `held_off`: the bus is off until it is taken back.
+        """
+        self.plan = plan
+        self.held_off = False
         self._rng = np.random.default_rng((seed, 0xCA0, direction))
         self._waiting: list[tuple[float, int, Frame]] = []
         self._order = 0
@@ -88,7 +92,7 @@ class FaultShim:
 
     def put(self, frame: Frame, now_s: float) -> None:
         """Give a frame to the bus."""
-        plan = self._plan
+        plan = self.plan
         # The same four draws for every frame, so that one fault's probability does not move the others' dice.
         drop, corrupt, duplicate, delay = (float(value) for value in self._rng.random(4))
         bits = self._rng.integers(0, 8 * max(len(frame.data), 1), self._rng.integers(1, 4))
@@ -119,7 +123,7 @@ class FaultShim:
 
     def _arrival(self, now_s: float) -> float | None:
         """When a frame that is sent now gets its gap beside the babbler; None when there is none."""
-        plan = self._plan
+        plan = self.plan
         if not self._babbling(now_s):
             return now_s
         share = plan.babble_hz * FRAME_S
@@ -130,13 +134,13 @@ class FaultShim:
         return self._free_s
 
     def _babbling(self, now_s: float) -> bool:
-        plan = self._plan
+        plan = self.plan
         return plan.babble_hz > 0 and plan.babble_from_s <= now_s < plan.babble_from_s + plan.babble_s
 
     def is_off(self, now_s: float) -> bool:
         """Whether nothing passes at that time."""
-        every_s = self._plan.bus_off_every_s
-        return every_s > 0 and now_s >= every_s and now_s % every_s < self._plan.bus_off_s
+        every_s = self.plan.bus_off_every_s
+        return self.held_off or (every_s > 0 and now_s >= every_s and now_s % every_s < self.plan.bus_off_s)
 
     def _queue(self, frame: Frame, arrives_s: float) -> None:
         self._order += 1
@@ -163,7 +167,7 @@ class FaultShim:
 
     def _babble(self, now_s: float) -> list[Frame]:
         """The babbler's frames since the last look; it fills the bus and no more."""
-        plan = self._plan
+        plan = self.plan
         if not self._babbling(now_s):
             return []
         due = int(min(plan.babble_hz, 1 / FRAME_S) * (now_s - plan.babble_from_s))
