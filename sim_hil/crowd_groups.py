@@ -51,7 +51,7 @@ class Groups:
 
     def patience(self, crowd: Crowd) -> Array:
         """[n]: share of their pace at which leaders walk, so that nobody is left behind."""
-        return np.clip(1.75 - 0.5 * self._furthest, 0.0, 1.0)
+        return np.clip(1.75 - 0.5 * self._furthest, 0.35, 1.0)
 
     def like(self, crowd: Crowd, ways: CrowdMap, like_x: Array, like_y: Array) -> None:
         """Fill in what followers would like: their place beside the leader, or in the circle of those who talk."""

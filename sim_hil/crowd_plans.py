@@ -6,6 +6,7 @@ from math import atan2, hypot, pi
 
 import numpy as np
 
+from sim_hil.crowd_courtesy import Courtesy
 from sim_hil.crowd_groups import Groups
 from sim_hil.crowd_map import CrowdMap
 from sim_hil.crowd_senses import RobotSeen
@@ -43,6 +44,7 @@ class Plans:
         self._route = np.zeros(crowd.n, dtype=np.int64)
         self._onwards = np.ones(crowd.n, dtype=np.int64)
         self._groups = Groups(crowd, rng, alone=bool(self._routes))
+        self._courtesy = Courtesy(crowd.n)
 
     # -- the beginning ---------------------------------------------------------------------------------------------
 
@@ -256,6 +258,7 @@ class Plans:
             if line:
                 self._advance(spot, line)
         self._unstick(dt)
+        self._courtesy.update(crowd, self._ways, robot, dt)
         self._like(robot)
         self._sit(dt)
 
@@ -341,6 +344,7 @@ class Plans:
         if len(standing):
             like_x[standing], like_y[standing] = self._stay_put(standing, robot)
         self._groups.like(crowd, ways, like_x, like_y)
+        self._courtesy.like(crowd, like_x, like_y)
         crowd.like_x, crowd.like_y = like_x, like_y
 
     def _on_the_way(self, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
