@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sim_hil.benchmark.expert_route import SPACING_M
 from sim_hil.nav_grid import NavGrid
+from sim_hil.people import PERSON_RADIUS_M
 
 Array = NDArray[np.float64]
 STEP_S: Final = 0.2
@@ -40,7 +41,7 @@ class Driving:
     turn_accel_radps2: float = 3.0
     body_radius_m: float = 0.27
     body_reach_m: float = 0.1
-    margin_m: float = 0.15
+    margin_m: float = 0.15  # beyond the collision distance
     comfort_m: float = 0.55
 
     def __post_init__(self) -> None:
@@ -100,7 +101,7 @@ class Motion:
         x, y, v, turned, wanted_v, wanted_w = self._drive(pose, route)
         cost = self._progress(x, y, route) + self._walls(x, y, turned)
         if len(people):
-            cost = cost + self._people(x, y, v, people, velocities, patience)
+            cost = cost + self._people(x, y, v, turned, people, velocities, patience)
         cost = cost + 0.06 * np.abs(wanted_v - self._speed) + 0.03 * np.abs(wanted_w - self._turn)
         cost = cost + 0.06 * np.abs(self._side - self._shift) + 0.03 * np.abs(self._side)
         best = int(np.argmin(cost))
@@ -180,23 +181,30 @@ class Motion:
         tight = _within(1.0 - room / 0.25, 1.0)
         return np.asarray(9.0 * np.max(hit * self._near_term[:, None], axis=0) + 0.25 * np.mean(tight * tight, axis=0))
 
-    def _people(self, x: Array, y: Array, v: Array, people: Array, velocities: Array, patience: float) -> Array:
+    def _people(
+        self, x: Array, y: Array, v: Array, heading: Array, people: Array, velocities: Array, patience: float
+    ) -> Array:
         """What passing near people costs; [futures]."""
         times = np.minimum(self._times, 3.0)
         px = people[:, 0] + velocities[:, 0] * times[:, None]
         py = people[:, 1] + velocities[:, 1] * times[:, None]
-        gaps = np.hypot(x[:, None, :] - px[:, :, None], y[:, None, :] - py[:, :, None]) - PERSON_M
+        driving = self._driving
+        dx, dy = x[:, None, :] - px[:, :, None], y[:, None, :] - py[:, :, None]
+        # From the middle the benchmark's distance counts, at the nose what would touch.
+        reach_x, reach_y = driving.body_reach_m * np.cos(heading), driving.body_reach_m * np.sin(heading)
+        nose = np.sqrt((dx + reach_x[:, None, :]) ** 2 + (dy + reach_y[:, None, :]) ** 2)
+        gaps = np.minimum(np.sqrt(dx * dx + dy * dy) - PERSON_M, nose - (driving.body_radius_m + PERSON_RADIUS_M))
         # Nobody walks exactly as foreseen, least of all somebody who walks fast.
         unsure = 0.05 * self._times[:, None] * np.minimum(np.hypot(velocities[:, 0], velocities[:, 1]), 1.5)
-        room = gaps - (self._driving.margin_m + np.minimum(unsure, 0.25))[:, :, None]
+        room = gaps - (driving.margin_m + np.minimum(unsure, 0.25))[:, :, None]
         hit = _within(-room / 0.25, 2.5)
-        near = _within(1.0 - room / (self._driving.comfort_m * patience), 1.0)
+        near = _within(1.0 - room / (driving.comfort_m * patience), 1.0)
         # People walk round a robot that stands: running into it is up to them. Into one that drives, less so.
         blame = (0.3 + 0.7 * _within(np.abs(v) / 0.35, 1.0))[:, None, :]
         weights = self._near_term[:, None, None] * blame
         worst = np.max(hit * weights, axis=0)
         return np.asarray(
-            3.0 * np.max(worst, axis=0)
+            4.0 * np.max(worst, axis=0)
             + 1.0 * np.sum(np.mean(hit * weights, axis=0), axis=0)
             + 0.7 * np.sum(np.mean(near * near * weights, axis=0), axis=0)
         )
