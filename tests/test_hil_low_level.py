@@ -71,13 +71,6 @@ def test_what_is_no_number_is_ignored_whatever_its_checksum(value: float) -> Non
     assert motor_targets(low) is None
 
 
-def test_a_command_without_the_head_is_ignored() -> None:
-    low = command()
-    low.head = b"\0\0"
-    low.crc = low_command_crc(low)
-    assert motor_targets(low) is None
-
-
 def test_the_torque_is_that_of_the_makers_formula() -> None:
     assert MotorTarget(True, 0.5, 1.0, 2.0, 10.0, 0.5).torque(0.2, 3.0) == pytest.approx(2.0 + 10 * 0.3 + 0.5 * -2.0)
 

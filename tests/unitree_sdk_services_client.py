@@ -91,10 +91,10 @@ class Session:
 
     def settings(self):
         sport, result = self.sport, self.result
-        result["settings"] = [sport.SpeedLevel(-1), sport.SwitchJoystick(True), sport.AutoRecoverySet(True),
-                              list(sport.AutoRecoveryGet()), sport.AutoRecoverySet(False),
-                              list(sport.AutoRecoveryGet()), sport.TrotRun(), sport.StaticWalk(), sport.ClassicWalk(True),
-                              sport.StopMove()]  # fmt: skip
+        result["settings"] = [sport.SpeedLevel(-1), sport.SwitchJoystick(True), sport.TrotRun(), sport.StaticWalk(),
+                              sport.ClassicWalk(True), sport.StopMove()]  # fmt: skip
+        result["auto_recovery"] = [sport.AutoRecoverySet(True), list(sport.AutoRecoveryGet()),
+                                   sport.AutoRecoverySet(False), list(sport.AutoRecoveryGet())]  # fmt: skip
         services = self.robot.ServiceList()[1]
         result["services"] = {service.name: [service.status, service.protect] for service in services}
         result["switch_protected"] = self.robot.ServiceSwitch("motion_switcher", False)

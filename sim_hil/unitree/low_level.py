@@ -1,6 +1,7 @@
 """Low-level mode: joints driven by `rt/lowcmd` alone, torque = tau + kp (q* - q) + kd (dq* - dq). Pure.
 
 A command counts when its checksum is right; one that is not is ignored and counted, as the robot's motor board does.
+The head does not matter: the maker's examples fill it in, a binding that people drive real robots with leaves it zero.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from sim_hil.unitree.idl_command import LowCmd_
 
 LOW_COMMAND_TOPIC: Final = "rt/lowcmd"
 LOW_COMMAND_LAYOUT: Final = struct.Struct("<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55BxI")  # 808 bytes, the crc follows
-HEAD: Final = (0xFE, 0xEF)
 MODE_FOC: Final = 0x01  # a motor that is driven; 0 stops it
 POSITION_STOP_RAD: Final = 2.146e9  # the maker's "no position control": such a number is no angle
 VELOCITY_STOP_RADPS: Final = 16000.0
@@ -62,7 +62,7 @@ def low_command_crc(command: LowCmd_) -> int:
 
 def motor_targets(command: LowCmd_) -> tuple[MotorTarget, ...] | None:
     """The 12 joints of a command (FR, FL, RR, RL x hip, thigh, calf); None when it is damaged or no number."""
-    if tuple(command.head) != HEAD or command.crc != low_command_crc(command):
+    if command.crc != low_command_crc(command):
         return None
     targets = tuple(
         MotorTarget(motor.mode == MODE_FOC, motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
