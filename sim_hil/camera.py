@@ -17,6 +17,7 @@ from sim_hil.scene import Scene
 from sim_hil.world import build_scene
 from sim_hil.world_renderer import Picture, Renderer
 from sim_hil.world_robot import RobotBody
+from sim_hil.world_visibility import Sight, Visibility
 
 Array = NDArray[np.float64]
 
@@ -25,9 +26,10 @@ CAMERA_POSITION_M = (0.327, 0.0, 0.043)
 CAMERA_PITCH_RAD = radians(2.0)  # downwards
 CAMERA_HFOV_RAD = radians(100.0)
 
-_PERSON_M: Final = 1.2  # anything of a person is within this of the point between the feet
+_PERSON_M: Final = 0.9  # anything of a person is within this of the point between the feet
 _FAR_PERSON_M: Final = 45.0  # a pixel or two high at 128 x 128: left out
-_NEAR_PERSON_M: Final = 7.0  # with all details up to here, rounder from there on
+_NEAR_PERSON_M: Final = 6.0  # with all details up to here, simpler from there on
+_UPRIGHT: Final = 0.9
 
 
 @dataclass(frozen=True)
@@ -70,9 +72,11 @@ class CameraWorld:
         self._renderer = Renderer(scene.sky)
         self._near: dict[int, PersonBody] = {}
         self._far: dict[int, PersonBody] = {}
-        self._shown: list[PersonBody] = []
+        self._shown: dict[int, PersonBody] = {}
         try:
-            build_scene(self._renderer, scene)
+            pieces = build_scene(self._renderer, scene)
+            self._fixed = [handle for handle, _ in pieces]
+            self._visibility = Visibility(scene, [bounds for _, bounds in pieces])
         except BaseException:
             self.close()
             raise
@@ -95,7 +99,10 @@ class CameraWorld:
         if self._robot is not None:
             self._robot.hide()
         shape = width / height if aspect is None else aspect
-        self._show_people(render_state, eye, forward, mount.hfov_rad, shape)
+        sight = self._sight(eye, forward, rotation[:, 2], mount.hfov_rad)
+        shown = self._fixed if sight is None else [self._fixed[piece] for piece in self._visibility.pieces(sight)]
+        self._renderer.arrange(self._fixed, shown)
+        self._show_people(render_state, eye, sight)
         return self._renderer.picture(eye, forward, rotation[:, 2], mount.hfov_rad, width, height, shape)
 
     def look(
@@ -110,7 +117,8 @@ class CameraWorld:
         eye = np.array(eye_m)
         forward = np.array(target_m) - eye
         forward /= np.linalg.norm(forward)
-        self._show_people(render_state, eye, forward, hfov_rad, width / height)
+        self._renderer.arrange(self._fixed, self._fixed)
+        self._show_people(render_state, eye, None)
         # Straight down there is no up to hold on to but north.
         up = np.array((0.0, 0.0, 1.0) if abs(forward[2]) < 0.999 else (0.0, 1.0, 0.0))
         return self._renderer.picture(eye, forward, up, hfov_rad, width, height, width / height)
@@ -119,27 +127,30 @@ class CameraWorld:
         if state.shape != (self.state_size,):
             raise ValueError(f"render state has shape {state.shape}, this world takes ({self.state_size},)")
 
-    def _show_people(self, state: Array, eye: Array, forward: Array, hfov_rad: float, aspect: float) -> None:
+    def _sight(self, eye: Array, forward: Array, up: Array, hfov_rad: float) -> Sight | None:
+        """What the robot has in view; None when it lies on its side or looks steeply up or down."""
+        flat = float(np.hypot(forward[0], forward[1]))
+        if up[2] < _UPRIGHT or flat < _UPRIGHT:
+            return None
+        # A camera that is tilted sees a little further to the sides than its angle says.
+        return self._visibility.look(eye[:2], forward[:2] / flat, tan(hfov_rad / 2) / (flat * float(up[2])))
+
+    def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
         """Pose those who may be in the picture and take all others out of it."""
         rows = state[self._mount.fields :].reshape(len(self._looks), RENDER_FIELDS)
-        for body in self._shown:
-            body.hide()
-        self._shown.clear()
-        if not len(rows):
-            return
-        away = rows[:, :2] - eye[:2]
-        gaps = np.hypot(away[:, 0], away[:, 1])
-        # Within a cone around the view's axis, through the picture's corners, widened by a person's size.
-        corner = np.hypot(1.0, 1.0 / aspect) * tan(hfov_rad / 2)
-        heights = np.zeros(len(rows)) + 0.9 - eye[2]
-        ahead = away @ forward[:2] + heights * forward[2]
-        aside = np.sqrt(np.maximum(gaps**2 + heights**2 - ahead**2, 0.0))
-        margin = _PERSON_M * np.hypot(1.0, corner)
-        seen = (gaps < _FAR_PERSON_M) & (aside < corner * np.maximum(ahead, -_PERSON_M) + margin)
-        for index in np.flatnonzero(seen):
-            body = self._body(int(index), bool(gaps[index] < _NEAR_PERSON_M))
-            body.pose(rows[index])
-            self._shown.append(body)
+        before, self._shown = self._shown, {}
+        if len(rows):
+            gaps = np.hypot(rows[:, 0] - eye[0], rows[:, 1] - eye[1])
+            seen = gaps < _FAR_PERSON_M
+            if sight is not None:
+                seen &= sight.sees(rows[:, :2] - _PERSON_M, rows[:, :2] + _PERSON_M)[0]
+            for index in np.flatnonzero(seen):
+                body = self._body(int(index), bool(gaps[index] < _NEAR_PERSON_M))
+                body.pose(rows[index])
+                self._shown[id(body)] = body
+        for key, body in before.items():
+            if key not in self._shown:
+                body.hide()
 
     def _body(self, index: int, near: bool) -> PersonBody:
         bodies = self._near if near else self._far

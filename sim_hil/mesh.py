@@ -83,6 +83,12 @@ class MeshBuilder:
             yield self._plain
         yield from self._textured.values()
 
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Extent along x and y: x0, y0, x1, y1, m; raises ValueError when nothing was built."""
+        corners = np.concatenate([np.array(surface.vertices) for surface in self.surfaces()])
+        (x0, y0), (x1, y1) = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+        return (float(x0), float(y0), float(x1), float(y1))
+
     def quad(self, texture: str, corners: Sequence[Vec3], repeat: Vec2 = (1.0, 1.0), origin: Vec2 = (0.0, 0.0)) -> None:
         """A textured quad; corners as its viewer sees them: bottom left, bottom right, top right, top left."""
         (u, v), (a, b) = repeat, origin

@@ -11,6 +11,7 @@ from sim_hil.world_kit import Kit
 from sim_hil.world_pieces import Pieces
 from sim_hil.world_shell import add_ceiling, add_floor, add_terrain, add_wall
 from sim_hil.world_stage import Stage
+from sim_hil.world_visibility import Bounds
 
 BUILDERS: dict[str, Callable[[Kit], None]] = {
     **world_indoor.BUILDERS,
@@ -25,8 +26,8 @@ def add_object(mesh: MeshBuilder, thing: SceneObject) -> None:
     BUILDERS[thing.kind](Kit(mesh, thing))
 
 
-def build_scene(stage: Stage, scene: Scene) -> None:
-    """Show everything of the scene that does not move."""
+def build_scene(stage: Stage, scene: Scene) -> list[tuple[int, Bounds]]:
+    """Show everything of the scene that does not move; the handle and the extent on the floor of each piece."""
     pieces = Pieces()
     add_floor(pieces, scene)
     add_ceiling(pieces, scene)
@@ -36,5 +37,4 @@ def build_scene(stage: Stage, scene: Scene) -> None:
         add_wall(pieces, wall)
     for thing in scene.objects:
         add_object(pieces.at(thing.position_m[0], thing.position_m[1]), thing)
-    for mesh in pieces.all():
-        stage.add(mesh)
+    return [(stage.add(mesh), mesh.bounds()) for mesh in pieces.all()]

@@ -6,6 +6,7 @@ filling. What lies outside the field of view is left out mesh by mesh, so add a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import atan, degrees, log2, tan
 from typing import Final
 
@@ -60,6 +61,7 @@ class Renderer:
         self._textures: dict[int, tuple[Image, core.Texture]] = {}
         self._lens = core.PerspectiveLens()
         self._camera = self._root.attach_new_node(core.Camera("camera", self._lens))
+        self._arranged: list[int] = []
         self._views: dict[tuple[int, int], tuple[core.GraphicsOutput, core.Texture]] = {}
 
     def add(self, mesh: MeshBuilder) -> int:
@@ -84,6 +86,16 @@ class Renderer:
     def hide(self, handle: int) -> None:
         """Take a mesh out of every picture until it is placed."""
         self._nodes[handle].stash()
+
+    def arrange(self, fixed: Sequence[int], shown: Sequence[int]) -> None:
+        """Of the meshes `fixed`, show these alone and draw them in this order: nearest first fills pixels once."""
+        if list(shown) == self._arranged:
+            return
+        for handle in self._arranged or fixed:
+            self._nodes[handle].detach_node()
+        for place, handle in enumerate(shown):
+            self._nodes[handle].reparent_to(self._root, place - len(fixed))
+        self._arranged = list(shown)
 
     def picture(
         self, eye_m: Array, forward: Array, up: Array, hfov_rad: float, width: int, height: int, aspect: float
