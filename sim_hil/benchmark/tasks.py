@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import atan2, cos, hypot, pi, sin
 
@@ -91,12 +92,38 @@ def _weight(area: Area) -> float:
     return 2.0 if area.kind == "room" else max(box.x1 - box.x0, box.y1 - box.y0)
 
 
-def sample_task(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Task:
-    """One task by chance; raises RouteError when what was drawn cannot be told unmistakably (draw again)."""
-    start = draw_start(scene, grid, rng)
-    found = goals(scene)
+def sample_task(
+    scene: Scene, grid: NavGrid, rng: np.random.Generator, *, things: Sequence[SceneObject] | None = None,
+    length_m: tuple[float, float] = (4.0, 80.0), tries: int = 12,
+) -> Task:  # fmt: skip
+    """One task by chance, to one of `things` (any goal of the scene), its way's length within limits.
+
+    Raises RouteError when none of the starts drawn can be told unmistakably: draw again.
+    """
+    found = goals(scene) if things is None else things
+    if not found:
+        raise RouteError("the scene has no landmark to go to")
     thing = found[int(rng.integers(len(found)))]
-    task = make_task(scene, grid, start, thing)
+    goal = goal_before(grid, thing)
+    if goal is None:
+        raise RouteError(f"there is no room before the {thing.landmark}")
+    field = grid.distance_field(goal)
+    why = "no start at such a distance was drawn"
+    for _ in range(tries):
+        start = draw_start(scene, grid, rng)
+        # The grid's own distances are up to 3 % long; the path's length is what counts to the caller.
+        if not length_m[0] <= grid.field_at(field, start[0], start[1]) <= length_m[1]:
+            continue
+        try:
+            return _facing(make_task(scene, grid, start, thing))
+        except RouteError as error:
+            why = str(error)
+    raise RouteError(why)
+
+
+def _facing(task: Task) -> Task:
+    """The same task, the robot looking where it must go; raises RouteError when the way begins beside it."""
+    start = task.start
     away = _first_direction(task.path)
     if task.told.leaves_room:  # stand so that the door is ahead
         return replace(task, start=(start[0], start[1], round(away, 3)))

@@ -69,7 +69,7 @@ def corridor_ends(building: Building, exit_kind: str = "double_door") -> list[Sc
             colour = doors[index]
             thing = builder.against(
                 room, exit_kind, side=side, along=0.5, colour=colour, landmark=f"{colour} exit door", text="EXIT",
-                size=(0.05, min(1.8, _extent(room, side) - 0.5), 2.2),
+                size=(0.05, min(1.8, _extent(room, side) - 0.7), 2.2),
             )  # fmt: skip
             if thing is not None:
                 made.append(thing)

@@ -112,17 +112,16 @@ def _open_floor(builder: Builder, rect: Rect, corridor: Room) -> Room:
 
 def _elevators(builder: Builder, rect: Rect, corridor: Room) -> None:
     room = builder.room(rect, "lobby", "elevator lobby", "marble")
-    wide_opening(builder, room, corridor, 3.0, "red", "ELEVATORS")
+    wide_opening(builder, room, corridor, 3.0, "red", "ELEVATOR")
     back = "n" if corridor.rect.y0 < rect.y0 else "s"
-    width = min(1.6, rect.width / 2 - 0.6)
-    for share in (0.1, 0.9):
-        lift = builder.against(room, "elevator", side=back, along=share, size=(0.08, width, 2.35),
-                               landmark=named("elevator"))  # fmt: skip
-        if lift is not None:
-            builder.place_before(lift, "door", 2, gap_m=0.6)
-            x, y, _ = lift.position_m
-            inward = -1 if back == "n" else 1
-            builder.keep_clear(Rect(x - width / 2, min(y, y + inward * 1.6), x + width / 2, max(y, y + inward * 1.6)))
+    # One door: "the elevator" must mean one place.
+    lift = builder.against(room, "elevator", side=back, along=0.5, landmark=named("elevator"))
+    if lift is None:
+        raise LayoutError("no room for the elevator")
+    builder.place_before(lift, "door", 4, gap_m=0.6)
+    x, y, _ = lift.position_m
+    inward = -1 if back == "n" else 1
+    builder.keep_clear(Rect(x - 1.0, min(y, y + inward * 1.6), x + 1.0, max(y, y + inward * 1.6)))
     builder.against(room, "plant", side=builder.pick(("w", "e")), landmark=named("plant"))
     builder.stand_in(rect, 2)
 

@@ -1,0 +1,212 @@
+"""Builds the DynaNav suite from its four scenes: tasks, wordings, crowds, timeouts. Fixed seeds: always the same text.
+
+Run by hand when scenes or grammar change; what it writes is committed, and a test holds the two equal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+
+from sim_hil.benchmark.episode import ROBOTS, SUITES, Episode, suite_to_toml
+from sim_hil.benchmark.instruction_reading import untrue
+from sim_hil.benchmark.instructions import WordingError, wordings
+from sim_hil.benchmark.robots import footprint_m
+from sim_hil.benchmark.route import RouteError
+from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak
+from sim_hil.benchmark.tasks import Task, goals, sample_task
+from sim_hil.benchmark.visibility import Sightlines
+from sim_hil.nav_grid import NavGrid
+from sim_hil.scene import Scene, load_scene
+
+NAME, VERSION = "dynanav", 1
+TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, whatever robot then drives
+WORDINGS = 6
+INDOOR_CROWDS = (0, 10, 20, 40, 60)
+_DRAWS = 300
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a task must be like: its goal's kinds (of object), length, and least number of turns."""
+
+    task: str
+    kinds: tuple[str, ...]
+    length_m: tuple[float, float]
+    turns: tuple[int, int]
+    area_kinds: tuple[str, ...] = ()
+    at_end: bool = False
+    counted: int = 0  # some turn must be this ordinal or a later one
+
+    def fits(self, scene: Scene, task: Task) -> bool:
+        """Whether a drawn task is one of these."""
+        thing = next(thing for thing in scene.objects if thing.label == task.goal_label)
+        told = task.told
+        turns = sum(step.side != "straight" or step.kind == "crossing" for step in told.steps)
+        return (
+            thing.kind in self.kinds
+            and self.length_m[0] <= told.length_m <= self.length_m[1]
+            and self.turns[0] <= turns <= self.turns[1]
+            and (not self.area_kinds or told.goal_area_kind in self.area_kinds)
+            and (not self.at_end or told.goal_at_end)
+            and (not self.counted or any(step.ordinal >= self.counted for step in told.steps))
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A scene's share of the suite."""
+
+    scene: str
+    seed: int
+    threshold_m: float
+    crowds: tuple[tuple[int, ...], ...]  # of each task
+    wanted: tuple[Wanted, ...]
+
+
+_INDOOR = (INDOOR_CROWDS,) * 5
+PARTS = (
+    Part("hospital", 1, 1.5, _INDOOR, (
+        Wanted("vending-machine", ("vending_machine",), (9, 18), (1, 2), ("corridor",)),
+        Wanted("hospital-bed", ("hospital_bed",), (12, 24), (1, 2), ("room",), counted=2),
+        Wanted("water-dispenser", ("water_dispenser",), (14, 26), (1, 2)),
+        Wanted("end-of-hallway", ("double_door",), (18, 34), (1, 1), ("corridor",), at_end=True),
+        Wanted("reception", ("reception_desk",), (22, 35), (2, 3), ("lobby",)),
+    )),
+    Part("office", 2, 1.5, _INDOOR, (
+        Wanted("elevator", ("elevator",), (10, 22), (1, 3), ("lobby",)),
+        Wanted("carpet", ("carpet",), (10, 22), (1, 2), ("room",)),
+        Wanted("coffee-machine", ("coffee_machine", "vending_machine"), (16, 30), (2, 3), ("room",)),
+        Wanted("exit-door", ("door",), (14, 32), (1, 2), ("corridor",), at_end=True),
+        Wanted("printer", ("printer", "desk"), (20, 35), (2, 3), ("room", "lobby"), counted=2),
+    )),
+    Part("warehouse", 3, 1.5, _INDOOR, (
+        Wanted("cone", ("traffic_cone",), (10, 20), (1, 2), ("aisle",), counted=2),
+        Wanted("third-aisle", ("box_stack", "drum", "fire_extinguisher", "wet_floor_sign"), (12, 24), (1, 1),
+               ("aisle",), counted=3),
+        Wanted("forklift", ("forklift",), (10, 28), (1, 3), ("yard",)),
+        Wanted("pallet-jack", ("pallet_jack", "drum"), (14, 32), (2, 3), ("aisle",)),
+        Wanted("extinguisher", ("fire_extinguisher", "box_stack", "wet_floor_sign"), (8, 30), (1, 2), ("aisle",)),
+    )),
+    Part("sidewalk", 4, 3.0, ((100, 150), (120, 170), (100, 180), (140, 200), (110, 160)), (
+        Wanted("fountain", ("fountain",), (30, 70), (1, 3)),
+        Wanted("umbrella", ("umbrella", "umbrella_table"), (35, 80), (1, 3)),
+        Wanted("storefront", ("storefront",), (40, 75), (1, 3)),
+        Wanted("statue", ("statue", "kiosk"), (30, 80), (1, 3)),
+        Wanted("bus-stop", ("bus_stop", "mailbox", "park_bench", "bicycle_rack", "storefront"), (50, 80), (2, 3)),
+    )),
+)  # fmt: skip
+
+
+def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
+    """In proportion to distance, and the more the fuller it is (paper appendix C); whole 5 s.
+
+    20 s to begin with, then 0.5 m/s through nobody, down to 0.3 m/s among 60 people indoors or 200 outdoors.
+    """
+    crowd = people / (300.0 if outdoor else 90.0)
+    return 5.0 * ceil((20.0 + shortest_m / 0.5 * (1.0 + crowd)) / 5.0)
+
+
+def build(progress: Callable[[str], None] = lambda line: None) -> str:
+    """The suite's text; raises ValueError when a task that is wanted is not found."""
+    episodes: list[Episode] = []
+    for part in PARTS:
+        scene = load_scene(part.scene)
+        found = _tasks(part, scene)
+        grids = {robot: NavGrid(scene, clearance_m=footprint_m(robot)) for robot in ROBOTS}
+        for index, (wanted, task) in enumerate(found):
+            name = f"{part.scene}-{wanted.task}"
+            progress(f"{name}: {task.told.length_m:.1f} m, {len(task.told.steps)} steps")
+            texts = tuple(_wordings(task, part.seed * 1000 + index))
+            for number, people in enumerate(part.crowds[index]):
+                # Each task has both robots, and over a scene's tasks each crowd has both.
+                robot = ROBOTS[(number + index) % 2]
+                shortest_m = round(grids[robot].distance_m(task.start[:2], task.goal), 3)
+                episodes.append(
+                    Episode(
+                        id=f"{name}-{people}-{robot}",
+                        task=name,
+                        scene=part.scene,
+                        robot=robot,
+                        people=people,
+                        seed=part.seed * 10000 + index * 100 + number,
+                        start=task.start,
+                        goal_xy=task.goal,
+                        instructions=texts,
+                        timeout_s=timeout_s(shortest_m, people, part.scene == "sidewalk"),
+                        threshold_m=part.threshold_m,
+                        shortest_m=shortest_m,
+                        landmarks=named_landmarks(texts, task.told),
+                        goal_landmark=task.goal_label,
+                    )
+                )
+    return suite_to_toml(NAME, VERSION, episodes)
+
+
+def _wordings(task: Task, seed: int) -> list[str]:
+    return wordings(task.told, WORDINGS, seed, held_out=True)
+
+
+def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
+    """For each, the first drawn task that is what is wanted and sound; no goal comes twice."""
+    rng = np.random.default_rng((part.seed, 17))
+    grid = NavGrid(scene, clearance_m=TELLING_CLEARANCE_M)
+    lines = Sightlines(scene)
+    found: list[tuple[Wanted, Task]] = []
+    for index, wanted in enumerate(part.wanted):
+        used = {task.goal_label for _, task in found}
+        things = [thing for thing in goals(scene) if thing.kind in wanted.kinds and thing.label not in used]
+        task = None
+        for _ in range(_DRAWS):
+            try:
+                drawn = sample_task(scene, grid, rng, things=things, length_m=wanted.length_m)
+            except RouteError:
+                continue
+            if wanted.fits(scene, drawn) and _sound(part, scene, grid, lines, drawn, part.seed * 1000 + index):
+                task = drawn
+                break
+        if task is None:
+            raise ValueError(f"{part.scene}: no task found for {wanted.task}")
+        found.append((wanted, task))
+    return found
+
+
+def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Task, seed: int) -> bool:
+    """Whether what the validator asks of an episode holds of a task."""
+    try:
+        texts = _wordings(task, seed)
+    except WordingError:
+        return False
+    if any(untrue(text, task.told) for text in texts):
+        return False
+    if worst_leak(grid, task.goal, part.threshold_m) > 0:
+        return False
+    return not named_too_small(scene, lines, list(task.path), named_landmarks(texts, task.told))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the suite; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sim_hil.benchmark.build_suite", description="Build the DynaNav suite from its scenes.",
+        epilog="example: python -m sim_hil.benchmark.build_suite --out sim_hil/benchmark/suites/dynanav.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=SUITES / f"{NAME}.toml", metavar="FILE")
+    args = parser.parse_args(argv)
+    try:
+        text = build(lambda line: sys.stderr.write(line + "\n") and None)
+        args.out.write_text(text, encoding="utf-8")
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
