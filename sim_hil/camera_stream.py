@@ -15,6 +15,7 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -94,16 +95,24 @@ class Shutter:
             self._changed.notify_all()
 
 
+def listen(port: int) -> socket.socket:
+    """A listening socket on the loopback; `port` 0: any free one. Raises OSError with one clear line."""
+    try:
+        return socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        raise OSError(f"camera: port {port}: expected a free one, {error.strerror}; choose another") from error
+
+
 class CameraServer(ThreadingHTTPServer):
-    """HTTP on the loopback. Raises OSError when the port is taken."""
+    """HTTP on a socket that listens already, and is the server's from now on."""
 
     daemon_threads = True
-    allow_reuse_address = True
 
-    def __init__(self, port: int, shutter: Shutter) -> None:
-        """`port`: 0 for any free one; see `server_port`."""
+    def __init__(self, listening: socket.socket, shutter: Shutter) -> None:
         self.shutter = shutter
-        super().__init__(("127.0.0.1", port), _Handler)
+        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -169,23 +178,30 @@ class CameraStream:
         port: int,
         state_length: int,
     ) -> None:
-        """`scene`: what load_scene takes; `size`: (width, height), pixels; `state_length`: of a render state."""
-        self._pose = SnapshotWriter(state_length)
-        command = [sys.executable, "-m", "sim_hil.camera_stream", "--scene", scene, "--robot", robot]
-        command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
-        command += ["--port", str(port), "--pose-fd", str(self._pose.fd)]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(self._pose.fd,)
-        )
+        """`scene`: what load_scene takes; `size`: (width, height), pixels; `port`: of the loopback, 0 for any free one;
+        `state_length`: of a render state. Raises OSError when the port is taken.
+        """
+        # Listening here: whoever starts us learns at once that a port is taken, and which one it is.
+        with listen(port) as listening:
+            self.port = int(listening.getsockname()[1])
+            self._pose = SnapshotWriter(state_length)
+            command = [sys.executable, "-m", "sim_hil.camera_stream", "--scene", scene, "--robot", robot]
+            command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
+            command += ["--listen-fd", str(listening.fileno()), "--pose-fd", str(self._pose.fd)]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=(self._pose.fd, listening.fileno()),
+            )
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         self._partial = b""
         self.pictures = 0
-        self.port = port
 
     @property
     def url(self) -> str:
-        """Where it can be seen; the port is known once it is ready."""
+        """Where it can be seen."""
         return f"http://127.0.0.1:{self.port}/stream.mjpg"
 
     def show(self, render_state: NDArray[np.float64]) -> None:
@@ -216,8 +232,7 @@ class CameraStream:
                 for line in lines:
                     event = json.loads(line)
                     self.pictures += event["event"] == "picture"
-                    if event["event"] == "ready":
-                        ready, self.port = True, int(event["port"])
+                    ready = ready or event["event"] == "ready"
         return ready
 
     def close(self) -> None:
@@ -281,25 +296,21 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--robot", required=True)
-    for name in ("people", "seed", "width", "height", "port", "pose-fd"):
+    for name in ("people", "seed", "width", "height", "listen-fd", "pose-fd"):
         parser.add_argument(f"--{name}", type=int, required=True)
     args = parser.parse_args(argv)
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pipe, shutter, size = _event_pipe(), Shutter(), (args.width, args.height)
-    try:
-        server = CameraServer(args.port, shutter)
-    except OSError as error:
-        sys.stderr.write(f"edge-hil camera: port {args.port}: expected a free one: {error.strerror}\n")
-        return 2
+    server = CameraServer(socket.socket(fileno=args.listen_fd), shutter)
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
     poses = SnapshotReader(args.pose_fd, world.state_size)
     noise = SensorNoise(args.width, args.height, args.seed)
     threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()
     # BrokenPipeError: the parent died between two looks at stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
-        _tell(pipe, event="ready", port=server.server_port)
+        _tell(pipe, event="ready")
         _render_while_parent_lives(world, poses, shutter, size, noise, pipe)
     return 0
 

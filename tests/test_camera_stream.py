@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import threading
 import time
 import urllib.request
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sim_hil.camera_stream import CameraServer, CameraStream, CameraStreamError, Shutter
+from sim_hil.camera_stream import CameraServer, CameraStream, Shutter, listen
 from sim_hil.scene import load_scene
 from sim_hil.simulation import Simulation
 
@@ -26,7 +25,8 @@ class Studio:
 
     def __init__(self) -> None:
         self.shutter = Shutter()
-        self.server = CameraServer(0, self.shutter)
+        self.server = CameraServer(listen(0), self.shutter)
+        self.port = int(self.server.server_address[1])
         self.made = 0
         self._ending = False
         self._threads = [threading.Thread(target=work) for work in (self.server.serve_forever, self._render)]
@@ -41,7 +41,7 @@ class Studio:
             time.sleep(0.001)
 
     def get(self, path: str) -> HTTPResponse:
-        connection = HTTPConnection("127.0.0.1", self.server.server_port, timeout=10)
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=10)
         connection.request("GET", path)
         return connection.getresponse()
 
@@ -138,17 +138,17 @@ def test_the_process_shows_the_world_at_the_pose_it_was_given(state: np.ndarray)
         camera.close()
 
 
-def test_a_port_that_is_taken_ends_the_start(state: np.ndarray, capfd: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        camera = _stream(state, taken.getsockname()[1])
-        try:
-            with pytest.raises(CameraStreamError):
-                camera.wait_ready([])
-        finally:
-            camera.close()
-    assert "expected a free one" in capfd.readouterr().err
+def test_a_port_that_is_taken_is_refused_in_one_line(state: np.ndarray) -> None:
+    with listen(0) as taken, pytest.raises(OSError, match=r"^camera: port \d+: expected a free one, .+$"):
+        _stream(state, taken.getsockname()[1])
+
+
+def test_its_address_is_known_before_it_is_ready(state: np.ndarray) -> None:
+    camera = _stream(state)
+    try:
+        assert camera.port > 0 and str(camera.port) in camera.url
+    finally:
+        camera.close()
 
 
 def test_waiting_for_it_ends_when_the_run_is_stopped(state: np.ndarray) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -26,7 +28,12 @@ def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> N
     try:
         assert hil.stderr is not None
         ready = next(text for text in hil.stderr if "ready" in text or "edge-hil:" in text)
-        assert f"ready, CAN serial:{line}, camera http://127.0.0.1:" in ready
+        found = re.search(
+            rf"ready, CAN serial:{re.escape(str(line))}, camera (http://127.0.0.1:\d+)/stream.mjpg", ready
+        )
+        assert found, ready
+        with urllib.request.urlopen(f"{found[1]}/frame.jpg", timeout=20) as picture:
+            assert picture.read(2) == b"\xff\xd8"
         done = _drive("--channel", str(line), "--vx", "0.5", "--duration", "1.5", "--json", "-")
         assert done.returncode == 0, done.stderr
         driven = json.loads(done.stdout)
@@ -39,6 +46,7 @@ def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> N
     assert 0.2 < driven["moved_m"] < 0.9 and abs(driven["end_speed_mps"]) < 0.02
     assert driven["base_counted"]["CrcErrors"] == 0
     assert wire["path_m"] == pytest.approx(driven["moved_m"], abs=0.1)
+    assert wire["video_frames"] >= 1
     assert wire["wire"]["last_command"] == "ModeCommand" and wire["wire"]["last_command_zero"]
     assert not line.is_symlink()
 

@@ -25,6 +25,7 @@ _LISTEN_S: Final = 0.1
 _SEND_QUEUE: Final = 256
 _RECEIVE_QUEUE: Final = 4096
 _SERIAL_TIMEOUT_S: Final = 0.05
+_SERIAL_WRITE_S: Final = 0.5  # generous: what is given up in the middle of a frame breaks the next one too
 _END_S: Final = 1.0
 _SERIAL_START: Final = 0xAA
 _SERIAL_END: Final = 0xBB
@@ -109,7 +110,7 @@ class _SerialBus(SerialBus):
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel, timeout=_SERIAL_TIMEOUT_S)
-        self._ser.write_timeout = _SERIAL_TIMEOUT_S
+        self._ser.write_timeout = _SERIAL_WRITE_S
         self._frames = SerialFrames()
 
     @property

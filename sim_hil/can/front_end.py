@@ -155,7 +155,9 @@ class CanFrontEnd:
         if path.is_symlink() and not path.exists():
             path.unlink()  # left behind by a run that was killed: its pty has gone
         if path.is_symlink() and str(path.resolve()).startswith("/dev/pts/"):
-            raise FrontEndError(f"--link {address}: expected a free path, found the line of another run; end it first")
+            raise FrontEndError(
+                f"--link {address}: expected a free path, found the line of another run; end that, or remove the link"
+            )
         if path.exists():
             return address
         try:
