@@ -27,7 +27,16 @@ from sim_hil.benchmark.summary import summarise
 from sim_hil.benchmark.task import EpisodeTask
 
 SCHEMA = 1
-_PACKAGES = ("tic-vla-edge", "numpy", "pybullet", "scipy", "pyrvo", "onnxruntime", "opencv-python-headless")
+_PACKAGES = (
+    "tic-vla-edge",
+    "numpy",
+    "pybullet",
+    "panda3d",
+    "scipy",
+    "pyrvo",
+    "onnxruntime",
+    "opencv-python-headless",
+)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,14 @@ from sim_hil.benchmark.episode_log import read_log
 from sim_hil.benchmark.results import EpisodeResult
 from sim_hil.benchmark.store import EPISODES, VIDEOS, ResultStore
 from sim_hil.benchmark.summary import METRICS, grouped_by
+from sim_hil.benchmark.video import last_picture
 from sim_hil.report_style import delay_histogram
 from sim_hil.scene import SceneError, load_scene
 
 REPORT = "report.html"
 SHOWN_TEXTS = 12
+SHOWN_ENDINGS = 12
+_CARD_PX = 640
 _HEADLINE = {
     "sr": ("success rate", "%"),
     "spl": ("SPL", "%"),
@@ -75,6 +78,7 @@ def _parts(
         "</div>",
         "<h2>Where the robot went</h2>",
         *_maps(results, logs),
+        _endings(store.directory, results),
         _texts(results, logs),
         "<h2>Episodes</h2>",
         _episode_table(store.directory, results),
@@ -160,6 +164,24 @@ def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | 
 def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
     columns = log["columns"]
     return np.column_stack([np.array(columns["x_m"], float), np.array(columns["y_m"], float)])
+
+
+def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
+    """The last picture of some videos, of episodes that were not reached or collided first."""
+    cards = []
+    for result in sorted(results, key=lambda result: (result.success, not result.collided)):
+        path = directory / VIDEOS / f"{result.id}.mp4"
+        picture = last_picture(path, _CARD_PX) if len(cards) < SHOWN_ENDINGS and path.is_file() else None
+        if picture is None:
+            continue
+        name = page.text_html(result.id)
+        hit = f", collided with {page.text_html(', '.join(result.collisions))}" if result.collided else ""
+        cards.append(
+            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last picture of {name}">'
+            f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
+            f"{result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}</div></figure>"
+        )
+    return f'<h2>How episodes ended</h2><div class="sheet">{"".join(cards)}</div>' if cards else ""
 
 
 def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> str:

@@ -35,7 +35,7 @@ WIDTH, HEIGHT = 1280, 720
 EYE_W, EYE_H = 800, 450
 RENDER_W, RENDER_H = 640, 360  # the software renderer is what a video costs; enlarged to the eye's size
 MAP_PX_PER_M: Final = 24.0
-CODECS: Final = ("vp09", "mp4v")  # what browsers play, and what every OpenCV writes
+CODEC: Final = "mp4v"  # what browsers play (VP9) takes 40 times as long, more than the episode itself
 MAX_TEXT_CHARS: Final = 420
 
 _PAPER: Colour = (250, 250, 248)
@@ -157,13 +157,28 @@ class EpisodeVideo:
             top += 18
 
 
+def last_picture(path: Path, width_px: int) -> bytes | None:
+    """The last picture of a video as JPEG of that width; None when it cannot be read."""
+    video = cv2.VideoCapture(str(path))
+    try:
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        video.set(cv2.CAP_PROP_POS_FRAMES, max(0, count - 1))
+        found, picture = video.read()
+    finally:
+        video.release()
+    if not found:
+        return None
+    height_px = round(picture.shape[0] * width_px / picture.shape[1])
+    small = cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes())
+
+
 def _open(path: Path) -> cv2.VideoWriter:
     path.parent.mkdir(parents=True, exist_ok=True)
-    for codec in CODECS:
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), FPS, (WIDTH, HEIGHT))
-        if writer.isOpened():
-            return writer
-    raise OSError(f"{path}: OpenCV here can write no video ({', '.join(CODECS)}); run with --video none")
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), FPS, (WIDTH, HEIGHT))
+    if not writer.isOpened():
+        raise OSError(f"{path}: OpenCV here can write no video ({CODEC}); run with --video none")
+    return writer
 
 
 def _around(
