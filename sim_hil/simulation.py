@@ -30,7 +30,6 @@ from sim_hil.world_stage import BulletStage
 __all__ = ["PERSON_COLLISION_M", "ROBOTS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
 
 PERSON_COLLISION_M = 0.5  # DynaNav: a person within 0.5 m of the robot counts as a collision
-ROBOT_FIELDS = 19  # render_state of a Go2: position, quaternion xyzw, 12 joint angles
 _CONTACT_S = 0.01  # how often contacts are looked at: they last longer than this
 _NEAR_M = 2.5  # people this close have a body that can be walked into; the others only a place
 _MAX_BODIES = 24  # more people do not fit into that circle
@@ -81,7 +80,6 @@ class Simulation:
         self._looks: list[PersonBody] = []
         self._walkers = People(self.scene, people, seed)
         self._people = self._walkers.poses()
-        self._velocities = np.zeros((people, 2))
         self._seed = seed
         self._steps = 0
         self._contact_every = max(1, round(_CONTACT_S * rate_hz))
@@ -245,8 +243,7 @@ class Simulation:
             if self._walkers_due() and len(self._walkers):
                 (x, y, _), heading = self._robot.pose()
                 self._walkers.step(x, y, heading)
-                before, self._people = self._people, self._walkers.poses()
-                self._velocities = (self._people[:, :2] - before[:, :2]) * UPDATE_HZ
+                self._people = self._walkers.poses()
                 self._place_people()
             self._physics()
         except pybullet.error as error:
@@ -340,7 +337,7 @@ class Simulation:
 
     def people_velocities(self) -> NDArray[np.float64]:
         """[n, 2]: velocity of every person in the world frame, m/s."""
-        return self._velocities.copy()
+        return self._walkers.velocities()
 
     def collided_with(self) -> set[str]:
         """Labels of what the robot has touched so far; "person" also for one within 0.5 m, centre to centre."""

@@ -140,7 +140,7 @@ def test_without_a_camera_there_is_no_picture(reached: EpisodeWorld) -> None:
 
 
 def hash_of(**changes: object) -> str:
-    with EpisodeWorld(corridor_episode(people=3, timeout_s=4.0, **changes), WorldOptions(drift="severe")) as world:
+    with EpisodeWorld(corridor_episode(people=3, timeout_s=2.5, **changes), WorldOptions(drift="severe")) as world:
         while not world.done:
             world.step((0.6, 0.0, 0.4 * np.sin(world.time_s)))
         return world.outcome().trajectory_sha256
