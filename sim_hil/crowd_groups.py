@@ -19,6 +19,8 @@ _ABREAST = {
 _FILE_M = 0.85
 _CIRCLE_M = {2: 0.42, 3: 0.52, 4: 0.62}
 _LOST_M, _OWN_WAY_S = 3.5, 4.0
+_WAIT_M, _WAIT_S = 2.0, 10.0  # one waits for who is further behind, for so long
+_TICK_S = 0.1
 
 
 class Groups:
@@ -44,14 +46,14 @@ class Groups:
         self._leaders = crowd.leader[self._followers]
         places = [_ABREAST[int(self.size[k])][int(crowd.place_in_group[k]) - 1] for k in self._followers]
         self._slots = np.array(places, dtype=np.float64).reshape(-1, 2)
-        self._furthest = np.zeros(crowd.n)
+        self._furthest, self._waited_s = np.zeros(crowd.n), np.zeros(crowd.n)
         self.settled = np.zeros(crowd.n, dtype=np.bool_)  # followers who stand where they are while the others talk
         self.onward_s = np.zeros(crowd.n)  # followers who make their own way for so long
         self._c, self._s = np.cos(crowd.heading), np.sin(crowd.heading)  # where leaders are bound
 
     def patience(self, crowd: Crowd) -> Array:
         """[n]: share of their pace at which leaders walk, so that nobody is left behind."""
-        return np.clip(1.75 - 0.5 * self._furthest, 0.35, 1.0)
+        return np.clip(1.75 - 0.5 * self._furthest, np.where(self._waited_s < _WAIT_S, 0.0, 0.35), 1.0)
 
     def like(self, crowd: Crowd, ways: CrowdMap, like_x: Array, like_y: Array) -> None:
         """Fill in what followers would like: their place beside the leader, or in the circle of those who talk."""
@@ -83,18 +85,20 @@ class Groups:
         gap = np.sqrt(dx * dx + dy * dy) + 1e-9
         self._furthest[:] = 0.0
         np.maximum.at(self._furthest, lead, np.hypot(x - crowd.x[lead], y - crowd.y[lead]))
+        self._waited_s = np.where(self._furthest > _WAIT_M, self._waited_s + _TICK_S, 0.0)
         lead_x, lead_y = np.where(talks, 0.0, crowd.vx[lead]), np.where(talks, 0.0, crowd.vy[lead])
         want_x, want_y = lead_x + 0.8 * dx, lead_y + 0.8 * dy
         # Round a corner: the way that the leader takes leads there too.
         off_x, off_y = x - crowd.x[lead], y - crowd.y[lead]
         in_front = ~talks & (off_x * c + off_y * s > 0.2) & (np.abs(off_y * c - off_x * s) < 0.55)
+        ahead_of_all = in_front & (off_x * off_x + off_y * off_y > _WAIT_M * _WAIT_M)
         in_front |= ~talks & (self.onward_s[who] > crowd.now_s)
         lost = np.flatnonzero((gap > _LOST_M) | in_front | ~ways.sees(x, y, sx, sy))
         self.settled[who] &= talks
         stays = self.settled[who]
-        stays[lost] |= talks[lost]
+        stays |= ahead_of_all & (self.onward_s[who] <= crowd.now_s)  # wait for the others
         want_x[stays] = want_y[stays] = 0.0
-        lost = lost[crowd.doing[lead[lost]] == Doing.WALK]
+        lost = lost[~stays[lost]]
         if len(lost):
             tx, ty = ways.ahead(crowd.spot[lead[lost]], x[lost], y[lost])
             norm = np.hypot(tx - x[lost], ty - y[lost]) + 1e-9

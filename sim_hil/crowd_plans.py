@@ -19,9 +19,10 @@ _WEIGHTS = {"way": 1.0, "stand": 1.6, "queue": 1.6, "sit": 1.2, "door": 1.0}
 _STAY_S = {"way": (4.0, 12.0), "stand": (6.0, 22.0), "door": (1.5, 3.0), "sit": (25.0, 90.0)}
 _SERVED_S = (4.0, 10.0)
 _NEAR_M, _AT_M, _PASSED_M = 1.3, 0.3, 0.9
-_OPEN_M, _WALL_SIDE_M = 1.5, 0.5  # who stands about does so in the open, or close by a wall
+_OPEN_M, _WALL_SIDE_M = 0.85, 0.5  # who stands about does so in the open, or close by a wall
 _GIVE_WAY_M = 0.75  # from the robot's body axis
 _SEAT_S = 1.2
+_PASSAGES = frozenset(("corridor", "aisle", "street", "crossing"))
 _GROUP_GAP_M = 0.9  # groups do not crowd into corners
 _PROGRESS_M = 0.4  # who has not got this far from where one was is stuck
 
@@ -38,6 +39,7 @@ class Plans:
             self._spots = spots_of(scene, ways, crowd.n, rng)
         ways.add_destinations([spot.reach for spot in self._spots])
         self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
+        self._stop = np.array([_may_stop(scene, *spot.reach) for spot in self._spots])
         self._queues: dict[int, list[int]] = {k: [] for k, s in enumerate(self._spots) if s.kind == "queue"}
         self._taken: dict[tuple[int, int], int] = {}  # (spot, slot) -> person
         self._slot = np.full(crowd.n, -1, dtype=np.int64)
@@ -64,7 +66,11 @@ class Plans:
             elif int(self._groups.size[person]) > 1 or rng.uniform() < 0.6 or not self._start_at_spot(person, scene):
                 self._put(person, x, y, scene)
                 self._next(person)
-                if self._groups.size[person] > 1 and rng.uniform() < 0.3 and self._roomy(person):
+                if (
+                    self._groups.size[person] > 1
+                    and rng.uniform() < 0.45
+                    and self._roomy(person, _may_stop(scene, crowd.x[person], crowd.y[person]))
+                ):
                     self._hold(person, float(crowd.heading[person]), (5.0, 30.0))
         crowd.like_x[:] = crowd.like_y[:] = 0.0
 
@@ -230,15 +236,21 @@ class Plans:
             crowd.gesture[person] = PHONE if rng.uniform() < 0.3 else 0.0
         elif what.kind in ("stand", "door") and self._slot[person] >= 0:
             self._hold(person, what.heading_rad, _STAY_S[what.kind])
-        elif what.kind == "way" and not self._routes and rng.uniform() < 0.3 and self._roomy(person):
+        elif (
+            what.kind == "way"
+            and not self._routes
+            and rng.uniform() < 0.35
+            and self._roomy(person, bool(self._stop[spot]))
+        ):
             self._hold(person, float(crowd.heading[person]), _STAY_S["way"])
         else:
             self._next(person)
 
-    def _roomy(self, person: int) -> bool:
+    def _roomy(self, person: int, area_allows: bool) -> bool:
+        """Whether one may stand about here: in the open, or alone close by a wall."""
         at = self._crowd.x[person : person + 1], self._crowd.y[person : person + 1]
         gap = float(self._ways.gaps_at(*at)[0])
-        return gap > _OPEN_M or (int(self._groups.size[person]) == 1 and gap < _WALL_SIDE_M)
+        return (area_allows and gap > _OPEN_M) or (int(self._groups.size[person]) == 1 and gap < _WALL_SIDE_M)
 
     # -- ten times a second ----------------------------------------------------------------------------------------
 
@@ -392,3 +404,9 @@ class Plans:
                 self._next(int(person))
                 continue
             crowd.target_x[person], crowd.target_y[person] = what.slots[0] if down else what.reach
+
+
+def _may_stop(scene: Scene, x: float, y: float) -> bool:
+    """Whether people stand about there: not where others come through."""
+    area = scene.area_at(x, y)
+    return area is not None and area.kind not in _PASSAGES
