@@ -174,11 +174,17 @@ class MeshBuilder:
         self.face(colour, tuple(reversed(loops[0])))
 
     def ball(
-        self, frame: Frame, centre: Sequence[float], radii: Sequence[float], colour: Colour, sides: int = 8
+        self,
+        frame: Frame,
+        centre: Sequence[float],
+        radii: Sequence[float],
+        colour: Colour,
+        sides: int = 8,
+        levels: int = 6,
     ) -> None:
         """An ellipsoid as a stack of rings."""
         rings = []
-        levels = max(round(6 * self._detail), 3)
+        levels = max(round(levels * self._detail), 3)
         for level in range(levels):
             angle = pi / 2 * 0.92 * (2 * level / (levels - 1) - 1)
             width = cos(angle)

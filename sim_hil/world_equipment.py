@@ -79,7 +79,7 @@ def _privacy_screen(kit: Kit) -> None:
     cloth = kit.picture(world_prints.curtain)
     kit.part((-0.3, 0.3), (-0.5, 0.5), (0.10, 1.0), WHITE, cloth, back=cloth)
     for y in (-0.47, 0.0, 0.47):
-        kit.part((-3.0, 3.0), (y - 0.01, y + 0.01), (0.0, 0.03), STEEL)
+        kit.part((-1.1, 1.1), (y - 0.01, y + 0.01), (0.0, 0.03), STEEL)
         kit.part((-0.3, 0.3), (y - 0.01, y + 0.01), (0.0, 0.10), STEEL)
 
 

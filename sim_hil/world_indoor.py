@@ -28,7 +28,7 @@ def _plant(kit: Kit) -> None:
         turn, out = 2 * pi * index / 7, 0.20 + 0.12 * rng.random()
         radii = (0.20 * kit.depth, 0.20 * kit.width, 0.13 * kit.height)
         shade = 0.8 + 0.45 * rng.random()
-        kit.ball(out * cos(turn), out * sin(turn), 0.5 + 0.30 * rng.random(), radii, kit.paint(shade), 6)
+        kit.ball(out * cos(turn), out * sin(turn), 0.5 + 0.30 * rng.random(), radii, kit.paint(shade), 6, 4)
     kit.ball(0, 0, 0.87, (0.22 * kit.depth, 0.22 * kit.width, 0.13 * kit.height), kit.paint(1.1), 6)
 
 

@@ -88,9 +88,11 @@ class Kit:
         """A wheel that stands on the floor, or `up_m` above it."""
         self.mesh.wheel(self.frame, (x * self.depth, y * self.width, radius_m + up_m), radius_m, width_m, colour)
 
-    def ball(self, x: float, y: float, z: float, radii_m: Vec3, colour: Colour, sides: int = 8) -> None:
+    def ball(
+        self, x: float, y: float, z: float, radii_m: Vec3, colour: Colour, sides: int = 8, levels: int = 6
+    ) -> None:  # fmt: skip
         """An ellipsoid."""
-        self.mesh.ball(self.frame, self.at(x, y, z), radii_m, colour, sides)
+        self.mesh.ball(self.frame, self.at(x, y, z), radii_m, colour, sides, levels)
 
     def face(self, colour: Colour, *corners: Vec3) -> None:
         """A plain face through points given as fractions, counter-clockwise as its viewer sees them."""

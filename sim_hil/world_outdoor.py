@@ -120,7 +120,7 @@ def _tree(kit: Kit) -> None:
         size = 0.26 + 0.06 * rng.random()
         radii = (size * kit.depth, size * kit.width, 0.17 * kit.height)
         z = 0.58 + 0.20 * rng.random()
-        kit.ball(0.26 * cos(turn), 0.26 * sin(turn), z, radii, kit.paint(0.8 + 0.5 * rng.random()), 7)
+        kit.ball(0.26 * cos(turn), 0.26 * sin(turn), z, radii, kit.paint(0.8 + 0.5 * rng.random()), 6, 5)
 
 
 def _hedge(kit: Kit) -> None:
@@ -136,10 +136,10 @@ def _planter(kit: Kit) -> None:
     count = max(round(kit.width / 0.3), 2)
     for k in range(count):
         y = -0.42 + 0.84 * k / (count - 1)
-        kit.ball(0.0, y, 0.70, (0.34 * kit.depth, 0.16, 0.14), (70, 130, 60), 6)
+        kit.ball(0.0, y, 0.70, (0.34 * kit.depth, 0.16, 0.14), (70, 130, 60), 6, 4)
         for _ in range(2):
             x = 0.5 * rng.random() - 0.25
-            kit.ball(x, y, 0.84 + 0.1 * rng.random(), (0.07, 0.07, 0.06), blooms[int(rng.integers(4))], 5)
+            kit.ball(x, y, 0.84 + 0.1 * rng.random(), (0.07, 0.07, 0.06), blooms[int(rng.integers(4))], 4, 3)
 
 
 def _bollard(kit: Kit) -> None:

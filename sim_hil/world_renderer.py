@@ -116,7 +116,7 @@ class Renderer:
         drawn = self._draw(width * samples, height * samples)
         if samples > 1:
             drawn = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA)
-        return np.ascontiguousarray(drawn[::-1, :, 2::-1])
+        return cv2.flip(cv2.cvtColor(drawn, cv2.COLOR_BGRA2RGB), 0)
 
     def close(self) -> None:
         """Release everything; may be called twice."""

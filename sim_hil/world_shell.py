@@ -19,13 +19,15 @@ _BEYOND_M = 60.0  # open ground goes on for so far beyond the scene
 def add_floor(pieces: Pieces, scene: Scene) -> None:
     """The floor with its patches, and open ground beyond it where there is no ceiling."""
     (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
-    patches = [(counter_clockwise(list(patch.polygon)), patch) for patch in scene.floors]
+    patches = [(counter_clockwise(list(patch.polygon)), patch, _extent(patch.polygon)) for patch in scene.floors]
     base = Floor(((x0, y0), (x1, y0), (x1, y1), (x0, y1)), scene.floor_texture)
     for left, right in _cells(x0 - _OVERLAP_M, x1 + _OVERLAP_M):
         for low, high in _cells(y0 - _OVERLAP_M, y1 + _OVERLAP_M):
             cell: list[Vec2] = [(left, low), (right, low), (right, high), (left, high)]
             parts = [(cell, base)]
-            for polygon, patch in patches:
+            for polygon, patch, (px0, px1, py0, py1) in patches:
+                if px0 >= right or px1 <= left or py0 >= high or py1 <= low:
+                    continue
                 inside, _ = split(cell, polygon)
                 if inside:
                     # A later patch lies over an earlier one: what it covers is cut away, so that nothing coincides.
@@ -127,6 +129,11 @@ def add_terrain(pieces: Pieces, terrain: Terrain) -> None:
             corners = [terrain.point(u, -half, 0), terrain.point(u, half, 0), terrain.point(u, half, h),
                        terrain.point(u, -half, h)]  # fmt: skip
             pieces.at(*_middle(corners)).face(colour, corners if turn > 0 else corners[::-1])
+
+
+def _extent(polygon: tuple[Vec2, ...]) -> tuple[float, float, float, float]:
+    xs, ys = zip(*polygon, strict=True)
+    return (min(xs), max(xs), min(ys), max(ys))
 
 
 def _middle(corners: list[Vec3]) -> Vec2:
