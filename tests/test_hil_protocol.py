@@ -407,6 +407,8 @@ def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_pat
     [
         (["--scene", "moon"], "moon"),
         (["--scene", "nowhere/moon.toml"], "moon.toml"),
+        (["--protocol", "can"], "speaks, unitree"),
+        (["--robot", "carter"], "--robot carter --protocol unitree"),
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
         (["--link", "udp:1"], "--link"),
