@@ -45,7 +45,7 @@ class ClusterJobs:
             raise ClusterError(
                 "--cluster: needs the packages of the extra 'cluster': pip install 'tic-vla-edge[cluster]'"
             ) from error
-        self._ray = ray
+        self._ray: Any = ray
         try:
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:

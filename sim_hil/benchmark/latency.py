@@ -32,6 +32,7 @@ MAX_BYTES = 16_000_000
 QUANTILE_STEPS = 200
 """Into so many times a distribution is cut of which only percentiles are known."""
 _TAG = 0x1A7E
+_POINTS = ("p50", "p99", "max")
 _KEYS = ("schema", "name", "source", "generation_s", "anchor_after_s")
 
 
@@ -173,7 +174,7 @@ def _of_run(path: Path, reasoning: Mapping[str, Any]) -> LatencyProfile:
 
     def points_s(key: str) -> list[float]:
         values = reasoning.get(key)
-        points = [values.get(point) for point in ("p50", "p99", "max")] if isinstance(values, Mapping) else []
+        points: list[Any] = [values.get(point) for point in _POINTS] if isinstance(values, Mapping) else []
         if len(points) != 3 or not all(_is_number(point) for point in points):
             raise LatencyError(f"expected reasoning.{key} with p50, p99 and max, as an edge-run with generations has")
         return [float(point) / 1e3 for point in points]

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,7 +108,7 @@ class LocalJobs:
                 ended.append(self._finish(name, attempt))
         return ended
 
-    def times_s(self) -> Mapping[str, float]:
+    def times_s(self) -> dict[str, float]:
         """Episode time of what runs."""
         return {name: attempt.time_s for name, attempt in self._running.items()}
 

@@ -40,7 +40,9 @@ def open_policy(conditions: Conditions, manifest_sha256: str = "") -> Policy:
         from sim_hil.benchmark.expert import ExpertPolicy
 
         return ExpertPolicy()
-    return {"point-goal": PointGoalPolicy, "random": RandomPolicy, "still": StillPolicy}[kind]()
+    if kind == "point-goal":
+        return PointGoalPolicy()
+    return RandomPolicy() if kind == "random" else StillPolicy()
 
 
 def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:

@@ -168,7 +168,7 @@ def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
 
 def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
     """The last picture of some videos, of episodes that were not reached or collided first."""
-    cards = []
+    cards: list[str] = []
     for result in sorted(results, key=lambda result: (result.success, not result.collided)):
         path = directory / VIDEOS / f"{result.id}.mp4"
         picture = last_picture(path, _CARD_PX) if len(cards) < SHOWN_ENDINGS and path.is_file() else None

@@ -59,7 +59,7 @@ class EpisodeTask:
     def of_json(content: Mapping[str, Any]) -> EpisodeTask:
         """A task that `as_json` has written; raises ConditionsError, SuiteError."""
         try:
-            raw = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
+            raw: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
             rest = {key: content[key] for key in ("video", "manifest_sha256", "attempt")}
             conditions = Conditions.of_json(content["conditions"])
             return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)

@@ -14,7 +14,7 @@ from edge.artifact_files import MANIFEST_NAME, read_manifest
 from edge.manifest import Artifacts
 from sim_hil.benchmark.conditions import ConditionsError
 
-_AS_IN_THE_PAPER = {
+_AS_IN_THE_PAPER: Mapping[str, Any] = {
     "semantic_interface": "kv",
     "latency_aware": True,
     "motion_offset": True,
@@ -22,22 +22,20 @@ _AS_IN_THE_PAPER = {
     "layers": 6,
     "head": "query",
 }
-VARIANTS: Mapping[str, Mapping[str, Any]] = {
-    name: {**_AS_IN_THE_PAPER, **changed}
-    for name, changed in {
-        "full": {},
-        "waypoints": {"semantic_interface": "waypoints"},
-        "waypoints-no-latency": {"semantic_interface": "waypoints", "latency_aware": False},
-        "no-latency": {"latency_aware": False},
-        "no-motion-offset": {"motion_offset": False},
-        "horizon-1s": {"horizon_s": 1.0},
-        "horizon-5s": {"horizon_s": 5.0},
-        "depth-3": {"layers": 3},
-        "depth-12": {"layers": 12},
-        "diffusion": {"head": "diffusion"},
-        "flow": {"head": "flow"},
-    }.items()
+_CHANGED: Mapping[str, Mapping[str, Any]] = {
+    "full": {},
+    "waypoints": {"semantic_interface": "waypoints"},
+    "waypoints-no-latency": {"semantic_interface": "waypoints", "latency_aware": False},
+    "no-latency": {"latency_aware": False},
+    "no-motion-offset": {"motion_offset": False},
+    "horizon-1s": {"horizon_s": 1.0},
+    "horizon-5s": {"horizon_s": 5.0},
+    "depth-3": {"layers": 3},
+    "depth-12": {"layers": 12},
+    "diffusion": {"head": "diffusion"},
+    "flow": {"head": "flow"},
 }
+VARIANTS = {name: {**_AS_IN_THE_PAPER, **changed} for name, changed in _CHANGED.items()}
 """What the model's action expert is in each ablation of the paper (tables 2, 5, 6, 11, 13)."""
 
 
@@ -56,7 +54,7 @@ def artifact_directory(root: Path, variant: str | None) -> Path:
 
 def check_variant(artifacts: Artifacts, variant: str | None) -> None:
     """Raise ConditionsError if the model is not what a variant of the table says."""
-    if variant not in VARIANTS:
+    if variant is None or variant not in VARIANTS:
         return
     found = described(artifacts)
     for key, value in VARIANTS[variant].items():
