@@ -19,7 +19,7 @@ from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import WordingError, wordings
 from sim_hil.benchmark.robots import footprint_m
 from sim_hil.benchmark.route import RouteError
-from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak
+from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.tasks import Task, goals, sample_task
 from sim_hil.benchmark.visibility import Sightlines
 from sim_hil.nav_grid import NavGrid
@@ -29,7 +29,8 @@ NAME, VERSION = "dynanav", 1
 TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, whatever robot then drives
 WORDINGS = 6
 INDOOR_CROWDS = (0, 10, 20, 40, 60)
-_DRAWS = 300
+_DRAWS = 400
+_LEAST_LEG_M = 3.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Wanted:
             and self.turns[0] <= turns <= self.turns[1]
             and (not self.area_kinds or told.goal_area_kind in self.area_kinds)
             and (not self.at_end or told.goal_at_end)
+            # Turns in quick succession can hardly be told apart, nor can what is right beside the start.
+            and all(step.before_m >= _LEAST_LEG_M for step in told.steps if step.before_kind != "room")
             and (not self.counted or any(step.ordinal >= self.counted for step in told.steps))
         )
 
@@ -84,22 +87,21 @@ PARTS = (
         Wanted("carpet", ("carpet",), (10, 22), (1, 2), ("room",)),
         Wanted("coffee-machine", ("coffee_machine", "vending_machine"), (16, 30), (2, 3), ("room",)),
         Wanted("exit-door", ("door",), (14, 32), (1, 2), ("corridor",), at_end=True),
-        Wanted("printer", ("printer", "desk"), (20, 35), (2, 3), ("room", "lobby"), counted=2),
+        Wanted("desk", ("desk",), (18, 35), (2, 3), ("room",), counted=2),
     )),
     Part("warehouse", 3, 1.5, _INDOOR, (
         Wanted("cone", ("traffic_cone",), (10, 20), (1, 2), ("aisle",), counted=2),
-        Wanted("third-aisle", ("box_stack", "drum", "fire_extinguisher", "wet_floor_sign"), (12, 24), (1, 1),
-               ("aisle",), counted=3),
+        Wanted("third-aisle", ("drum", "fire_extinguisher", "wet_floor_sign"), (12, 24), (1, 1), ("aisle",), counted=3),
         Wanted("forklift", ("forklift",), (10, 28), (1, 3), ("yard",)),
-        Wanted("pallet-jack", ("pallet_jack", "drum"), (14, 32), (2, 3), ("aisle",)),
-        Wanted("extinguisher", ("fire_extinguisher", "box_stack", "wet_floor_sign"), (8, 30), (1, 2), ("aisle",)),
+        Wanted("pallet-jack", ("pallet_jack",), (14, 32), (2, 3), ("aisle",)),
+        Wanted("boxes", ("box_stack",), (8, 30), (1, 2), ("aisle",)),
     )),
     Part("sidewalk", 4, 3.0, ((100, 150), (120, 170), (100, 180), (140, 200), (110, 160)), (
         Wanted("fountain", ("fountain",), (30, 70), (1, 3)),
         Wanted("umbrella", ("umbrella", "umbrella_table"), (35, 80), (1, 3)),
         Wanted("storefront", ("storefront",), (40, 75), (1, 3)),
-        Wanted("statue", ("statue", "kiosk"), (30, 80), (1, 3)),
-        Wanted("bus-stop", ("bus_stop", "mailbox", "park_bench", "bicycle_rack", "storefront"), (50, 80), (2, 3)),
+        Wanted("kiosk", ("kiosk",), (30, 80), (1, 3)),
+        Wanted("far-storefront", ("storefront",), (50, 80), (2, 4)),
     )),
 )  # fmt: skip
 
@@ -185,9 +187,9 @@ def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Tas
         return False
     if any(untrue(text, task.told) for text in texts):
         return False
-    if worst_leak(grid, task.goal, part.threshold_m) > 0:
+    if worst_leak(grid, task.goal, part.threshold_m) > 0 or wrong_bends(task.told, task.path):
         return False
-    return not named_too_small(scene, lines, list(task.path), named_landmarks(texts, task.told))
+    return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.told))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -125,7 +125,7 @@ def _sentence(text: str) -> str:
 
 def _polite(w: _Writer, text: str) -> str:
     kind = w.pick("plain", "plain", "plain", "please", "robot", "could", "now")
-    statement = text.startswith(("your goal", "we need", "at ", "when ", "where "))
+    statement = text.startswith(("your goal", "we need", "at ", "when ", "where ")) or ". " in text or ": " in text
     if kind == "please" and not statement:
         return _sentence(f"please {text}" if w.chance(0.6) else f"{text}, please")
     if kind == "robot":

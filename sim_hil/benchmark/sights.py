@@ -1,10 +1,10 @@
-"""Checks of a task on its scene: landmarks seen along the way, and a goal that is not reached through a wall."""
+"""Checks of a task on its scene: landmarks seen on the way, a goal not reached through a wall, turns that bend."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from math import atan2, hypot
+from math import atan2, degrees, hypot, pi
 
 import numpy as np
 
@@ -16,7 +16,11 @@ from sim_hil.scene import Scene, Vec2
 
 MIN_PIXELS = 40.0  # of a 128 x 128 picture: about 6 x 6, enough for a colour and a shape
 RANGE_INDOORS_M, RANGE_OUTDOORS_M = 12.0, 30.0
-_STEP_M = 0.4
+_POSE_M = 0.4
+_STEP_M = 0.1
+_LOOK, _RUN = 22, 6  # steps: a turn lies within 2.2 m of where it is told; directions are taken over 0.6 m
+_LEAST_TURN_RAD = pi / 9  # 20 degrees: a shortest path rounds its corners slantwise
+_OPEN = frozenset(("plaza", "yard"))
 
 
 def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
@@ -27,7 +31,7 @@ def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
         if length < 1e-6:
             continue
         heading = atan2(b[1] - a[1], b[0] - a[0])
-        count = max(1, round(length / _STEP_M))
+        count = max(1, round(length / _POSE_M))
         poses += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count, heading) for k in range(count)]
     if poses:
         poses.append((path[-1][0], path[-1][1], poses[-1][2]))
@@ -49,7 +53,7 @@ def named_landmarks(texts: Sequence[str], told: Told) -> tuple[str, ...]:
 
 
 def named_too_small(
-    scene: Scene, lines: Sightlines, path: list[Vec2], labels: Sequence[str]
+    scene: Scene, lines: Sightlines, path: Sequence[Vec2], labels: Sequence[str]
 ) -> list[str]:  # fmt: skip
     """Landmarks that are nowhere along the path large enough in the picture, one line each."""
     range_m = RANGE_INDOORS_M if scene.ceiling_height_m > 0 else RANGE_OUTDOORS_M
@@ -81,3 +85,41 @@ def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
             if gap < threshold_m and grid.free[row, column]:
                 worst = max(worst, float(min(field[row, column], 1e6)) - (2.0 * threshold_m + 0.5))
     return float(np.maximum(worst, 0.0))
+
+
+def wrong_bends(told: Told, path: Sequence[Vec2]) -> list[str]:
+    """The told turns against the bare path: where each one is said to be, the path must bend that way.
+
+    Not onto a plaza or a yard: their borders are open, and a straight line may run slantwise across.
+    """
+    dense = _dense(path)
+    places = [_nearest(dense, step.at) for step in told.steps]
+    found = []
+    for index, (step, at) in enumerate(zip(told.steps, places, strict=True)):
+        if step.side == "straight" or step.kind in _OPEN:
+            continue
+        # No further than half way to the turns before and after: they bend the path too.
+        first = max(at - _LOOK, (places[index - 1] + at) // 2 if index else 0)
+        last = min(at + _LOOK, (at + places[index + 1]) // 2 if index + 1 < len(places) else len(dense) - 1)
+        before = _minus(dense[min(first + _RUN, at)], dense[first])
+        after = _minus(dense[last], dense[max(last - _RUN, at)])
+        bend = (atan2(after[1], after[0]) - atan2(before[1], before[0]) + pi) % (2 * pi) - pi
+        if (bend > 0) != (step.side == "left") or abs(bend) < _LEAST_TURN_RAD:
+            found.append(f"turn {step.side} into the {step.name}: the path bends by {degrees(bend):.0f} degrees there")
+    return found
+
+
+def _dense(path: Sequence[Vec2]) -> list[Vec2]:
+    points = [path[0]]
+    for a, b in itertools.pairwise(path):
+        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / _STEP_M))
+        points += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count) for k in range(1, count + 1)]
+    return points
+
+
+def _nearest(points: Sequence[Vec2], to: Vec2) -> int:
+    return min(range(len(points)), key=lambda index: hypot(*_minus(points[index], to)))
+
+
+def _minus(a: Vec2, b: Vec2) -> Vec2:
+    return (a[0] - b[0], a[1] - b[1])

@@ -10,11 +10,12 @@ from sim_hil.layouts.skeleton import Building
 from sim_hil.scene import KINDS, SceneObject
 
 _LINTEL_M = 2.15  # underside
+_SHORT = {"desk": "desk"}  # what people call it, where its kind says more
 
 
 def named(kind: str, colour: str = "") -> str:
     """A thing's name in words, with its colour where it has one to be told by."""
-    return f"{colour} {KINDS[kind].words}".strip()
+    return f"{colour} {_SHORT.get(kind, KINDS[kind].words)}".strip()
 
 
 def lights(builder: Builder, spacing_m: float = 5.0) -> None:

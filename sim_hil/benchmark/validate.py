@@ -1,0 +1,185 @@
+"""`python -m sim_hil.benchmark.validate`: is every episode of a suite feasible, and is every word of it true?
+
+Everything is computed anew from scene, start and goal: nothing of how the suite was built is trusted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import hypot
+from pathlib import Path
+
+from sim_hil.benchmark.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
+from sim_hil.benchmark.instruction_reading import untrue
+from sim_hil.benchmark.instructions import is_held_out
+from sim_hil.benchmark.robots import footprint_m
+from sim_hil.benchmark.route import RouteError, tell
+from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
+from sim_hil.benchmark.visibility import Sightlines
+from sim_hil.nav_grid import NavGrid
+from sim_hil.scene import Scene, SceneError, SceneObject, Vec2, load_scene
+
+TELLING_CLEARANCE_M = 0.4
+MEAN_SPEED_MPS = 0.6  # an episode must be feasible at this mean speed
+LENGTH_TOLERANCE_M = 0.02
+MAX_GOAL_GAP_M = 1.6  # from the landmark's outline to the goal
+
+_EXAMPLES = """examples:
+  python -m sim_hil.benchmark.validate
+  python -m sim_hil.benchmark.validate --suite my_suite.toml --json -
+exit codes: 0 all sound, 1 something is wrong, 2 the suite or a scene cannot be read"""
+
+
+@dataclass
+class _Place:
+    """One scene with what is worked out on it, as it is needed."""
+
+    scene: Scene
+    grids: dict[float, NavGrid] = field(default_factory=dict)
+
+    def grid(self, clearance_m: float) -> NavGrid:
+        if clearance_m not in self.grids:
+            self.grids[clearance_m] = NavGrid(self.scene, clearance_m=clearance_m)
+        return self.grids[clearance_m]
+
+    @cached_property
+    def lines(self) -> Sightlines:
+        return Sightlines(self.scene)
+
+    def thing(self, label: str) -> SceneObject | None:
+        return next((thing for thing in self.scene.objects if thing.label == label), None)
+
+
+class Validator:
+    """Checks episodes one by one; scenes are loaded once. Raises SceneError for a scene that cannot be read."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, _Place] = {}
+        self._tasks: dict[tuple[object, ...], list[str]] = {}
+
+    def problems(self, episode: Episode) -> list[str]:
+        """What is wrong with an episode, one line each."""
+        if episode.scene not in self._places:
+            self._places[episode.scene] = _Place(load_scene(episode.scene))
+        place = self._places[episode.scene]
+        found = _feasible(episode, place)
+        # What does not hang on robot and crowd is checked once for all episodes of a task.
+        key = (episode.scene, episode.start, episode.goal_xy, episode.instructions, episode.landmarks,
+               episode.goal_landmark, episode.threshold_m)  # fmt: skip
+        if key not in self._tasks:
+            self._tasks[key] = _truthful(episode, place)
+        return found + self._tasks[key]
+
+
+def _feasible(episode: Episode, place: _Place) -> list[str]:
+    grid = place.grid(footprint_m(episode.robot))
+    found = []
+    if not grid.is_free(*episode.start[:2]):
+        found.append(f"the start is not free for a {episode.robot}")
+    if not grid.is_free(*episode.goal_xy):
+        found.append(f"the goal is not free for a {episode.robot}")
+    length = grid.distance_m(episode.start[:2], episode.goal_xy)
+    if length == float("inf"):
+        return [*found, "the goal cannot be reached"]
+    if abs(length - episode.shortest_m) > LENGTH_TOLERANCE_M:
+        found.append(f"shortest_m is {episode.shortest_m:.3f}, the shortest feasible path has {length:.3f}")
+    least = length / MEAN_SPEED_MPS
+    if episode.timeout_s < least:
+        found.append(f"timeout_s is {episode.timeout_s:.0f}, at {MEAN_SPEED_MPS} m/s it takes {least:.0f}")
+    return found
+
+
+def _truthful(episode: Episode, place: _Place) -> list[str]:
+    scene, grid = place.scene, place.grid(TELLING_CLEARANCE_M)
+    goal = place.thing(episode.goal_landmark)
+    if goal is None or not goal.landmark:
+        return [f"goal_landmark {episode.goal_landmark!r} is no landmark of the scene"]
+    found = []
+    gap = _gap(goal, episode.goal_xy)
+    if gap > MAX_GOAL_GAP_M:
+        found.append(f"the goal is {gap:.1f} m away from the {goal.landmark}")
+    if (leak := worst_leak(grid, episode.goal_xy, episode.threshold_m)) > 0:
+        found.append(f"within the threshold there is a spot {leak:.1f} m too far round: the goal counts through a wall")
+    path = grid.path(episode.start[:2], episode.goal_xy)
+    if path is None:
+        return [*found, f"no way for a robot of radius {TELLING_CLEARANCE_M} m"]
+    try:
+        told = tell(scene, grid, path, goal)
+    except RouteError as error:
+        return [*found, f"the way cannot be told: {error}"]
+    found += wrong_bends(told, path)
+    for text in episode.instructions:
+        found += [f"{text!r}: {problem}" for problem in untrue(text, told)]
+        if not is_held_out(text):
+            found.append(f"{text!r}: this sentence pattern belongs to training")
+    if not found:
+        named = set(named_landmarks(episode.instructions, told))
+        if named != set(episode.landmarks):
+            found.append(f"landmarks are {sorted(episode.landmarks)}, the instructions name {sorted(named)}")
+    return found + named_too_small(scene, place.lines, path, episode.landmarks)
+
+
+def _gap(thing: SceneObject, point: Vec2) -> float:
+    """Distance from a point to a thing's outline, m."""
+    box = thing.box
+    dx, dy = point[0] - box.centre_m[0], point[1] - box.centre_m[1]
+    c, s = box.axis
+    along, across = abs(dx * c + dy * s) - box.size_m[0] / 2, abs(dy * c - dx * s) - box.size_m[1] / 2
+    return hypot(max(along, 0.0), max(across, 0.0))
+
+
+def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
+    """Problems by episode id, only of those that have any."""
+    validator = Validator()
+    found = {episode.id: validator.problems(episode) for episode in episodes}
+    return {name: lines for name, lines in found.items() if lines}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sim_hil.benchmark.validate", description="Check that a suite's episodes are feasible and true.",
+        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument(
+        "--suite", default="dynanav", metavar="S", help=f"{', '.join(suite_names())}, or a .toml file"
+    )  # fmt: skip
+    parser.add_argument("--json", metavar="FILE|-", help="the result as JSON")
+    args = parser.parse_args(argv)
+    try:
+        episodes = load_suite(args.suite)
+        wrong = validate(episodes)
+    except (SuiteError, SceneError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    result = {
+        "suite": args.suite,
+        "episodes": len(episodes),
+        "tasks": len({episode.task for episode in episodes}),
+        "wordings": sum(len(t) for t in {episode.instructions for episode in episodes}),
+        "robots": {robot: sum(episode.robot == robot for episode in episodes) for robot in ROBOTS},
+        "wrong": len(wrong),
+        "problems": wrong,
+    }
+    try:
+        if args.json == "-":
+            sys.stdout.write(json.dumps(result) + "\n")
+        elif args.json:
+            Path(args.json).write_text(json.dumps(result) + "\n", encoding="utf-8")
+    except OSError as error:
+        sys.stderr.write(f"--json: cannot write: {error}\n")
+        return 2
+    for name, lines in wrong.items():
+        for line in lines:
+            sys.stderr.write(f"{name}: {line}\n")
+    sys.stderr.write(f"{len(episodes)} episodes, {len(wrong)} of them wrong\n")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
