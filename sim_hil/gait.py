@@ -33,7 +33,7 @@ _CARRY_SHARE = 0.92  # a trot with the stance feet carried at v was measured to 
 class GaitConfig:
     """Gait numbers; the limits are those measured not to fall (tools/bench/locomotion.py), not the robot's own."""
 
-    period_s: float = 0.42
+    period_s: float = 0.36
     stance_ratio: float = 0.56
     swing_height_m: float = 0.075
     slow_mps: float = 0.5  # up to here the above hold,
@@ -44,11 +44,12 @@ class GaitConfig:
     body_height_m: float = 0.31
     stance_widen_m: float = 0.012
     forward_shift_m: float = 0.0
-    attitude_nm_per_rad: float = 120.0
-    attitude_nms_per_rad: float = 6.0
+    attitude_nm_per_rad: float = 140.0
+    attitude_nms_per_rad: float = 7.0
     velocity_ns_per_m: float = 60.0
-    accel_mps2: float = 1.5
-    alpha_radps2: float = 4.0
+    accel_x_mps2: float = 1.5
+    accel_y_mps2: float = 1.0
+    alpha_radps2: float = 3.0
     vx_limits_mps: tuple[float, float] = (-0.8, 1.6)
     vy_limit_mps: float = 0.5
     wz_limit_radps: float = 1.2
@@ -182,10 +183,9 @@ def step_gait(
     if tilt > 0.22:
         ease = _clip(1.0 - (tilt - 0.22) / 0.25, 0.0, 1.0)
         wx, wy, ww = wx * ease, wy * ease, ww * ease
-    linear = config.accel_mps2 * dt_s
     sx, sy, sw = smooth
-    sx = _slew(sx, _clip(wx, fx - 0.4, fx + 0.4), linear)
-    sy = _slew(sy, _clip(wy, fy - 0.3, fy + 0.3), linear)
+    sx = _slew(sx, _clip(wx, fx - 0.4, fx + 0.4), config.accel_x_mps2 * dt_s)
+    sy = _slew(sy, _clip(wy, fy - 0.3, fy + 0.3), config.accel_y_mps2 * dt_s)
     sw = _slew(sw, _clip(ww, fw - 0.8, fw + 0.8), config.alpha_radps2 * dt_s)
     lx, ly = lean
     lx += blend * ((sx - smooth[0]) / dt_s - sy * sw - lx)
@@ -211,11 +211,11 @@ def step_gait(
     phase = (phase + dt_s / period_s) % 1.0
     # Where a swing foot lands relative to its home, without the part that the turning adds.
     half_stance_s, height_per_g = 0.5 * ratio * period_s, config.body_height_m / GRAVITY_MPS2
-    step_x = fx * half_stance_s + 0.10 * (vx - sx) - height_per_g * lx
-    step_y = fy * half_stance_s + 0.12 * (vy - sy) - height_per_g * ly
+    step_x = sx * half_stance_s - error_x * half_stance_s + 0.06 * (vx - sx) - height_per_g * lx
+    step_y = sy * half_stance_s - error_y * half_stance_s + 0.06 * (vy - sy) - height_per_g * ly
     feet, lifted, stance = _feet(config, feet, lifted, phase, period_s, ratio, height_m, carry, step_x, step_y, dt_s)
     still = not asked and sx == sy == sw == 0.0 and abs(fx) + abs(fy) < 0.08
-    idle_s = idle_s + dt_s if still and abs(fw) < 0.15 and not restless else 0.0
+    idle_s = idle_s + dt_s if still and abs(fw) < 0.3 and not restless else 0.0
     # Only after a whole quiet cycle, at the moment every foot is down, do the feet stay where they are.
     walking = not (idle_s > period_s and stance == _ALL_DOWN)
     drive_x = config.velocity_ns_per_m * (sx - vx) + TOTAL_MASS_KG * lx

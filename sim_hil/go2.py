@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 LYING_HEIGHT_M = 0.075
 # From the table of sim_hil/go2_urdf.py: the head's corner, and a foot in mid-stride, reach this far from the origin.
 RADIUS_M = 0.33
-HALF_LENGTH_M = 0.345
+HALF_LENGTH_M = 0.36
 RENDER_FIELDS = 19
 ACCEL_CUTOFF_HZ = 40.0  # our choice
 # A moving joint's dry friction, as a torque: rises over this range of speed instead of at once.
