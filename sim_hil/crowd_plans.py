@@ -16,7 +16,7 @@ from sim_hil.scene import Scene, Vec2
 
 TALKING, PHONE = 1.0, 2.0
 _WEIGHTS = {"way": 1.0, "stand": 1.6, "queue": 1.6, "sit": 1.2, "door": 1.0}
-_STAY_S = {"way": (4.0, 12.0), "stand": (6.0, 22.0), "door": (1.5, 3.0), "sit": (25.0, 90.0)}
+_STAY_S = {"way": (6.0, 18.0), "stand": (10.0, 40.0), "door": (1.5, 3.0), "sit": (30.0, 120.0)}
 _SERVED_S = (4.0, 10.0)
 _NEAR_M, _AT_M, _PASSED_M = 1.3, 0.3, 0.9
 _OPEN_M, _WALL_SIDE_M = 0.85, 0.5  # who stands about does so in the open, or close by a wall
@@ -63,7 +63,7 @@ class Plans:
                 self._join(person, leader, x, y, scene)
             elif self._routes:
                 self._start_on_route(person, scene, clear_m)
-            elif int(self._groups.size[person]) > 1 or rng.uniform() < 0.6 or not self._start_at_spot(person, scene):
+            elif int(self._groups.size[person]) > 1 or rng.uniform() < 0.45 or not self._start_at_spot(person, scene):
                 self._put(person, x, y, scene)
                 self._next(person)
                 if (
@@ -325,6 +325,7 @@ class Plans:
         crowd.anchor_x = np.where(fresh, crowd.x, crowd.anchor_x)
         crowd.anchor_y = np.where(fresh, crowd.y, crowd.anchor_y)
         crowd.stuck_s = np.where(fresh, 0.0, crowd.stuck_s + dt)
+        crowd.blocked_s = np.where(fresh, 0.0, crowd.blocked_s + dt)
         crowd.squeeze_s -= dt
         for person in np.flatnonzero(crowd.stuck_s > crowd.patience_s):
             self._lose_patience(int(person))

@@ -57,6 +57,7 @@ class Crowd:
         self.group = np.arange(n, dtype=np.int64)
         self.place_in_group = np.zeros(n, dtype=np.int64)
         self.anchor_x, self.anchor_y = np.zeros(n), np.zeros(n)  # where one last got on
+        self.blocked_s = np.zeros(n)  # how long one has wanted to get on since
         self.stuck_s, self.squeeze_s = np.zeros(n), np.zeros(n)
 
         self.seen_s, self.lost_s = np.zeros(n), np.zeros(n)

@@ -82,6 +82,10 @@ class People:
         """[n, 2]: vx, vy in the world, m/s."""
         return np.stack((self._crowd.vx, self._crowd.vy), axis=1)
 
+    def blocked_s(self) -> Array:
+        """[n]: for how long each has wanted to get on without getting 0.4 m further, s; 0 for who stays on purpose."""
+        return self._crowd.blocked_s.copy()
+
     def render_rows(self) -> Array:
         """[n, RENDER_FIELDS]: what a renderer needs of each person."""
         crowd = self._crowd
