@@ -1,38 +1,23 @@
-"""What each service of the simulated Go2 does: leases, switching, postures, avoidance; by rule, without a wire."""
+"""What the services of the simulated Go2 do: leases, postures, gaits, switching; by rule, without a wire."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.geometry import SE2
-from sim_hil.gait import BodyMotion
-from sim_hil.go2 import Go2
-from sim_hil.scene import Box, load_scene
-from sim_hil.simulation import Simulation
-from sim_hil.sport import Measured, SportAction, SportController
-from sim_hil.unitree.avoidance import (
-    RANGE_M,
-    STOP_M,
-    ObstaclesAvoid,
-    Pilot,
-    RangeFinder,
-    allowed_mps,
-    slowed,
-    towards,
-)
-from sim_hil.unitree.behaviour import Go2Behaviour
+from sim_hil.sport import SportAction
 from sim_hil.unitree.leases import APPLY, RENEW, Lease
 from sim_hil.unitree.parameters import parse_flag, parse_numbers, parse_table, parse_text
 from sim_hil.unitree.postures import SHOWS, STANDING, body_over_feet
-from sim_hil.unitree.sport_service import SportService
-from sim_hil.unitree.switching import BUSY_S, MotionSwitcher, RobotState
+from sim_hil.unitree.switching import BUSY_S
+from sim_hil.unitree.vui import Vui
+from tests.go2_services import Desk, Stage
 
 S = 1_000_000_000
 
@@ -88,74 +73,6 @@ class TestParameters:
     @pytest.mark.parametrize(("text", "value"), [("true", True), ("0", False), ("1", True), ("2", None), ('"1"', None)])
     def test_a_flag_is_a_truth_value_or_0_or_1(self, text: str, value: bool | None) -> None:
         assert parse_flag(f'{{"on": {text}}}', "on") is value
-
-
-class Services:
-    """The services of a Go2 that stands balanced."""
-
-    def __init__(self, behaviour: Go2Behaviour) -> None:
-        self.behaviour = behaviour
-        self.free_m = RANGE_M
-        self.pilot = Pilot(behaviour.request_move, lambda _direction: self.free_m)
-        self.sport = SportService(behaviour, self.pilot)
-        self.switcher = MotionSwitcher(behaviour)
-        self.avoid = ObstaclesAvoid(self.pilot, self.pose)
-        self.robot_state = RobotState(self.switcher, self.avoid.switch)
-
-    def pose(self) -> SE2:
-        return SE2(0.0, 0.0, 0.0)
-
-    def advance(self) -> None:
-        raise NotImplementedError
-
-    def run(self, seconds: float, each_tenth: Callable[[], object] = lambda: None) -> None:
-        for index in range(round(seconds * 500)):
-            if index % 50 == 0:
-                each_tenth()
-            if index % 25 == 0:
-                self.pilot.step(self.behaviour.time_s, self.pose)
-            self.advance()
-
-    def ask(self, api_id: int, **parameter: object) -> tuple[int, str]:
-        return self.sport.handle(api_id, json.dumps(parameter))
-
-
-class Desk(Services):
-    """Without physics: a body that always is where it should be, unless `measured` is changed."""
-
-    def __init__(self) -> None:
-        super().__init__(Go2Behaviour(SportController(0.002), 0.002))
-        self.measured = Measured(STANDING, (0.0,) * 12, BodyMotion(*[0.0] * 8), 1.0)
-        self.behaviour.request(SportAction.RECOVERY_STAND)
-        self.run(2.1)
-        assert self.behaviour.mode == 1
-
-    def advance(self) -> None:
-        self.behaviour.step(self.measured)
-
-
-class Stage(Services):
-    """In physics, in the corridor."""
-
-    def __init__(self) -> None:
-        self.simulation = Simulation(load_scene("corridor"), people=0, seed=0)
-        robot = self.simulation.robot
-        assert isinstance(robot, Go2)
-        super().__init__(Go2Behaviour(robot.sport, self.simulation.dt_s))
-        robot.sport = self.behaviour  # type: ignore[assignment]
-        self.simulation.settle()
-
-    def pose(self) -> SE2:
-        (x, y, _), heading = self.simulation.pose()
-        return SE2(x, y, heading)
-
-    def advance(self) -> None:
-        self.simulation.step()
-
-    @property
-    def tilt(self) -> tuple[float, float, float]:
-        roll, pitch, yaw = self.simulation.truth().rpy_rad
-        return float(roll), float(pitch), float(yaw)
 
 
 @pytest.fixture
@@ -343,110 +260,23 @@ class TestSwitching:
         assert desk.robot_state.handle(1002, '{"interval": -1, "duration": 30}') == (3204, "")
 
 
-class TestAvoidance:
-    wall = Box((3.0, 0.0, 1.0), (1.0, 0.0), (0.2, 4.0, 2.0))
-    nobody = np.zeros((0, 3))
-
-    def test_the_range_is_that_to_the_face_of_a_box(self) -> None:
-        assert RangeFinder([self.wall]).free_m(0.0, 0.0, 0.0, self.nobody) == pytest.approx(2.9)
-        assert RangeFinder([self.wall]).free_m(0.0, 0.0, math.pi, self.nobody) == RANGE_M
-
-    @given(st.floats(-math.pi, math.pi))
-    def test_it_is_the_same_for_a_world_turned_about_the_robot(self, turn: float) -> None:
-        c, s = math.cos(turn), math.sin(turn)
-        turned = Box((3.0 * c, 3.0 * s, 1.0), (c, s), (0.2, 4.0, 2.0))
-        assert RangeFinder([turned]).free_m(0.0, 0.0, turn, self.nobody) == pytest.approx(2.9, abs=1e-6)
-
-    def test_what_is_beside_the_robot_is_in_its_way_and_what_is_further_out_is_not(self) -> None:
-        finder = RangeFinder([Box((2.0, 0.3, 0.5), (1.0, 0.0), (0.2, 0.1, 1.0))])
-        assert finder.free_m(0.0, 0.0, 0.0, self.nobody) == pytest.approx(1.9)
-        assert finder.free_m(0.0, -0.1, 0.0, self.nobody) == RANGE_M
-
-    def test_a_lamp_above_and_a_stripe_on_the_floor_stop_nobody(self) -> None:
-        boxes = [Box((1.0, 0.0, z), (1.0, 0.0), (0.5, 4.0, 0.02)) for z in (0.01, 2.5)]
-        assert RangeFinder(boxes).free_m(0.0, 0.0, 0.0, self.nobody) == RANGE_M
-
-    def test_a_person_ahead_is_seen_and_one_behind_is_not(self) -> None:
-        finder, people = RangeFinder([]), np.array([[1.5, 0.1, 0.0], [-1.0, 0.0, 0.0]])
-        assert 1.0 < finder.free_m(0.0, 0.0, 0.0, people) < 1.5
-
-    @given(st.floats(0, 4), st.floats(0.05, 4))
-    def test_nearer_is_never_faster_and_close_is_a_stop(self, free_m: float, more_m: float) -> None:
-        assert 0.0 <= allowed_mps(free_m) <= allowed_mps(free_m + more_m)
-        assert allowed_mps(STOP_M) == 0.0
-
-    @given(st.floats(-2, 2), st.floats(-1, 1), st.floats(-2, 2), st.floats(0, 4))
-    def test_a_slowed_velocity_keeps_its_direction_and_its_turning(
-        self, vx: float, vy: float, wz: float, free_m: float
-    ) -> None:
-        sx, sy, sz = slowed((vx, vy, wz), free_m)
-        assert math.hypot(sx, sy) <= max(allowed_mps(free_m), 0.0) + 1e-9
-        assert sz == wz and abs(sx * vy - sy * vx) < 1e-9 and sx * vx >= 0.0
-
-    def test_it_walks_up_to_a_wall_and_stops_before_it(self, stage: Stage) -> None:
-        assert stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}') == (0, "")
-        wall_x = stage.pose().x_m + 2.2
-        velocity = '{"x": 0.8, "y": 0, "yaw": 0, "mode": 0}'
-
-        def look() -> None:
-            stage.free_m = wall_x - stage.pose().x_m
-            assert stage.avoid.handle(1003, velocity) == (0, "")
-
-        stage.run(7.0, look)
-        assert 0.35 < wall_x - stage.pose().x_m < STOP_M + 0.25
-        assert abs(stage.simulation.truth().velocity_world_mps[0]) < 0.1
-
-    def test_a_velocity_counts_for_a_second_there_too(self, desk: Desk) -> None:
-        desk.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
-        desk.run(0.2)
-        desk.avoid.handle(1003, '{"x": 0.4, "y": 0, "yaw": 0, "mode": 0}')
-        desk.run(0.8)
-        assert desk.behaviour.commanded[0] == pytest.approx(0.4)
-        desk.run(0.4)
-        assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
-
-    def test_its_moves_are_ignored_until_the_api_is_said_to_command(self, desk: Desk) -> None:
-        desk.avoid.handle(1003, '{"x": 0.4, "y": 0, "yaw": 0, "mode": 0}')
-        assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
-
-    @pytest.mark.parametrize(("mode", "goal"), [(1, (0.6, 0.0, 0.5)), (2, None)])
-    def test_it_goes_to_a_place(self, stage: Stage, mode: int, goal: tuple[float, float, float] | None) -> None:
-        stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
-        start = stage.pose()
-        wanted = start @ SE2(0.6, 0.0, 0.5)
-        x, y, yaw = goal if goal is not None else wanted.as_tuple()
-        stage.avoid.handle(1003, json.dumps({"x": x, "y": y, "yaw": yaw, "mode": mode}))
-        stage.run(6.0)
-        left = stage.pose().inverse() @ wanted
-        assert math.hypot(left.x_m, left.y_m) < 0.12 and abs(left.theta_rad) < 0.15
-        assert stage.behaviour.commanded == (0.0, 0.0, 0.0)
-
-    def test_a_stop_ends_the_way_to_a_place(self, stage: Stage) -> None:
-        stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
-        stage.avoid.handle(1003, '{"x": 3, "y": 0, "yaw": 0, "mode": 1}')
-        stage.run(1.0)
-        stage.ask(1003)
-        stage.run(1.0)
-        where = stage.pose()
-        stage.run(1.0)
-        assert abs(stage.pose().x_m - where.x_m) < 0.05
-
-    def test_there_is_no_way_to_where_one_is(self) -> None:
-        assert towards(SE2(1, 2, 3), SE2(1, 2, 3)) is None
-
-    def test_the_sport_services_own_moves_are_slowed_once_it_avoids(self, desk: Desk) -> None:
-        desk.free_m = 0.2
-        desk.ask(1008, x=0.5, y=0, z=0)
-        assert desk.behaviour.commanded[0] == 0.5
-        assert desk.ask(2048, data=True) == (0, "")
-        desk.ask(1008, x=0.5, y=0, z=0.3)
-        assert desk.behaviour.commanded == pytest.approx((0.0, 0.0, 0.3))
-        assert desk.ask(2058) == (0, "")
-        desk.ask(1008, x=0.5, y=0, z=0)
-        assert desk.behaviour.commanded[0] == 0.5
-
-
 def test_a_request_of_the_controller_itself_still_reaches_it(desk: Desk) -> None:
     assert desk.behaviour.request(SportAction.STAND_DOWN) == 0
     desk.run(2.0)
     assert desk.behaviour.mode == 5
+
+
+class TestVui:
+    @pytest.mark.parametrize(
+        ("api_id", "key", "value"), [(1001, "enable", 0), (1003, "volume", 3), (1005, "brightness", 7)]
+    )
+    def test_what_is_set_is_read_back(self, api_id: int, key: str, value: int) -> None:
+        vui = Vui()
+        assert vui.handle(api_id, json.dumps({key: value})) == (0, "")
+        code, data = vui.handle(api_id + 1, "{}")
+        assert (code, json.loads(data)) == (0, {key: value})
+
+    @pytest.mark.parametrize("parameter", ["", '{"volume": 11}', '{"volume": 1.5}', '{"volume": -1}'])
+    def test_what_no_knob_has_is_a_parameter_error(self, parameter: str) -> None:
+        assert Vui().handle(1003, parameter) == (3204, "")
+        assert Vui().handle(9999, parameter) == (3203, "")

@@ -31,6 +31,7 @@ from sim_hil.unitree.sport import CommandLog, api_name
 from sim_hil.unitree.sport_service import UNLEASED, SportService
 from sim_hil.unitree.state import OdometryFrame, StatePublishers
 from sim_hil.unitree.switching import MotionSwitcher, RobotState
+from sim_hil.unitree.vui import VUI_SERVICE, Vui
 
 if TYPE_CHECKING:
     from sim_hil.faults.injector import FaultInjector
@@ -85,6 +86,7 @@ class UnitreeFrontEnd:
         self._others: tuple[tuple[ServiceServer, Callable[[int, str], Answer]], ...] = (
             (ServiceServer(self.bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
             (ServiceServer(self.bus, ids.MOTION_SWITCHER_SERVICE), switcher.handle),
+            (ServiceServer(self.bus, VUI_SERVICE), Vui().handle),
             (
                 ServiceServer(self.bus, ids.OBSTACLES_AVOID_SERVICE, version=OBSTACLES_AVOID_VERSION),
                 avoid.handle,

@@ -22,6 +22,7 @@ _ACTIONS: Final = {
 _ENDS_MOTION: Final = frozenset({ids.STOP_MOVE, ids.DAMP, ids.STAND_DOWN})
 _VELOCITY_MODE: Final = 0  # of an obstacles_avoid Move; the others are poses
 AVOID_MOVE: Final = 1003
+_RELEASE_MODE: Final = 1003  # of the motion switcher
 _API_NAMES: Final = {
     ids.SPORT_SERVICE: {
         **ids.SPORT_API_NAMES,
@@ -92,6 +93,8 @@ class CommandLog:
             mode = (parse_table(request.parameter) or {}).get("mode", _VELOCITY_MODE)
             velocity = parse_numbers(request.parameter, "x", "y", "yaw") if mode == _VELOCITY_MODE else None
             self._moved(request, velocity)  # type: ignore[arg-type]
+        elif request.service == ids.MOTION_SWITCHER_SERVICE and request.api_id == _RELEASE_MODE:
+            self._at_zero = True
         elif request.service == ids.SPORT_SERVICE:
             if request.api_id == ids.MOVE:
                 self._moved(request, parse_move(request.parameter))
