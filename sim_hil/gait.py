@@ -37,7 +37,7 @@ class GaitConfig:
     stance_ratio: float = 0.56
     swing_height_m: float = 0.075
     slow_mps: float = 0.5  # up to here the above hold,
-    fast_period_s: float = 0.27  # from `fast_mps` on these
+    fast_period_s: float = 0.26  # from `fast_mps` on these
     fast_stance_ratio: float = 0.5
     fast_swing_height_m: float = 0.055
     fast_mps: float = 1.4
@@ -50,9 +50,11 @@ class GaitConfig:
     accel_x_mps2: float = 1.5
     accel_y_mps2: float = 1.0
     alpha_radps2: float = 3.0
-    vx_limits_mps: tuple[float, float] = (-0.8, 1.6)
+    vx_limits_mps: tuple[float, float] = (-0.8, 1.5)
     vy_limit_mps: float = 0.5
     wz_limit_radps: float = 1.2
+    run_mps: float = 1.0
+    turn_mps2: float = 1.5
 
     def __post_init__(self) -> None:
         for period_s, ratio in (
@@ -145,11 +147,18 @@ def _slew(value: float, target: float, step: float) -> float:
 
 
 def limit_command(config: GaitConfig, command: Vec3) -> Vec3:
-    """Clip (vx, vy, wz) to what this gait can do without falling."""
+    """Clip (vx, vy, wz) to what this gait can do without falling.
+
+    Above `run_mps` there is less and less room to go sideways, and the turn is bounded by its centripetal acceleration.
+    """
     vx, vy, wz = command
-    low, high = config.vx_limits_mps
-    side, turn = config.vy_limit_mps, config.wz_limit_radps
-    return (_clip(vx, low, high), _clip(vy, -side, side), _clip(wz, -turn, turn))
+    vx = _clip(vx, *config.vx_limits_mps)
+    side, turn, speed = config.vy_limit_mps, config.wz_limit_radps, abs(vx)
+    if speed > config.run_mps:
+        side = max(side - 0.4 * (speed - config.run_mps), 0.0)
+    if speed * turn > config.turn_mps2:
+        turn = config.turn_mps2 / speed
+    return (vx, _clip(vy, -side, side), _clip(wz, -turn, turn))
 
 
 def step_gait(

@@ -82,6 +82,8 @@ class Go2:
     radius_m = RADIUS_M
     half_length_m = HALF_LENGTH_M
     render_fields = RENDER_FIELDS
+    _forward: Vec3  # the base's x and z axes in the world
+    _upward: Vec3
 
     def __init__(self, client: int, folder: Path, start: tuple[float, float, float], dt_s: float) -> None:
         self._client = client

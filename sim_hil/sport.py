@@ -4,8 +4,8 @@ Mode numbers are those of SportModeState. A mode is reported when the robot has 
 up or lying down it reports the mode it left (recovery reports 8 until it stands). A request repeated while its motion
 runs changes nothing: a client that repeats a call faster than the robot moves still gets it done.
 
-What the trot can do without falling (measured on a flat floor, friction 0.8; see tests/test_sim_go2.py) is less than
-the real robot's range, and commands are clipped to it: see GaitConfig.
+What the trot can do without falling (measured: tools/bench/locomotion.py) is less than the real robot's range, and
+commands are clipped to it: see GaitConfig.
 """
 
 from __future__ import annotations
