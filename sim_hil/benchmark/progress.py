@@ -74,7 +74,7 @@ class BenchProgress(AbstractContextManager["BenchProgress"]):
 
     def _running(self, times: dict[str, float]) -> None:
         if self._bar is not None:
-            names = [f"{name} {time_s:.0f} s" for name, time_s in sorted(times.items())[:SHOWN]]
-            more = f" +{len(times) - SHOWN}" if len(times) > SHOWN else ""
-            counted = f"{self._reached} reached, {self._collided} collided"
-            self._bar.update(self._bar_task, description=f"{counted} | {', '.join(names)}{more}")
+            at = ", ".join(f"{time_s:.0f} s" for time_s in sorted(times.values(), reverse=True)[:SHOWN])
+            now = f"; at {at}" if times else ""
+            counted = f"{self._reached} reached, {self._collided} collided{now}"
+            self._bar.update(self._bar_task, description=counted)
