@@ -254,6 +254,7 @@ def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_pat
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
         (["--link", "udp:1"], "--link"),
+        (["--camera", "none", "--faults", "f.sock"], "--camera none"),
         (["--people", "100000"], "people"),
         (["--people", "-1"], "--people"),
         (["--seed", "-1"], "--seed"),

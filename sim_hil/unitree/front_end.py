@@ -223,6 +223,8 @@ def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeF
     """The front end of `--protocol unitree`. Raises FrontEndError, ConfigError, DdsError or OSError."""
     if options.link is not None:
         raise FrontEndError("--link: unitree is reached by --domain and --interface; leave it out")
+    if options.faults is not None and options.camera_size is None:
+        raise FrontEndError("--faults: expected a camera to inject them into, found --camera none; leave one out")
     peers = ("127.0.0.1",) if options.interface == "lo" else ()
     return UnitreeFrontEnd(simulation, options, DdsConfig(options.domain, options.interface, peers))
 
@@ -250,4 +252,4 @@ def _odometry(options: FrontEndOptions) -> OdometryFrame:
 
 def _heard(request: Received) -> Heard:
     name = api_name(request.service, request.api_id)
-    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter)
+    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id)

@@ -75,8 +75,8 @@ def attitude(roll: float, pitch: float, yaw: float) -> Script:
 
 def _hello() -> Script:
     leaning = {"pitch": -0.15, "shift_m": (-0.07, 0.05, 0.0)}
-    raised = (0.08, -0.02, 0.14)
-    out, back = (0.10, -0.10, 0.15), (0.10, 0.04, 0.15)
+    raised = (0.08, -0.02, 0.20)
+    out, back = (0.10, -0.14, 0.22), (0.10, 0.06, 0.22)
     waves = tuple((0.3, body_over_feet(**leaning, lifted={_FR: foot})) for foot in (out, back) * 3)  # type: ignore[arg-type]
     lean = (0.6, body_over_feet(**leaning))  # type: ignore[arg-type]
     lift = (0.5, body_over_feet(**leaning, lifted={_FR: raised}))  # type: ignore[arg-type]
