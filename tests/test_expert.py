@@ -160,3 +160,12 @@ def test_somebody_who_crosses_is_let_pass() -> None:
 def test_whoever_stands_right_before_it_is_not_driven_into() -> None:
     speed, _ = settled(np.array([(0.8, 0.0)]), np.zeros((1, 2)))
     assert speed <= 0.3
+
+
+def test_where_people_take_the_goal_up_being_near_it_is_enough() -> None:
+    around = np.array([(6.0, 0.0), (6.0, 0.9), (6.0, -0.9)])
+    exact, near = (RoutePlanner(hall(), (6.0, 0.0), 0.33, 0.06, near_m) for near_m in (0.0, 1.2))
+    assert np.allclose(exact.route((0.0, 0.0), around, 20.0)[-1], (6.0, 0.0), atol=0.15)
+    end = near.route((0.0, 0.0), around, 20.0)[-1]
+    assert 0.5 < hypot(end[0] - 6.0, end[1]) < 1.25
+    assert np.allclose(near.route((0.0, 0.0), NOBODY, 20.0)[-1], (6.0, 0.0), atol=0.15)

@@ -33,6 +33,7 @@ _SIGHT_M: Final = 7.0  # people further away do not matter yet
 _VIEW_M: Final = 12.0  # who stands about within this is led round
 _STANDING_MPS: Final = 0.25
 _OFF_ROUTE_M: Final = 0.6
+_NEAR: Final = 0.8  # of the threshold: so near has arrived for certain
 _STUCK_S: Final = 6.0
 _STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
 
@@ -69,7 +70,9 @@ class ExpertPolicy:
         if world is None:
             raise ValueError("expert: expected the episode's world, which only a privileged policy is given")
         build = BUILDS[episode.robot]
-        planner = RoutePlanner(world.scene, episode.goal_xy, world.robot.radius_m, build.max_step_m)
+        planner = RoutePlanner(
+            world.scene, episode.goal_xy, world.robot.radius_m, build.max_step_m, _NEAR * episode.threshold_m
+        )
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")

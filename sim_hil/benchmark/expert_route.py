@@ -26,6 +26,7 @@ _WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
 _STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
 _STANDING_PRICE: Final = 12.0  # a metre through somebody who stands there costs so much more
 _PERSON_M: Final = 0.7  # as far as that price reaches in full; it ends twice as far
+_SHORT_PRICE: Final = 4.0  # each metre that one ends short of the goal is as bad as so many metres of way
 _SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
 _NO_ROOM: Final = 1000.0
 _DETOUR: Final = 1.01  # a straight piece may cost so much more than the crooked one
@@ -35,14 +36,16 @@ _KEEP: Final = (1.2, 2.5)  # the way so far is kept while it costs at most so ma
 class RoutePlanner:
     """Ways to one goal. `clearance_m` is the least distance from the robot's centre to anything solid.
 
-    Raises ValueError when the scene has no room for it.
+    Within `near_m` of the goal is near enough where people keep the robot from the goal itself. Raises ValueError when
+    the scene has no room for it.
     """
 
-    def __init__(self, scene: Scene, goal_xy: Vec2, clearance_m: float, max_step_m: float) -> None:
+    def __init__(self, scene: Scene, goal_xy: Vec2, clearance_m: float, max_step_m: float, near_m: float = 0.0) -> None:
         self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
         self._goal = goal_xy
         self._price = self._static_price(scene)
         self._coarsen()
+        self._ends, self._end_prices = self._ends_near(near_m)
         self._costs, self._onwards = self._search(np.zeros((0, 2)))
         self._empty_costs = self._costs
         self._searched = b""
@@ -93,6 +96,17 @@ class RoutePlanner:
         row, column = self.grid.free_cell(*point)
         return int(self._ids[row // 2, column // 2])
 
+    def _ends_near(self, near_m: float) -> tuple[NDArray[np.int64], Array]:
+        """Nodes at which one has arrived, and what each is worse than the goal itself."""
+        if self._goal_node < 0:
+            return np.zeros(0, np.int64), np.zeros(0)
+        gaps = np.hypot(self._nodes[:, 0] - self._goal[0], self._nodes[:, 1] - self._goal[1])
+        # A place behind a wall is not near the goal, however short the straight line.
+        ways = dijkstra(self._links, directed=False, indices=self._goal_node, limit=2 * near_m + 0.1)
+        ends = np.flatnonzero((gaps < near_m) & (ways < 1.5 * near_m))
+        ends = np.union1d(ends, [self._goal_node])
+        return ends, np.where(ends == self._goal_node, 0.0, _SHORT_PRICE * gaps[ends])
+
     def _search(self, standing: Array) -> tuple[Array, NDArray[np.int32]]:
         """Cost of the way to the goal from every node, and each one's next, people standing at [k, 2]."""
         if self._goal_node < 0:
@@ -100,9 +114,18 @@ class RoutePlanner:
         price = self._node_price + _crowd_price(self._nodes, standing)
         joins = self._links
         data = joins.data * 0.5 * (price[self._link_source] + price[joins.indices])
-        priced = csr_matrix((data, joins.indices, joins.indptr), shape=joins.shape)
-        costs, onwards = dijkstra(priced, directed=False, indices=self._goal_node, return_predecessors=True)
-        return costs, onwards
+        # One more node is joined to every place at which one has arrived.
+        count, total = len(self._nodes), joins.nnz + len(self._ends)
+        priced = csr_matrix(
+            (
+                np.concatenate((data, self._end_prices + price[self._ends] * 1e-6)),
+                np.concatenate((joins.indices, self._ends)),
+                np.append(joins.indptr, total),
+            ),
+            shape=(count + 1, count + 1),
+        )
+        costs, onwards = dijkstra(priced, directed=False, indices=count, return_predecessors=True)
+        return costs[:count], np.where(onwards[:count] == count, -1, onwards[:count])
 
     def reachable(self, x_m: float, y_m: float) -> bool:
         """Whether there is a way to the goal from a point."""
@@ -130,7 +153,8 @@ class RoutePlanner:
         for _ in range(round(reach_m / (2 * self.grid.resolution_m))):
             points.append((float(self._nodes[end, 0]), float(self._nodes[end, 1])))
             if self._onwards[end] < 0:
-                points.append(self._goal)
+                if end == self._goal_node:
+                    points.append(self._goal)
                 break
             end = int(self._onwards[end])
         fresh = self._relaxed(self._straightened(_spaced(points), standing))
@@ -149,9 +173,10 @@ class RoutePlanner:
             return line
         points = [(float(line[-1, 0]), float(line[-1, 1]))]
         for _ in range(round(missing / (2 * self.grid.resolution_m))):
-            node = int(self._onwards[node])
+            before, node = node, int(self._onwards[node])
             if node < 0:
-                points.append(self._goal)
+                if before == self._goal_node:
+                    points.append(self._goal)
                 break
             points.append((float(self._nodes[node, 0]), float(self._nodes[node, 1])))
         return np.vstack((line, self._relaxed(_spaced(points))[1:]))
