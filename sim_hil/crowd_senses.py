@@ -11,6 +11,7 @@ from sim_hil.crowd_map import CrowdMap
 from sim_hil.crowd_state import Array, Crowd
 
 NEAR_M = 0.75  # this close to its body it is felt and heard, whichever way one looks
+_HEARD_M, _HEARING_SHARE = 1.7, 0.3
 _FORGET_S = 2.5
 _FASTEST_MPS = 3.0
 
@@ -64,12 +65,14 @@ def notice(crowd: Crowd, ways: CrowdMap, robot: RobotSeen, dt: float) -> None:
     in_range = distance < crowd.sight_m
     in_range &= rx * np.cos(crowd.heading) + ry * np.sin(crowd.heading) > crowd.sight_cos * distance
     in_range |= distance < NEAR_M + robot.axis_m
-    who = np.flatnonzero(in_range)
+    heard = distance < _HEARD_M
+    who = np.flatnonzero(in_range | heard)
     visible = np.zeros(crowd.n, dtype=np.bool_)
     if len(who):
         robot_x, robot_y = np.full(len(who), robot.x), np.full(len(who), robot.y)
         visible[who] = ways.sees(crowd.x[who], crowd.y[who], robot_x, robot_y)
-    crowd.seen_s = np.where(visible, crowd.seen_s + dt, 0.0)
+    # Feet and motors behind one's back are noticed, too, but it takes longer.
+    crowd.seen_s = np.where(visible, crowd.seen_s + np.where(in_range, dt, _HEARING_SHARE * dt), 0.0)
     crowd.lost_s = np.where(visible, 0.0, crowd.lost_s + dt)
     crowd.aware |= crowd.seen_s >= crowd.reaction_s
     crowd.aware &= crowd.lost_s < _FORGET_S
