@@ -115,40 +115,43 @@ def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
     return 5.0 * ceil((20.0 + shortest_m / 0.5 * (1.0 + crowd)) / 5.0)
 
 
+def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) -> list[Episode]:
+    """One scene's episodes; raises ValueError when a task that is wanted is not found."""
+    scene = load_scene(part.scene)
+    grids = {robot: NavGrid(scene, clearance_m=footprint_m(robot)) for robot in ROBOTS}
+    episodes: list[Episode] = []
+    for index, (wanted, task) in enumerate(_tasks(part, scene)):
+        name = f"{part.scene}-{wanted.task}"
+        progress(f"{name}: {task.told.length_m:.1f} m, {len(task.told.steps)} steps")
+        texts = tuple(_wordings(task, part.seed * 1000 + index))
+        lengths = {robot: round(grids[robot].distance_m(task.start[:2], task.goal), 3) for robot in ROBOTS}
+        for number, people in enumerate(part.crowds[index]):
+            # Each task has both robots, and over a scene's tasks each crowd has both.
+            robot = ROBOTS[(number + index) % 2]
+            episodes.append(
+                Episode(
+                    id=f"{name}-{people}-{robot}",
+                    task=name,
+                    scene=part.scene,
+                    robot=robot,
+                    people=people,
+                    seed=part.seed * 10000 + index * 100 + number,
+                    start=task.start,
+                    goal_xy=task.goal,
+                    instructions=texts,
+                    timeout_s=timeout_s(lengths[robot], people, part.scene == "sidewalk"),
+                    threshold_m=part.threshold_m,
+                    shortest_m=lengths[robot],
+                    landmarks=named_landmarks(texts, task.told),
+                    goal_landmark=task.goal_label,
+                )
+            )
+    return episodes
+
+
 def build(progress: Callable[[str], None] = lambda line: None) -> str:
     """The suite's text; raises ValueError when a task that is wanted is not found."""
-    episodes: list[Episode] = []
-    for part in PARTS:
-        scene = load_scene(part.scene)
-        found = _tasks(part, scene)
-        grids = {robot: NavGrid(scene, clearance_m=footprint_m(robot)) for robot in ROBOTS}
-        for index, (wanted, task) in enumerate(found):
-            name = f"{part.scene}-{wanted.task}"
-            progress(f"{name}: {task.told.length_m:.1f} m, {len(task.told.steps)} steps")
-            texts = tuple(_wordings(task, part.seed * 1000 + index))
-            for number, people in enumerate(part.crowds[index]):
-                # Each task has both robots, and over a scene's tasks each crowd has both.
-                robot = ROBOTS[(number + index) % 2]
-                shortest_m = round(grids[robot].distance_m(task.start[:2], task.goal), 3)
-                episodes.append(
-                    Episode(
-                        id=f"{name}-{people}-{robot}",
-                        task=name,
-                        scene=part.scene,
-                        robot=robot,
-                        people=people,
-                        seed=part.seed * 10000 + index * 100 + number,
-                        start=task.start,
-                        goal_xy=task.goal,
-                        instructions=texts,
-                        timeout_s=timeout_s(shortest_m, people, part.scene == "sidewalk"),
-                        threshold_m=part.threshold_m,
-                        shortest_m=shortest_m,
-                        landmarks=named_landmarks(texts, task.told),
-                        goal_landmark=task.goal_label,
-                    )
-                )
-    return suite_to_toml(NAME, VERSION, episodes)
+    return suite_to_toml(NAME, VERSION, [episode for part in PARTS for episode in build_part(part, progress)])
 
 
 def _wordings(task: Task, seed: int) -> list[str]:
@@ -192,6 +195,10 @@ def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Tas
     return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.told))
 
 
+def _say(line: str) -> None:
+    sys.stderr.write(line + "\n")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Write the suite; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -200,9 +207,14 @@ def main(argv: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=SUITES / f"{NAME}.toml", metavar="FILE")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if the file says otherwise")
     args = parser.parse_args(argv)
     try:
-        text = build(lambda line: sys.stderr.write(line + "\n") and None)
+        text = build(_say)
+        if args.check:
+            same = args.out.read_text(encoding="utf-8") == text
+            _say(f"{args.out} {'is' if same else 'is not'} what would be built")
+            return 0 if same else 1
         args.out.write_text(text, encoding="utf-8")
     except (ValueError, OSError) as error:
         sys.stderr.write(f"{error}\n")

@@ -7,7 +7,7 @@ was made enters. Used both to word instructions and to check them.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, hypot, sin
 
 from sim_hil.benchmark.openings import LINEAR, Bounds, Frame, Opening, bounds_of, is_open, side_openings
@@ -105,7 +105,7 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
     length = sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(path))
     last_m = hypot(last.end[0] - last.start[0], last.end[1] - last.start[1])
     return Told(
-        steps=tuple(steps),
+        steps=tuple(_without(step, goal.label) for step in steps),
         goal_label=goal.label,
         goal_name=goal.landmark,
         goal_bare=_bare(scene, walked, goal),
@@ -114,10 +114,19 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
         goal_area_kind=last.kind,
         goal_area_name=(last.followed or last.crossed)[-1].name,
         last_m=last_m,
-        passed=_passed(scene, last, last.frame.along(last.end) - 1.5) if linear else (),
+        passed=_others(_passed(scene, last, last.frame.along(last.end) - 1.5), goal.label) if linear else (),
         leaves_room=legs[0].kind not in LINEAR,
         length_m=length,
     )
+
+
+def _without(step: Step, label: str) -> Step:
+    """The goal is where one stops: it is neither passed nor does it mark a turn."""
+    return replace(step, near=_others(step.near, label), passed=_others(step.passed, label))
+
+
+def _others(things: tuple[Passed, ...], label: str) -> tuple[Passed, ...]:
+    return tuple(thing for thing in things if thing.label != label)
 
 
 def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:

@@ -16,6 +16,12 @@ from sim_hil.scene import Area, Scene, SceneObject, Vec2, Vec3
 
 GOAL_GAP_M = 0.95  # from a landmark's front to the goal: a robot stands there without touching it
 _LYING = frozenset(("carpet",))
+_STANDS_M = {"umbrella": 0.15, "umbrella_table": 0.5}  # half of what stands on the ground below the cloth
+# One stops where one gets to these, whichever way they look.
+_FREE_STANDING = frozenset(
+    ("forklift", "pallet_jack", "fountain", "umbrella", "umbrella_table", "kiosk", "statue", "drum", "traffic_cone",
+     "box_stack", "wet_floor_sign", "meeting_table")
+)  # fmt: skip
 _NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "clock", "planter"))
 
 
@@ -36,7 +42,7 @@ def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
     if thing.kind in _LYING:
         return (round(x, 2), round(y, 2)) if grid.is_free(x, y) else None
     for gap in (GOAL_GAP_M, GOAL_GAP_M - 0.2, GOAL_GAP_M + 0.2, GOAL_GAP_M - 0.4):
-        reach = thing.size_m[0] / 2 + gap
+        reach = _STANDS_M.get(thing.kind, thing.size_m[0] / 2) + gap
         for turn in (0.0, 0.4, -0.4):
             angle = thing.heading_rad + turn
             px, py = round(x + reach * cos(angle), 2), round(y + reach * sin(angle), 2)
@@ -53,8 +59,37 @@ def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> T
     path = grid.path((start[0], start[1]), goal)
     if path is None:
         raise RouteError(f"there is no way to the {thing.landmark}")
+    if thing.kind in _FREE_STANDING:
+        goal = _first_beside(grid, thing, path) or goal
+        path = grid.path((start[0], start[1]), goal)
+        if path is None:
+            raise RouteError(f"there is no way to the {thing.landmark}")
     told = tell(scene, grid, path, thing)
     return Task(start, goal, thing.label, tuple(path), told)
+
+
+def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 | None:
+    """Where a way first comes close to a thing that has no side to stop before."""
+    for a, b in itertools.pairwise(path):
+        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / 0.1))
+        for k in range(count + 1):
+            x, y = a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count
+            point = (round(x, 2), round(y, 2))
+            if outline_gap_m(thing, point) < GOAL_GAP_M and grid.is_free(*point):
+                return point
+    return None
+
+
+def outline_gap_m(thing: SceneObject, point: Vec2) -> float:
+    """Distance from a point to what a thing stands on, m: its bounding box, or its parts where it is a parasol."""
+    boxes = thing.boxes if thing.kind in ("umbrella", "umbrella_table", "tree") else (thing.box,)
+    gaps = []
+    for box in boxes:
+        dx, dy = point[0] - box.centre_m[0], point[1] - box.centre_m[1]
+        c, s = box.axis
+        along, across = abs(dx * c + dy * s) - box.size_m[0] / 2, abs(dy * c - dx * s) - box.size_m[1] / 2
+        gaps.append(hypot(max(along, 0.0), max(across, 0.0)))
+    return min(gaps)
 
 
 def goals(scene: Scene) -> list[SceneObject]:

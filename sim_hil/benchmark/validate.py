@@ -11,7 +11,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import hypot
 from pathlib import Path
 
 from sim_hil.benchmark.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
@@ -20,6 +19,7 @@ from sim_hil.benchmark.instructions import is_held_out
 from sim_hil.benchmark.robots import footprint_m
 from sim_hil.benchmark.route import RouteError, tell
 from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
+from sim_hil.benchmark.tasks import outline_gap_m
 from sim_hil.benchmark.visibility import Sightlines
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene, SceneError, SceneObject, Vec2, load_scene
@@ -41,6 +41,7 @@ class _Place:
 
     scene: Scene
     grids: dict[float, NavGrid] = field(default_factory=dict)
+    lengths: dict[tuple[str, Vec2, Vec2], float] = field(default_factory=dict)
 
     def grid(self, clearance_m: float) -> NavGrid:
         if clearance_m not in self.grids:
@@ -83,7 +84,10 @@ def _feasible(episode: Episode, place: _Place) -> list[str]:
         found.append(f"the start is not free for a {episode.robot}")
     if not grid.is_free(*episode.goal_xy):
         found.append(f"the goal is not free for a {episode.robot}")
-    length = grid.distance_m(episode.start[:2], episode.goal_xy)
+    key = (episode.robot, episode.start[:2], episode.goal_xy)
+    if key not in place.lengths:
+        place.lengths[key] = grid.distance_m(episode.start[:2], episode.goal_xy)
+    length = place.lengths[key]
     if length == float("inf"):
         return [*found, "the goal cannot be reached"]
     if abs(length - episode.shortest_m) > LENGTH_TOLERANCE_M:
@@ -100,7 +104,7 @@ def _truthful(episode: Episode, place: _Place) -> list[str]:
     if goal is None or not goal.landmark:
         return [f"goal_landmark {episode.goal_landmark!r} is no landmark of the scene"]
     found = []
-    gap = _gap(goal, episode.goal_xy)
+    gap = outline_gap_m(goal, episode.goal_xy)
     if gap > MAX_GOAL_GAP_M:
         found.append(f"the goal is {gap:.1f} m away from the {goal.landmark}")
     if (leak := worst_leak(grid, episode.goal_xy, episode.threshold_m)) > 0:
@@ -122,15 +126,6 @@ def _truthful(episode: Episode, place: _Place) -> list[str]:
         if named != set(episode.landmarks):
             found.append(f"landmarks are {sorted(episode.landmarks)}, the instructions name {sorted(named)}")
     return found + named_too_small(scene, place.lines, path, episode.landmarks)
-
-
-def _gap(thing: SceneObject, point: Vec2) -> float:
-    """Distance from a point to a thing's outline, m."""
-    box = thing.box
-    dx, dy = point[0] - box.centre_m[0], point[1] - box.centre_m[1]
-    c, s = box.axis
-    along, across = abs(dx * c + dy * s) - box.size_m[0] / 2, abs(dy * c - dx * s) - box.size_m[1] / 2
-    return hypot(max(along, 0.0), max(across, 0.0))
 
 
 def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
