@@ -45,6 +45,8 @@ class RunOptions:
     duration_s: float | None
     release_delay: ReleaseDelay
     record: Path | None
+    instructions: Path | None = None
+    """Where further instructions are taken while it drives."""
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"
   edge-run --artifacts out/nano --robot firmware_bridge/robots/go2_sim.toml --duration 60 \\
            --release-delay 2 --record flight.mcap --json - --instruction "go down the corridor"
+  edge-run --artifacts out/nano --robot go2.toml --instructions say.sock --instruction "go down the corridor"
+  edge-say "stop at the second door" --to say.sock      # while it drives; its own user only
 
 edge-bridge must be running; where the robot file says operator_arm, the robot stays where it is until
 `edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
@@ -95,6 +97,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="where the newest release that was trusted is remembered (default: %(default)s)",
     )
+    p.add_argument(
+        "--instructions",
+        type=Path,
+        metavar="PATH",
+        help="take further instructions at this local socket while it drives (edge-say TEXT --to PATH)",
+    )
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
@@ -120,6 +128,7 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
         duration_s=args.duration,
         release_delay=parse_release_delay(args.release_delay),
         record=args.record,
+        instructions=args.instructions,
     )
     return robot, options
 

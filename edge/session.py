@@ -19,6 +19,7 @@ from edge.command_tap import CommandTap
 from edge.deadline import Deadline
 from edge.findings import Finding
 from edge.graph import GraphError
+from edge.instructions import InstructionSocket
 from edge.language import ContextOverflowError, LanguageModel
 from edge.manifest import Artifacts
 from edge.policy import Policy
@@ -78,7 +79,7 @@ class RunSession:
         activity = TickActivity(self._period_ns)
         policy = Policy(artifacts, schedule=self._schedule, activity=activity)
         language = LanguageModel(artifacts, schedule=self._schedule)
-        language.check_instruction(options.instruction, len(runtime.frame_offsets_s))
+        self._check_instruction(language, options.instruction)
         try:
             tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
         except (GraphError, ContextOverflowError) as error:
@@ -92,6 +93,19 @@ class RunSession:
         self._began = False
         self.hung = False
         """Whether reasoning hangs in a call that nothing but the end of the process ends."""
+
+    def _open_instructions(self) -> InstructionSocket | None:
+        if self._options.instructions is None:
+            return None
+        try:
+            return InstructionSocket(
+                self._options.instructions, lambda text: self._check_instruction(self._engines.language, text)
+            )
+        except OSError as error:
+            raise RefusedError(str(error)) from error
+
+    def _check_instruction(self, language: LanguageModel, text: str) -> None:
+        language.check_instruction(text, len(self._artifacts.runtime.frame_offsets_s))
 
     def request_stop(self) -> None:
         """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
@@ -110,6 +124,7 @@ class RunSession:
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
+        told: InstructionSocket | None = None
         result: dict[str, Any] | None = None
         end: Deadline | None = None
         try:
@@ -139,6 +154,7 @@ class RunSession:
                 say=self._lines.append,
                 on_tick=self._reporter.on_tick,
             )
+            told = self._open_instructions()
             loops.power.start()
             # After everything that lives as long as the process has been made.
             refused = lock_memory()
@@ -154,7 +170,7 @@ class RunSession:
             if recorder is not None:
                 recorder.put("/run", started_ns, self._run_record(started_ns))
                 inputs.recorder = recorder
-            end = self._drive(loops, inputs, bridge)
+            end = self._drive(loops, inputs, bridge, told)
             status = self._halt(bridge, end)
             result = run_result(
                 loops.control,
@@ -171,6 +187,8 @@ class RunSession:
         finally:
             # Whatever ended the run: closing the connection makes the bridge stop the robot.
             bridge.close()
+            if told is not None:
+                told.close()
             end = end or Deadline(END_S)
             if recorder is not None:
                 self._close_recorder(recorder, result, end)
@@ -238,7 +256,9 @@ class RunSession:
             operator=self._robot.safety.operator_arm,
         )
 
-    def _drive(self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient) -> Deadline:
+    def _drive(
+        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, told: InstructionSocket | None
+    ) -> Deadline:
         """Run both threads until the end; this thread only waits and looks on. Returns by when all must have ended."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
         epoch_ns = time.monotonic_ns() + self._period_ns // 2
@@ -265,7 +285,7 @@ class RunSession:
         ]
         for thread in threads:
             thread.start()
-        self._look_on(loops, inputs)
+        self._look_on(loops, inputs, told)
         self._stop.set()
         end = Deadline(END_S)
         reasoning.cancel()
@@ -295,8 +315,8 @@ class RunSession:
 
         return target
 
-    def _look_on(self, loops: Loops, inputs: RobotInputs) -> None:
-        """Until a thread has ended or a stop is asked for: hand lines on, and see that reasoning gets anywhere."""
+    def _look_on(self, loops: Loops, inputs: RobotInputs, told: InstructionSocket | None) -> None:
+        """Until a thread has ended or a stop is asked for: hand on lines and instructions, watch over reasoning."""
         reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
         while not self._finished.wait(POLL_S):
             if self._stop_requested:
@@ -305,6 +325,10 @@ class RunSession:
                 says = loops.control.supervision.says
                 self._print(says or "all faults have cleared")
             self._print_lines()
+            instruction = None if told is None else told.poll()
+            if instruction is not None:
+                reasoning.submit(instruction)
+                self._print(f"new instruction: {instruction}")
             hang = watch.step(reasoning.last_progress_ns, reasoning.generation_ms.quantile(1.0), time.monotonic_ns())
             if hang is Hang.INTERRUPT:
                 self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")

@@ -54,7 +54,7 @@ class Heard:
     """One command as it came off the wire, for the trace; `received_ns` is time.monotonic_ns.
 
     `service` is the part of the protocol that it was sent to, `api_id` its number there, `name` what the protocol's
-    own page calls it, `parameter` its content in words.
+    own page calls it, `parameter` its content in words. `request_id` is the sender's, 0 where there is none.
     """
 
     received_ns: int
@@ -62,6 +62,7 @@ class Heard:
     api_id: int
     name: str
     parameter: str
+    request_id: int = 0
 
 
 class FrontEnd(Protocol):

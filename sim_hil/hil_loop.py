@@ -94,6 +94,7 @@ class HilLoop:
                     api_id=heard.api_id,
                     name=heard.name,
                     parameter=heard.parameter,
+                    request_id=heard.request_id,
                 )
 
     def _step(self) -> None:
@@ -125,7 +126,8 @@ class HilLoop:
         self._last_xy = (x, y)
         wz = float(truth.gyro_radps[2])
         mode = getattr(truth, "mode", None)  # of a robot that has modes
-        self._note("pose", x=x, y=y, z=z, theta=theta, vx=vx_world, vy=vy_world, wz=wz, mode=mode)
+        touching = sorted(self._simulation.touching)  # of the last 0.1 s: nothing is missed between two lines
+        self._note("pose", x=x, y=y, z=z, theta=theta, vx=vx_world, vy=vy_world, wz=wz, mode=mode, touching=touching)
 
     def _note(self, kind: str, **fields: object) -> None:
         if self._trace is not None:

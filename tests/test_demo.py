@@ -15,8 +15,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tools import children, demo
-from tools.children import Children, StepError, tail
+from sim_hil.realtime import children
+from sim_hil.realtime.children import Children, StepError, tail
+from sim_hil.realtime.stack import COMMANDS, free_domain, socket_dir
+from tools import demo
 from tools.progress import Progress, TraceTail
 from tools.report.machine import machine_facts
 
@@ -72,7 +74,7 @@ def test_a_failed_check_is_exit_1_and_still_a_report(tmp_path: Path, capsys: pyt
 
     out = tmp_path / "demo"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo.run_demo, "__defaults__", (demo.COMMANDS, report))
+        patch.setattr(demo.run_demo, "__defaults__", (COMMANDS, report))
         assert run(out) == 1
     captured = capsys.readouterr()
     assert "check tick_p99_ms failed" in captured.err
@@ -232,7 +234,7 @@ def test_processes_end_in_reverse_order_of_their_start(tmp_path: Path) -> None:
 
 
 def test_the_bridges_socket_has_a_short_path_and_its_folder_is_removed() -> None:
-    with demo.socket_dir() as folder:
+    with socket_dir() as folder:
         assert len(os.fsencode(folder / "bridge.sock")) < 100
     assert not folder.exists()
 
@@ -277,14 +279,14 @@ def test_a_domain_in_use_is_not_chosen(tmp_path: Path) -> None:
     taken = [domain for domain in range(1, 91) if domain != 42]
     lines = [f"   1: 0100007F:{7400 + 250 * domain + 11:04X} 00000000:0000 07\n" for domain in taken]
     (tmp_path / "udp").write_text(head + "".join(lines))
-    assert demo.free_domain([tmp_path / "udp", tmp_path / "absent"]) == 42
+    assert free_domain([tmp_path / "udp", tmp_path / "absent"]) == 42
 
 
 def test_no_free_domain_is_an_error(tmp_path: Path) -> None:
     lines = [f"   1: 0100007F:{7400 + 250 * domain:04X} 00000000:0000 07\n" for domain in range(1, 91)]
     (tmp_path / "udp").write_text("head\n" + "".join(lines))
     with pytest.raises(ValueError, match="no free DDS domain"):
-        demo.free_domain([tmp_path / "udp"])
+        free_domain([tmp_path / "udp"])
 
 
 def test_off_a_terminal_the_progress_is_plain_lines_a_few_times_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:

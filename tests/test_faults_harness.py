@@ -12,9 +12,9 @@ import pytest
 from edge.controller import arc_to
 from edge.faults import FAULTS
 from edge.geometry import SE2
+from sim_hil.faults.client import FaultClient, FaultError
 from tools.faults import __main__ as command
 from tools.faults import circle
-from tools.faults.client import FaultClient, FaultError
 from tools.faults.heard import Hearing, Tail, first_lasting, longest_gap_ms
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult

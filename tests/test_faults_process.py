@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.demo import socket_dir
+from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
 from tools.faults.rig import Rig
 from tools.faults.rows import rows

@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import re
 import shutil
 import signal
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import firmware_bridge
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
-from tools.children import Child, Children, StepError, uninterrupted
+from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, free_domain, slow_robot, socket_dir
 from tools.progress import Progress, TraceTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
@@ -30,18 +26,11 @@ from tools.report.run_data import Record, ReportError
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
-ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
-READY_LINE = "edge-hil: ready"
 DEMO_SPEED_MPS = 0.14
-"""8 m in a minute: untrained weights bend off the corridor and into its wall after 9 m."""
+"""8 m in a minute: untrained weights bend off the corridor and into its wall after 9 m.
 
-# Run as modules of this interpreter, so that the demo works from any virtual environment, activated or not.
-COMMANDS: Mapping[str, Sequence[str]] = {
-    "edge-export": (sys.executable, "-m", "export.cli"),
-    "edge-hil": (sys.executable, "-m", "sim_hil.hil"),
-    "edge-bridge": (sys.executable, "-m", "firmware_bridge.bridge"),
-    "edge-run": (sys.executable, "-m", "edge.runner"),
-}
+A robot that pushes against its wall is stopped for good, as it should be (`odometry-stays-frozen`).
+"""
 
 EXPORT_TIMEOUT_S = 1800.0
 READY_TIMEOUT_S = 90.0
@@ -158,7 +147,7 @@ def _run_to_end(children: Children, child: Child, what: str) -> int:
 def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, socket: Path) -> None:
     """Robot, bridge, runner; then stop them in the order that lets each write its result."""
     files, domain = options.files, ["--domain", str(options.domain)]
-    common = ["--robot", str(_slow_robot(options.out)), "--socket", str(socket), *domain]
+    common = ["--robot", str(slow_robot(options.out, DEMO_SPEED_MPS)), "--socket", str(socket), *domain]
     hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
     with Progress(lambda elapsed_s: f"demo: starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
@@ -190,20 +179,6 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     _stop(children, hil)
 
 
-def _slow_robot(folder: Path) -> Path:
-    """The simulated robot's file with a lower speed limit: untrained weights do not keep to the corridor.
-
-    A robot that pushes against its wall is stopped for good, as it should be (`odometry-stays-frozen`).
-    """
-    line = f"vx_max_mps = {DEMO_SPEED_MPS}"
-    text, changed = re.subn(r"^vx_max_mps *=.*$", line, ROBOT_FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    if changed != 1:
-        raise StepError(f"{ROBOT_FILE}: expected one line with vx_max_mps, found {changed}")
-    file = folder / "robot.toml"
-    file.write_text(text, encoding="utf-8")
-    return file
-
-
 def _stop(children: Children, child: Child) -> None:
     code = children.stop(child)
     if code not in (EXIT_DONE, EXIT_INTERRUPTED):
@@ -232,34 +207,6 @@ def _run_arguments(options: DemoOptions) -> list[str]:
 
 def _says_ready(log: Path) -> bool:
     return READY_LINE in log.read_text(encoding="utf-8", errors="replace")
-
-
-@contextmanager
-def socket_dir() -> Iterator[Path]:
-    """A folder of its own with a short path: a Unix socket's path may have 107 bytes, `--out` may be longer."""
-    folder = Path(tempfile.mkdtemp(prefix="tic-"))
-    try:
-        yield folder
-    finally:
-        with uninterrupted():
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
-    """A DDS domain in 1..90 whose UDP ports nobody on this machine uses (RTPS: 250 ports from 7400 + 250 · domain)."""
-    used: set[int] = set()
-    for table in udp_tables:
-        try:
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                used.add((int(line.split()[1].rsplit(":", 1)[1], 16) - 7400) // 250)
-        except OSError:
-            continue  # not Linux, or no IPv6
-    # From a different place in every process: two demos started together then rarely want the same one.
-    candidates = [1 + (os.getpid() + i) % 90 for i in range(90)]
-    for domain in candidates:
-        if domain not in used:
-            return domain
-    raise ValueError("no free DDS domain between 1 and 90; name one with --domain")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -33,8 +33,9 @@ from edge.power.monitor import PowerMonitor
 from edge.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.recording import RecordingError, read_messages
 from edge.semantic import SemanticState
-from tools.children import Children, StepError
-from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from sim_hil.realtime.children import Children, StepError
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from tools.demo import INSTRUCTION
 from tools.faults import circle
 
 BLOCK_S = 8.0

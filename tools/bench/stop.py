@@ -18,8 +18,9 @@ import time
 from pathlib import Path
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
-from tools.children import Child, Children, StepError
-from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from tools.demo import INSTRUCTION
 
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 BOUND_MS = 300.0

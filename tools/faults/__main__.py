@@ -26,9 +26,9 @@ from edge.cli import (
     check_result_target,
     write_result,
 )
-from tools.children import StepError, uninterrupted
-from tools.demo import free_domain, socket_dir
-from tools.faults.client import FaultError
+from sim_hil.faults.client import FaultError
+from sim_hil.realtime.children import StepError, uninterrupted
+from sim_hil.realtime.stack import free_domain, socket_dir
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, result, show
 from tools.faults.rig import Rig

@@ -12,10 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from firmware_bridge.config import RobotConfig, load_robot_config
-from tools.children import Child, Children, StepError, tail
-from tools.demo import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_FILE
+from sim_hil.faults.client import FaultClient, FaultError
+from sim_hil.realtime.children import Child, Children, StepError, tail
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
+from tools.demo import INSTRUCTION
 from tools.faults.circle import SPEED_MPS
-from tools.faults.client import FaultClient, FaultError
 from tools.faults.heard import Hearing, Tail
 
 READY_TIMEOUT_S = 90.0

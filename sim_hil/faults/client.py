@@ -1,4 +1,4 @@
-"""The asking end of a fault socket: `edge-hil --faults` and `tools.faults.faulty_runner` speak the same lines."""
+"""The asking end of a fault socket: `edge-hil --faults` and the fault rig's runner speak the same lines."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import socket
 import time
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 _POLL_S = 0.01
 
@@ -60,7 +61,7 @@ class FaultClient:
 
     def inject(self, fault: str, *, on: bool = True, timeout_s: float = 5.0, **values: float | str) -> int:
         """`ask` and `effect_ns` in one; older answers that nobody waited for are thrown away first."""
-        self._drop_answers()
+        self.answers()
         self.ask(fault, on=on, **values)
         return self.effect_ns(fault, timeout_s)
 
@@ -77,10 +78,12 @@ class FaultClient:
         self._socket.close()
         self._own.unlink(missing_ok=True)
 
-    def _drop_answers(self) -> None:
+    def answers(self) -> list[dict[str, Any]]:
+        """What has been answered since the last call, without waiting."""
+        found: list[dict[str, Any]] = []
         self._socket.setblocking(False)
         try:
             while True:
-                self._socket.recv(4096)
+                found.append(json.loads(self._socket.recv(4096)))
         except BlockingIOError:
-            return
+            return found

@@ -1,4 +1,4 @@
-"""Start, watch and end the processes of a demo. No child outlives its parent, whatever ends the parent."""
+"""Start, watch and end the processes of a run. No child outlives its parent, whatever ends the parent."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Tick = Callable[[], None]
 
 
 class StepError(RuntimeError):
-    """One step of the demo failed; the text is what the user has to know, log included."""
+    """One step of the run failed; the text is what the user has to know, log included."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Child:
 
 @dataclass
 class Children:
-    """All processes of a demo, ended in reverse order of their start when the block is left."""
+    """All processes of a run, ended in reverse order of their start when the block is left."""
 
     log_dir: Path
     grace_s: float = 5.0
@@ -74,7 +74,7 @@ class Children:
                     stdin=subprocess.DEVNULL,
                     stdout=stream,
                     stderr=subprocess.STDOUT,
-                    # A session of its own: Ctrl-C reaches the demo alone, which then stops its children in order.
+                    # A session of its own: Ctrl-C reaches the parent alone, which then stops its children in order.
                     start_new_session=True,
                     preexec_fn=_end_with_parent,  # one system call; nothing in it can meet a lock
                 )
@@ -160,7 +160,7 @@ def _kill_session(pid: int) -> None:
 
 
 def _end_with_parent() -> None:
-    # Even a SIGKILL of the demo must not leave a robot walking: the kernel then interrupts the children.
+    # Even a SIGKILL of the parent must not leave a robot walking: the kernel then interrupts the children.
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 

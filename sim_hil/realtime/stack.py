@@ -1,0 +1,250 @@
+"""The robot's side, the bridge and the runner as real processes, started and ended as a user would do it."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import firmware_bridge
+from sim_hil.faults.client import FaultClient
+from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
+
+ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
+READY_LINE = "edge-hil: ready"
+ARMED_LINE = "armed and driving"
+
+# Run as modules of this interpreter, so that any virtual environment will do, activated or not.
+COMMANDS: Mapping[str, Sequence[str]] = {
+    "edge-export": (sys.executable, "-m", "export.cli"),
+    "edge-hil": (sys.executable, "-m", "sim_hil.hil"),
+    "edge-bridge": (sys.executable, "-m", "firmware_bridge.bridge"),
+    "edge-run": (sys.executable, "-m", "edge.runner"),
+}
+
+READY_TIMEOUT_S = 120.0
+BRIDGE_TIMEOUT_S = 30.0
+GRACE_S = 12.0
+"""The runner may take 7 s to end (edge.session.END_S)."""
+
+
+@dataclass(frozen=True)
+class StackOptions:
+    """One robot in one world, and who drives it; `folder` takes results and logs and exists."""
+
+    folder: Path
+    artifacts: Path
+    scene: str
+    start: tuple[float, float, float]
+    people: int
+    seed: int
+    domain: int
+    mode: str = "async"
+    release_delay: str = "0"
+    odometry_noise: str = "none"
+    speed_limit_mps: float | None = None
+    """In place of the robot file's limit of the forward speed."""
+    faults: bool = False
+    instructions: bool = False
+    """Whether the runner takes further instructions while it drives."""
+
+    def __post_init__(self) -> None:
+        if self.speed_limit_mps is not None and not 0.01 <= self.speed_limit_mps <= 5.0:
+            raise ValueError(f"speed limit: expected 0.01 to 5 m/s, found {self.speed_limit_mps}")
+        if self.people < 0 or self.seed < 0 or not all(map(math.isfinite, self.start)):
+            raise ValueError(f"stack: expected people and seed of 0 or more and a finite start, found {self}")
+
+
+class Stack:
+    """A context manager that ends exactly the processes that it has started, the runner first."""
+
+    def __init__(self, options: StackOptions, commands: Mapping[str, Sequence[str]] = COMMANDS) -> None:
+        self.options = options
+        self.runs = 0
+        """How many runners have been started; files of the newest carry this number."""
+        self.robot: Child | None = None
+        self.bridge: Child | None = None
+        self.runner: Child | None = None
+        self.faults: FaultClient | None = None
+        self._commands = commands
+        self._children = Children(options.folder, grace_s=GRACE_S)
+        self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
+        self._robot_file = _robot_file(options)
+
+    def __enter__(self) -> Stack:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with uninterrupted():
+            self._children.__exit__(kind, error, trace)
+            if self.faults is not None:
+                self.faults.close()
+            shutil.rmtree(self._sockets, ignore_errors=True)
+
+    @property
+    def trace(self) -> Path:
+        """Ground truth, written by the robot's side."""
+        return self.options.folder / "trace.jsonl"
+
+    @property
+    def instructions(self) -> Path:
+        """Where the newest runner takes instructions."""
+        return self._sockets / f"say{self.runs}"
+
+    def flight_log(self, run: int) -> Path:
+        """Flight log of a runner, counted from 1."""
+        return self.options.folder / f"flight-{run}.mcap"
+
+    def result(self, name: str) -> Path:
+        """Result of a process: edge-hil, edge-bridge-N, edge-run-N."""
+        return self.options.folder / f"{name}.json"
+
+    def processes(self) -> dict[str, int]:
+        """Process ids by command name of what has been started and not ended."""
+        found = {"edge-hil": self.robot, "edge-bridge": self.bridge, "edge-run": self.runner}
+        return {name: child.process.pid for name, child in found.items() if child is not None and child.running}
+
+    def start_robot(self, tick: Tick) -> None:
+        """Start the simulated robot and wait until it is ready. Raises StepError."""
+        options = self.options
+        x_m, y_m, theta_rad = options.start
+        command = [
+            *self._commands["edge-hil"],
+            *("--robot", "go2", "--protocol", "unitree", "--interface", "lo", "--scene", options.scene),
+            # One word: a place may begin with a minus.
+            f"--start={x_m!r},{y_m!r},{math.degrees(theta_rad)!r}",
+            *("--people", str(options.people), "--seed", str(options.seed), "--domain", str(options.domain)),
+            *("--odometry-noise", options.odometry_noise),
+            *("--trace", str(self.trace), "--json", str(self.result("edge-hil"))),
+        ]
+        faults = self._sockets / "faults"
+        if options.faults:
+            command += ["--faults", str(faults)]
+        robot = self.robot = self._children.start("edge-hil", command)
+        ready = lambda: READY_LINE in _text(robot.log)  # noqa: E731 - one line, used once
+        self._children.wait_until(robot, ready, READY_TIMEOUT_S, "ready line", tick)
+        if options.faults:
+            self.faults = FaultClient(faults, self._sockets / "asked")
+
+    def start_bridge(self, tick: Tick) -> None:
+        """Start the bridge and wait for its socket. Raises StepError."""
+        socket = self._sockets / "bridge"
+        socket.unlink(missing_ok=True)  # of a bridge that was killed
+        name = f"edge-bridge-{self.runs + 1}"
+        command = [*self._commands["edge-bridge"], *self._link(), "--json", str(self.result(name))]
+        bridge = self.bridge = self._children.start(name, command)
+        self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
+
+    def start_runner(self, instruction: str) -> Child:
+        """Start the runner; it arms and drives by itself (`armed`)."""
+        options = self.options
+        self.runs += 1
+        name = f"edge-run-{self.runs}"
+        command = [
+            *self._commands["edge-run"],
+            *self._link(),
+            *("--artifacts", str(options.artifacts), "--instruction", instruction, "--mode", options.mode),
+            *("--release-delay", options.release_delay),
+            *("--record", str(self.flight_log(self.runs)), "--json", str(self.result(name))),
+        ]
+        if options.instructions:
+            command += ["--instructions", str(self.instructions)]
+        self.runner = self._children.start(name, command)
+        return self.runner
+
+    def armed(self) -> bool:
+        """Whether the newest runner drives, or has driven."""
+        return self.runner is not None and ARMED_LINE in _text(self.runner.log)
+
+    def check(self) -> None:
+        """StepError when the robot's side or the bridge has ended by itself."""
+        self._children.check_others(self.runner)
+
+    def end_runner(self) -> int | None:
+        """End the runner if it still runs; its exit code, negative for a signal, None without one."""
+        code = self._end(self.runner)
+        self.runner = None
+        return code
+
+    def end_bridge(self) -> int | None:
+        """End the bridge likewise."""
+        code = self._end(self.bridge)
+        self.bridge = None
+        return code
+
+    def end_robot(self) -> int | None:
+        """End the robot's side likewise; its trace is whole then."""
+        code = self._end(self.robot)
+        self.robot = None
+        return code
+
+    def _end(self, child: Child | None) -> int | None:
+        if child is None:
+            return None
+        self._children.end(child)
+        with suppress(ValueError):
+            self._children.forget(child)
+        return child.process.returncode
+
+    def _link(self) -> list[str]:
+        where = ["--socket", str(self._sockets / "bridge"), "--domain", str(self.options.domain)]
+        return ["--robot", str(self._robot_file), *where]
+
+
+def _robot_file(options: StackOptions) -> Path:
+    if options.speed_limit_mps is None:
+        return ROBOT_FILE
+    return slow_robot(options.folder, options.speed_limit_mps)
+
+
+def slow_robot(folder: Path, speed_limit_mps: float) -> Path:
+    """The simulated robot's file with another limit of the forward speed, in `folder`. Raises StepError."""
+    line = f"vx_max_mps = {speed_limit_mps}"
+    text, changed = re.subn(r"^vx_max_mps *=.*$", line, ROBOT_FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    if changed != 1:
+        raise StepError(f"{ROBOT_FILE}: expected one line with vx_max_mps, found {changed}")
+    file = folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def _text(log: Path) -> str:
+    return log.read_text(encoding="utf-8", errors="replace")
+
+
+@contextmanager
+def socket_dir() -> Iterator[Path]:
+    """A folder of its own with a short path: a Unix socket's path may have 107 bytes, a folder of results more."""
+    folder = Path(tempfile.mkdtemp(prefix="tic-"))
+    try:
+        yield folder
+    finally:
+        with uninterrupted():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
+    """A DDS domain in 1..90 whose UDP ports nobody on this machine uses (RTPS: 250 ports from 7400 + 250 · domain)."""
+    used: set[int] = set()
+    for table in udp_tables:
+        try:
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                used.add((int(line.split()[1].rsplit(":", 1)[1], 16) - 7400) // 250)
+        except OSError:
+            continue  # not Linux, or no IPv6
+    # From a different place in every process: two started together then rarely want the same one.
+    candidates = [1 + (os.getpid() + i) % 90 for i in range(90)]
+    for domain in candidates:
+        if domain not in used:
+            return domain
+    raise ValueError("no free DDS domain between 1 and 90; name one with --domain")
