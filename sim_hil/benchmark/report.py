@@ -24,6 +24,7 @@ from sim_hil.scene import SceneError, load_scene
 REPORT = "report.html"
 SHOWN_TEXTS = 12
 SHOWN_ENDINGS = 12
+SHOWN_HITS = 4
 _CARD_PX = 640
 _HEADLINE = {
     "sr": ("success rate", "%"),
@@ -67,15 +68,7 @@ def _parts(
             "Below each name how many episodes it stands for.", wide=True,
         ),
         _group_tables(summary),
-        '<div class="pair">',
-        page.figure(
-            report_figures.error_and_time(results), "Distance to the goal against time used", "One point an episode.",
-        ),
-        page.figure(
-            delay_histogram(delays), "Histogram of the delay",
-            "How old the semantic state was in every period that drove by one.",
-        ) if len(delays) else "",
-        "</div>",
+        *_distributions(results, delays),
         "<h2>Where the robot went</h2>",
         *_maps(results, logs),
         _endings(store.directory, results),
@@ -88,6 +81,26 @@ def _parts(
             [(page.text_html(key), page.text_html(str(value))) for key, value in _facts(store.config, conditions)],
         ),
     ]  # fmt: skip
+
+
+def _distributions(results: Sequence[EpisodeResult], delays: NDArray[np.float64]) -> list[str]:
+    words = ("Distance to the goal against time used", "One point an episode.")
+    if not len(delays):
+        return [page.figure(report_figures.error_and_time(results, width_in=11.0), *words, wide=True)]
+    caption = "How old the semantic state was in every period that drove by one."
+    return [
+        '<div class="pair">',
+        page.figure(report_figures.error_and_time(results, width_in=5.4), *words),
+        page.figure(delay_histogram(delays), "Histogram of the delay", caption),
+        "</div>",
+    ]
+
+
+def _hits(result: EpisodeResult) -> str:
+    """What was hit, the first few."""
+    more = len(result.collisions) - SHOWN_HITS
+    shown = [*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])]
+    return page.text_html(", ".join(shown))
 
 
 def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
@@ -152,10 +165,12 @@ def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | 
         except SceneError:
             parts.append(f"<p>Scene {page.text_html(name)} is not on this machine: no map.</p>")
             continue
-        picture = report_figures.scene_map(scene, [result for result, _ in shown], [_path(log) for _, log in shown])
+        ended, logged = [result for result, _ in shown], [log for _, log in shown]
+        goals = [log["goal_xy"] for log in logged]
+        picture = report_figures.scene_map(scene, ended, [_path(log) for log in logged], goals)
         caption = (
-            f"{name}: {len(shown)} of {len(members)} episodes. Blue: start. Green: reached without a collision, "
-            "orange: reached with one, red: not reached."
+            f"{name}: {len(shown)} of {len(members)} episodes. Blue: start; green ring: goal. Paths: green reached "
+            "without a collision, orange reached with one, red not reached."
         )
         parts.append(page.figure(picture, f"Map of {name} with the paths", caption, wide=True))
     return parts
@@ -175,7 +190,7 @@ def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
         if picture is None:
             continue
         name = page.text_html(result.id)
-        hit = f", collided with {page.text_html(', '.join(result.collisions))}" if result.collided else ""
+        hit = f", collided with {_hits(result)}" if result.collided else ""
         cards.append(
             f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last picture of {name}">'
             f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
@@ -210,13 +225,12 @@ def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> str:
         mark = (
             '<span class="pass">reached</span>' if r.success else f'<span class="fail">{page.text_html(r.end)}</span>'
         )
-        hit = ", ".join(r.collisions) if r.collided else ""
         video = directory / VIDEOS / f"{r.id}.mp4"
         name = page.text_html(r.id)
         link = f'<a href="{VIDEOS}/{name}.mp4">{name}</a>' if video.is_file() else name
         delay = "" if r.delay_s is None else f"{r.delay_s['mean']:.1f}"
         numbers = (f"{r.ne_m:.1f}", f"{r.spl:.0f}", f"{r.path_m:.1f}", f"{r.shortest_m:.1f}", f"{r.time_s:.0f}", delay)
-        rows.append((link, r.scene, r.robot, str(r.people), mark, page.text_html(hit), *numbers))
+        rows.append((link, r.scene, r.robot, str(r.people), mark, _hits(r), *numbers))
     head = (
         "episode", "scene", "robot", "people", "end", "collided with", "NE m", "SPL %", "path m", "shortest m",
         "time s", "mean Δt s",

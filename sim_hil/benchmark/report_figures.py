@@ -49,11 +49,15 @@ def rates(results: Sequence[EpisodeResult]) -> bytes:
     return png(figure)
 
 
-def scene_map(scene: Scene, results: Sequence[EpisodeResult], paths: Sequence[Path2]) -> bytes:
-    """A scene from above with the true path of each episode (n, 2): green reached, orange with a collision, red not."""
+def scene_map(
+    scene: Scene, results: Sequence[EpisodeResult], paths: Sequence[Path2], goals: Sequence[Sequence[float]]
+) -> bytes:
+    """A scene from above with each episode's goal (x m, y m) and true path [n, 2] m, coloured by how it ended."""
     span_m = max(scene.floor_max_m[0] - scene.floor_min_m[0], 1.0)
     px_per_m = min(40.0, _MAP_PX / (span_m + 1))
     image, view = draw_map(scene, px_per_m, names=True), map_view(scene, px_per_m)
+    for goal in goals:
+        draw_mark(image, view, (goal[0], goal[1]), _GOAL, 0.5, filled=False)
     for result, path in sorted(zip(results, paths, strict=True), key=lambda pair: pair[0].success):
         colour = _FAILED if not result.success else _COLLIDED if result.collided else _SUCCESS
         draw_path(image, view, [(float(x), float(y)) for x, y in path], colour, 2)
@@ -65,9 +69,9 @@ def scene_map(scene: Scene, results: Sequence[EpisodeResult], paths: Sequence[Pa
     return bytes(data.tobytes())
 
 
-def error_and_time(results: Sequence[EpisodeResult]) -> bytes:
+def error_and_time(results: Sequence[EpisodeResult], width_in: float) -> bytes:
     """Each episode: how much of its time it took, and how far from the goal it ended."""
-    figure = new_figure(5.4, 3.1)
+    figure = new_figure(width_in, 3.1)
     axes = figure.add_subplot()
     for label, colour, chosen in (
         ("reached", GOOD, [r for r in results if r.success]),
