@@ -41,6 +41,7 @@ _RUN_FAILURES: Final = (RuntimeError, ValueError, OSError, pybullet.error, *DDS_
 EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene my_scene.toml --protocol unitree --start 2.5,-1,90
+  edge-hil --robot carter --scene warehouse --protocol can --link serial:carter.can
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
   edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
 with --faults, one JSON object a datagram switches a fault on or off, such as {"fault": "camera-stop", "on": true}; the
