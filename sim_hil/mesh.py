@@ -83,6 +83,10 @@ class MeshBuilder:
             yield self._plain
         yield from self._textured.values()
 
+    def empty(self) -> bool:
+        """Whether nothing was built yet."""
+        return not self._plain.indices and not self._textured
+
     def bounds(self) -> tuple[float, float, float, float]:
         """Extent along x and y: x0, y0, x1, y1, m; raises ValueError when nothing was built."""
         corners = np.concatenate([np.array(surface.vertices) for surface in self.surfaces()])

@@ -8,25 +8,27 @@ from sim_hil.mesh import MeshBuilder
 from sim_hil.world_surfaces import surface_picture
 
 Vec2 = tuple[float, float]
-SQUARE_M = 8.0
 
 
 class Pieces:
-    """Meshes by the square that their point lies in; textures of surfaces are registered when first asked for."""
+    """Meshes by the square that their point lies in; `around` is for what is far outside."""
 
-    def __init__(self) -> None:
+    def __init__(self, square_m: float) -> None:
+        self._square_m = square_m
         self._meshes: dict[tuple[int, int], MeshBuilder] = {}
+        self.around = MeshBuilder()
 
     def at(self, x: float, y: float) -> MeshBuilder:
         """The mesh of the square around a point, m."""
-        square = (floor(x / SQUARE_M), floor(y / SQUARE_M))
+        square = (floor(x / self._square_m), floor(y / self._square_m))
         if square not in self._meshes:
             self._meshes[square] = MeshBuilder()
         return self._meshes[square]
 
     def all(self) -> list[MeshBuilder]:
         """All meshes, in an order that depends on the places alone."""
-        return [self._meshes[square] for square in sorted(self._meshes)]
+        meshes = [self._meshes[square] for square in sorted(self._meshes)]
+        return [mesh for mesh in (*meshes, self.around) if not mesh.empty()]
 
 
 def surface(mesh: MeshBuilder, texture: str) -> str:

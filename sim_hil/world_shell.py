@@ -47,7 +47,7 @@ def _beyond(pieces: Pieces, scene: Scene) -> None:
         for left, right in _cells(i0, i1, 4 * _CELL_M):
             for low, high in _cells(j0, j1, 4 * _CELL_M):
                 corners: list[Vec3] = [(left, low, 0), (right, low, 0), (right, high, 0), (left, high, 0)]
-                pieces.at((left + right) / 2, (low + high) / 2).face(colour, corners)
+                pieces.around.face(colour, corners)
 
 
 def add_ceiling(pieces: Pieces, scene: Scene) -> None:
