@@ -210,16 +210,21 @@ class Go2:
         was_x, was_y, was_z = self._last_imu_velocity
         self._last_imu_velocity = velocity
         dt_s = self._dt_s
-        sx, sy, sz = (vx - was_x) / dt_s, (vy - was_y) / dt_s, (vz - was_z) / dt_s + GRAVITY_MPS2
-        fx, fy, fz = self._forward
-        ux, uy, uz = self._upward
+        raw = self._to_body(((vx - was_x) / dt_s, (vy - was_y) / dt_s, (vz - was_z) / dt_s + GRAVITY_MPS2))
         # Rigid contacts are impulses: the raw difference shows spikes of many g that no filtered IMU reports.
         blend = self._accel_blend
-        ax, ay, az = self._accel
-        self._accel = (
-            ax + blend * (fx * sx + fy * sy + fz * sz - ax),
-            ay + blend * ((uy * fz - uz * fy) * sx + (uz * fx - ux * fz) * sy + (ux * fy - uy * fx) * sz - ay),
-            az + blend * (ux * sx + uy * sy + uz * sz - az),
+        x, y, z = self._accel
+        self._accel = (x + blend * (raw[0] - x), y + blend * (raw[1] - y), z + blend * (raw[2] - z))
+
+    def _to_body(self, world: Vec3) -> Vec3:
+        """A vector of the world in the base frame, whose y axis is z cross x."""
+        x, y, z = world
+        fx, fy, fz = self._forward
+        ux, uy, uz = self._upward
+        return (
+            fx * x + fy * y + fz * z,
+            (uy * fz - uz * fy) * x + (uz * fx - ux * fz) * y + (ux * fy - uy * fx) * z,
+            ux * x + uy * y + uz * z,
         )
 
     def pose(self) -> tuple[tuple[float, float, float], float]:
@@ -264,7 +269,7 @@ class Go2:
             quaternion_wxyz=np.array((w, x, y, z)),
             rpy_rad=np.array((body.roll_rad, body.pitch_rad, body.yaw_rad)),
             velocity_world_mps=np.array(self._linear),
-            gyro_radps=rotation_matrix(self._quaternion).T @ np.array(self._angular),
+            gyro_radps=np.array(self._to_body(self._angular)),
             accel_mps2=np.array(self._accel),
             joint_q_rad=np.array(self._q),
             joint_dq_radps=np.array(self._dq),
