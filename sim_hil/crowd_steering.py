@@ -27,7 +27,7 @@ _COS, _SIN = np.cos(_ANGLES) * _SHARES, np.sin(_ANGLES) * _SHARES
 _IDLE = np.append(1.0 - _SHARES, 0.5)
 _LEFT = np.append(np.where((_ANGLES > 0) & (_ANGLES < 3), 0.05, 0.0), 0.0)  # passing on the right is the habit
 
-_COLLISION, _CLOSE, _INERTIA, _WALL, _WALL_AIR = 3.2, 0.9, 0.35, 2.6, 0.45
+_COLLISION, _CLOSE, _INERTIA, _WALL, _WALL_AIR = 3.2, 0.9, 0.65, 2.6, 0.45
 _SOON_S = 0.25  # a collision now costs _COLLISION / _SOON_S
 _NONE_S = 1e3
 _WALL_TIMES_S = np.array((0.25, 0.55, 1.0))

@@ -61,11 +61,11 @@ def test_people_turn_round_gradually(corridor: Scene) -> None:
         assert np.abs(turn).max() * UPDATE_HZ < 3.1
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_nobody_is_stuck_for_long(corridor: Scene, seed: int) -> None:
-    poses = np.array(_walk(People(corridor, 8, seed), 60.0))[:, :, :2]
+    poses = np.array(_walk(People(corridor, 8, seed), 40.0))[:, :, :2]
     path = np.hypot(*np.moveaxis(np.diff(poses, axis=0), -1, 0)).sum(axis=0)
-    assert path.min() > 0.4 * 60.0 * 0.8
+    assert path.min() > 0.4 * 40.0 * 0.8
 
 
 def test_routes_leave_room_for_a_person_to_walk_beside_the_line(corridor: Scene) -> None:

@@ -51,7 +51,7 @@ def test_a_crowd_repeats_itself_whether_or_not_it_is_looked_at(hospital: Scene) 
 def test_nobody_gets_into_walls_or_other_people(hospital: Scene) -> None:
     people = People(hospital, 60, 2)
     free = CrowdMap(hospital)
-    for step in range(45 * UPDATE_HZ):
+    for step in range(20 * UPDATE_HZ):
         people.step(*FAR_AWAY)
         if step % 10 == 0:
             rows = people.render_rows()
@@ -65,7 +65,7 @@ def test_nobody_gets_into_walls_or_other_people(hospital: Scene) -> None:
 def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
     people = People(hospital, 60, 4)
     longest = np.zeros(60)
-    for _ in range(50 * UPDATE_HZ):
+    for _ in range(30 * UPDATE_HZ):
         people.step(*FAR_AWAY)
         longest = np.maximum(longest, people.blocked_s())
     assert (longest > 15.0).mean() <= 0.04
@@ -73,14 +73,15 @@ def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
 
 def test_people_speed_up_gently_and_brake_within_what_legs_can_do(hospital: Scene) -> None:
     people = People(hospital, 30, 0)
-    before, most = people.velocities(), 0.0
-    for _ in range(20 * UPDATE_HZ):
+    before, changes = people.velocities(), []
+    for _ in range(15 * UPDATE_HZ):
         people.step(*FAR_AWAY)
-        standing = people.render_rows()[:, 6] == 0.0
-        change = np.hypot(*(people.velocities() - before).T) * UPDATE_HZ
-        most = max(most, float(np.percentile(change[standing], 97)))
+        up = people.render_rows()[:, 6] == 0.0
+        changes += np.hypot(*(people.velocities() - before)[up].T).tolist()
         before = people.velocities()
-    assert most < 3.6
+    accelerations = np.array(changes) * UPDATE_HZ
+    assert (accelerations > 3.6).mean() < 0.005
+    assert (accelerations > 1.9).mean() < 0.1
 
 
 def test_people_stand_sit_walk_and_talk(hospital: Scene) -> None:
@@ -96,7 +97,9 @@ def test_a_queue_stands_in_line_and_is_served_in_order(hall: Scene) -> None:
     people = People(replace(hall, places=(counter,)), 6, 3)
     crowd, served = people._crowd, []
     deepest = 0
-    for _ in range(90 * UPDATE_HZ):
+    for person in range(6):
+        people._plans._go(person, 0)
+    for _ in range(60 * UPDATE_HZ):
         people.step(*FAR_AWAY)
         line = people._plans._queues[0]
         waiting = [k for k in line if hypot(crowd.vx[k], crowd.vy[k]) < 0.05 and crowd.stuck_s[k] == 0.0]
@@ -127,7 +130,7 @@ def test_groups_stay_together(hospital: Scene) -> None:
     followers = np.flatnonzero(crowd.leader >= 0)
     assert 5 <= len(followers) <= 40
     gaps = []
-    for step in range(40 * UPDATE_HZ):
+    for step in range(20 * UPDATE_HZ):
         people.step(*FAR_AWAY)
         if step % UPDATE_HZ == 0:
             lead = crowd.leader[followers]
@@ -140,10 +143,10 @@ def test_two_streams_get_past_each_other_in_a_narrow_corridor(hall: Scene) -> No
     side = [Wall(f"side {y}", (2.0, y), (26.0, y), 0.1, 2.5, "wall_wainscot") for y in (-1.3, 1.3)]
     narrow = replace(hall, walls=(*hall.walls, *side), places=())
     people = People(narrow, 16, 0)
-    rows = _walk(people, 60.0)
+    rows = _walk(people, 40.0)
     travelled = np.hypot(*np.moveaxis(np.diff(rows[:, :, :2], axis=0), -1, 0)).sum(axis=0)
-    assert np.median(travelled) > 0.5 * 60.0
-    assert travelled.min() > 10.0
+    assert np.median(travelled) > 0.5 * 40.0
+    assert travelled.min() > 6.0
 
 
 def test_a_person_on_a_platform_stands_on_it(hall: Scene) -> None:
@@ -157,8 +160,8 @@ def test_a_person_on_a_platform_stands_on_it(hall: Scene) -> None:
 
 def test_streets_are_crossed_at_the_crossing_rather_than_anywhere() -> None:
     scene = load_scene("sidewalk")
-    people = People(scene, 100, 0)
-    rows = _walk(people, 40.0)[::UPDATE_HZ]
+    people = People(scene, 50, 0)
+    rows = _walk(people, 20.0)[::UPDATE_HZ]
     kinds = [scene.area_at(x, y) for x, y in rows[:, :, :2].reshape(-1, 2)]
     streets = sum(area is not None and area.kind == "street" for area in kinds)
     assert streets / len(kinds) < 0.05
