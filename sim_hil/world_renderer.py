@@ -172,7 +172,7 @@ class Renderer:
 
 def _power_of_two(size: int) -> int:
     """The size that the rasteriser takes, nearest to one."""
-    return min(2 ** max(round(log2(size)), 3), _MAX_TEXTURE_PX)
+    return int(min(2 ** max(round(log2(size)), 3), _MAX_TEXTURE_PX))
 
 
 def _geom(surface: Surface) -> core.Geom:

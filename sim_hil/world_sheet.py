@@ -44,7 +44,7 @@ def showroom(kind: Kind) -> Scene:
         "it", kind.name, (0.0, 0.0, z), 0.0, kind.size_m, kind.colour, _TEXTS.get(kind.name, ""), kind.words
     )
     depth, width, _ = kind.size_m
-    walls = ()
+    walls: tuple[Wall, ...] = ()
     if not kind.solid and kind.name not in ("carpet", "light"):
         half = max(width, 3.0)
         walls = (Wall("wall", (-depth / 2 - 0.08, -half), (-depth / 2 - 0.08, half), 0.15, 3.4, "wall_office"),)
