@@ -1,0 +1,68 @@
+"""Follows edge-hil's trace while it is written: where the robot truly is, what it touches, what it was told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class TruePose:
+    """One line of ground truth: m, rad, world frame; `touching` are labels of what the robot touched."""
+
+    t_ns: int
+    x_m: float
+    y_m: float
+    theta_rad: float
+    touching: tuple[str, ...]
+
+
+class TruthTail:
+    """Reads what was added to a trace; an unfinished last line is left for the next time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self.newest: TruePose | None = None
+
+    def update(self) -> list[TruePose]:
+        """The poses since the last call, in order."""
+        poses = [pose_of(line) for line in self._lines() if line.get("kind") == "pose"]
+        if poses:
+            self.newest = poses[-1]
+        return poses
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        try:
+            with self._path.open("rb") as stream:
+                stream.seek(self._offset)
+                added = stream.read()
+        except FileNotFoundError:
+            return
+        whole = added[: added.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        yield from parsed(whole)
+
+
+def pose_of(line: dict[str, Any]) -> TruePose:
+    """The pose of a line of kind `pose`."""
+    return TruePose(int(line["t_ns"]), line["x"], line["y"], line["theta"], tuple(line["touching"]))
+
+
+def parsed(text: bytes) -> Iterator[dict[str, Any]]:
+    """Objects of a JSON-lines text; a line that was cut off, which only the last one can be, is left out."""
+    for line in text.splitlines():
+        try:
+            yield json.loads(line)
+        except ValueError:
+            continue
+
+
+def read_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Objects of a JSON-lines file one by one, a cut last line left out; raises OSError."""
+    with path.open("rb") as stream:
+        for line in stream:
+            yield from parsed(line)

@@ -1,0 +1,228 @@
+"""`edge-soak`: drives for hours in real time, task after task with random faults, and judges what it has measured."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from edge.artifact_files import ArtifactError
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    check_result_target,
+    write_result,
+)
+from edge.manifest import load_artifacts
+from firmware_bridge.config import load_robot_config
+from sim_hil.hil import stop_signals
+from sim_hil.odometry_noise import LEVELS
+from sim_hil.realtime.children import StepError
+from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
+from sim_hil.scene import SceneError, load_scene
+from sim_hil.soak import budget as budgets
+from sim_hil.soak import schedule
+from sim_hil.soak.budget import FAIL, BudgetLine
+from sim_hil.soak.measures import names
+from sim_hil.soak.schedule import FaultMenu, SoakInputError
+from sim_hil.soak.soak_run import SoakFolder, SoakOptions, run_legs, soak_result
+
+MODES: Final = ("async", "sync", "no-reasoning")
+PLAIN_S: Final = 30.0
+_UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+EXAMPLES = """examples:
+  edge-soak --artifacts out/nano --duration 1h --out out/soak
+  edge-soak --artifacts out/nano --duration 8h --leg 30m --people 12 --scene hospital --scene office --out out/night
+  edge-soak --artifacts out/nano --duration 8h --out out/night --resume      # with the same options, after a kill
+  edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
+
+A leg is one stack (edge-hil, edge-bridge, edge-run) in one scene; within it the runner goes on from task to task.
+The default budget and faults: sim_hil/soak/budget.toml and faults.toml; copy and change them.
+exit codes: 0 the budget is kept, 1 it is not or nothing could be run, 2 bad arguments or input, 3 refused (artifacts),
+            130 interrupted (the report of what there is is written)
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "edge-soak", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
+    p.add_argument("--duration", type=parse_seconds, required=True, metavar="T", help="such as 90s, 10m, 1h or 1d")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="samples, legs, result.json, report.html")
+    p.add_argument("--faults", default="default", metavar="FILE|none", help="what may happen (default: the package's)")
+    p.add_argument("--budget", type=Path, metavar="FILE", help="what it is judged by (default: the package's)")
+    p.add_argument("--scene", action="append", metavar="NAME|FILE", help="default hospital; repeated: leg by leg")
+    p.add_argument("--people", type=int, default=6, metavar="N", help="walking people (default 6)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of tasks, people and faults (default 0)")
+    p.add_argument("--leg", type=parse_seconds, default=600.0, metavar="T", help="length of a leg (default 10m)")
+    p.add_argument("--mode", choices=MODES, default="async", help="of edge-run (default async)")
+    p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="of edge-run (default 0)")
+    p.add_argument("--odometry-noise", choices=tuple(LEVELS), default="none", help="of edge-hil (default none)")
+    p.add_argument(
+        "--speed-limit", type=float, metavar="MPS", help="forward, instead of the robot file's (untrained: slowly)"
+    )
+    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: one that is free)")
+    p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
+    p.add_argument("--resume", action="store_true", help="continue the soak in --out with the time that is left")
+    p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    return p
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds of a text such as 90s, 10m, 1.5h, 1d or 90; raises argparse.ArgumentTypeError."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text, re.ASCII)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"expected a time such as 90s, 10m or 1h, found {text!r}")
+    return float(match[1]) * _UNITS_S[match[2] or "s"]
+
+
+def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
+    """Command line; see EXAMPLES for the exit codes."""
+    args = parser().parse_args(argv)
+    try:
+        check_result_target(args.json)
+        options = options_of(args)
+        menu = _menu(args.faults)
+        budget = budgets.load_budget(args.budget or budgets.DEFAULT)
+        budgets.check_names(budget, names())
+        soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
+    except ArtifactError as error:
+        return _complain(error, EXIT_REFUSED)
+    except (SoakInputError, SceneError, ValueError, OSError) as error:
+        return _complain(error, EXIT_BAD_INPUT)
+    if not options.trained:
+        _say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
+    with stop_signals() as stop:
+        progress, failure = _Progress(), ""
+        try:
+            finished = run_legs(
+                soak, options, menu, stopped=lambda: bool(stop), tell=progress.tell, say=progress.say,
+                keep_logs=args.keep_logs, commands=commands,
+            )  # fmt: skip
+        except (StepError, ValueError) as error:
+            finished, failure = False, str(error)
+        progress.end()
+        result = soak_result(soak, options, budget, finished=finished)
+        _write(args, soak, options, result, budget)
+    if failure:
+        return _complain(failure, EXIT_CHECK_FAILED)
+    if not finished:
+        return _complain(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
+    return EXIT_CHECK_FAILED if result["verdict"] == FAIL else EXIT_DONE
+
+
+def options_of(args: argparse.Namespace) -> SoakOptions:
+    """What the arguments ask for; raises ArtifactError, SoakInputError, SceneError or ValueError."""
+    artifacts = load_artifacts(args.artifacts.absolute())
+    scenes = tuple(args.scene or ("hospital",))
+    for scene in scenes:
+        load_scene(scene)
+    limit_mps = args.speed_limit
+    if limit_mps is not None and not 0.02 <= limit_mps <= 2.0:
+        raise SoakInputError(f"--speed-limit: expected 0.02 to 2 m/s, found {limit_mps}")
+    return SoakOptions(
+        artifacts=args.artifacts.absolute(),
+        manifest_sha256=artifacts.manifest_sha256,
+        trained=artifacts.trained,
+        scenes=scenes,
+        people=args.people,
+        seed=args.seed,
+        duration_s=args.duration,
+        leg_s=args.leg,
+        speed_mps=limit_mps or load_robot_config(ROBOT_FILE).limits.vx_max_mps,
+        speed_limit_mps=limit_mps,
+        mode=args.mode,
+        release_delay=args.release_delay,
+        odometry_noise=args.odometry_noise,
+        domain=free_domain() if args.domain is None else args.domain,
+        faults=args.faults,
+    )
+
+
+def _menu(faults: str) -> FaultMenu | None:
+    if faults == "none":
+        return None
+    return schedule.load_menu(schedule.DEFAULT if faults == "default" else Path(faults))
+
+
+def _write(
+    args: argparse.Namespace,
+    soak: SoakFolder,
+    options: SoakOptions,
+    result: Mapping[str, Any],
+    budget: Sequence[BudgetLine],
+) -> None:
+    write_result(str(soak.path / "result.json"), result)
+    write_result(args.json, result)
+    if args.json != "-":
+        sys.stdout.write(summary_lines(result))
+
+
+def summary_lines(result: Mapping[str, Any]) -> str:
+    """The verdict and the budget's lines for a terminal."""
+    rows = []
+    for line in result["budget"]:
+        limit = f"<= {line['max']:g}" if "max" in line else f">= {line['min']:g}"
+        value = line["found"]["value"]
+        found = "–" if value is None else f"{value:g} {line['found']['unit']}"
+        rows.append(f"{line['verdict']:<10}{line['measure']:<38}{found:>18}  {limit}" + _why(line))
+    legs = result["legs"]
+    tasks, reached = sum(leg["tasks"] for leg in legs), sum(leg["reached"] for leg in legs)
+    rows.append(
+        f"{result['verdict']}: {result['elapsed_s']:.0f} s in {len(legs)} legs, {reached} of {tasks} tasks reached, "
+        f"{sum(leg['stops'] for leg in legs)} stops, {sum(leg['faults'] for leg in legs)} faults"
+    )
+    return "\n".join(rows) + "\n"
+
+
+def _why(line: Mapping[str, Any]) -> str:
+    return f"  ({line['why']})" if "why" in line else ""
+
+
+class _Progress:
+    """One line on stderr: redrawn on a terminal, otherwise now and then."""
+
+    def __init__(self) -> None:
+        self._told_ns = 0
+        self._terminal = sys.stderr.isatty()
+
+    def tell(self, line: str) -> None:
+        now_ns = time.monotonic_ns()
+        if self._terminal:
+            sys.stderr.write(f"\r\x1b[Kedge-soak: {line}")
+            sys.stderr.flush()
+        elif now_ns - self._told_ns >= PLAIN_S * 1e9:
+            self._told_ns = now_ns
+            _say(line)
+
+    def say(self, line: str) -> None:
+        self.end()
+        _say(line)
+
+    def end(self) -> None:
+        if self._terminal:
+            sys.stderr.write("\r\x1b[K")
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"edge-soak: {line}\n")
+    sys.stderr.flush()
+
+
+def _complain(what: object, code: int) -> int:
+    _say(str(what))
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
