@@ -196,7 +196,8 @@ class Motion:
         gaps = np.minimum(np.sqrt(dx * dx + dy * dy) - PERSON_M, nose - (driving.body_radius_m + PERSON_RADIUS_M))
         # Nobody walks exactly as foreseen, least of all somebody who walks fast.
         unsure = 0.05 * self._times[:, None] * np.minimum(np.hypot(velocities[:, 0], velocities[:, 1]), 1.5)
-        room = gaps - (driving.margin_m + np.minimum(unsure, 0.25))[:, :, None]
+        margin_m = driving.margin_m * max(patience, 0.4)
+        room = gaps - (margin_m + np.minimum(unsure, 0.25))[:, :, None]
         hit = _within(-room / 0.25, 2.5)
         near = _within(1.0 - room / (driving.comfort_m * patience), 1.0)
         # People walk round a robot that stands: running into it is up to them. Into one that drives, less so.

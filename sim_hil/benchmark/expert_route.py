@@ -24,8 +24,8 @@ SPACING_M: Final = 0.1  # between the points of a route
 ROOM_M: Final = 0.5  # nearer than this beyond its clearance to a wall, a metre costs more
 _WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
 _STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
-_STANDING_PRICE: Final = 12.0  # a metre through somebody who stands there costs so much more
-_PERSON_M: Final = 0.7  # as far as that price reaches in full; it ends twice as far
+# Distance from somebody who stands there, m, and what a metre costs more at it: between two people one may pass.
+_CROWD: Final = ((0.5, 60.0), (0.7, 12.0), (1.4, 0.0))
 _SHORT_PRICE: Final = 4.0  # each metre that one ends short of the goal is as bad as so many metres of way
 _SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
 _NO_ROOM: Final = 1000.0
@@ -233,11 +233,12 @@ class RoutePlanner:
 def _crowd_price(points: Array, standing: Array) -> Array:
     """What a metre at each point [n, 2] costs more for those who stand about [k, 2]."""
     price = np.zeros(len(points))
+    gaps_m, prices = zip(*_CROWD, strict=True)
     for x, y in standing:
-        near = np.flatnonzero((np.abs(points[:, 0] - x) < 2 * _PERSON_M) & (np.abs(points[:, 1] - y) < 2 * _PERSON_M))
+        near = np.flatnonzero((np.abs(points[:, 0] - x) < gaps_m[-1]) & (np.abs(points[:, 1] - y) < gaps_m[-1]))
         gap = np.hypot(points[near, 0] - x, points[near, 1] - y)
         # The dearest of those around: in a dense group a metre is no worse than in the middle of one person.
-        price[near] = np.maximum(price[near], _STANDING_PRICE * np.clip(2.0 - gap / _PERSON_M, 0.0, 1.0))
+        price[near] = np.maximum(price[near], np.interp(gap, gaps_m, prices))
     return price
 
 
