@@ -19,6 +19,7 @@ _CLIP_M = 0.45  # a corner cut through an area for no longer than this is no par
 _LEG_M = 1.2  # followed for less, a corridor is only crossed
 _AT_START_M = 0.7  # an opening this close beside the start can be counted or not: nobody could tell
 _END_M = 1.6  # a corridor that goes on for less than this ends here
+_GOAL_END_M = 2.4  # the same for the goal: one stops a metre before what stands at the end
 _NEAR_M = 2.4  # a landmark marks a turn when it is no further from it
 
 
@@ -301,7 +302,7 @@ def _ends(scene: Scene, grid: NavGrid, leg: _Leg, target: Area | None = None) ->
     if target is not None:
         (_, t_high), _ = leg.frame.span(bounds_of(target))
         end = max(end, min(t_high, high))
-    if high - end > _END_M:
+    if high - end > (_END_M if target is not None else _GOAL_END_M):
         return False
     middle = (right + left) / 2
     a, b = leg.frame.point(high - 0.6, middle), leg.frame.point(high + 0.6, middle)

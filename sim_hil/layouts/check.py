@@ -12,13 +12,17 @@ from sim_hil.scene import Box, Scene
 
 ROBOT_RADIUS_M = 0.4
 PERSON_RADIUS_M = 0.25
+_LARGE_M2 = 3000.0  # outdoors nothing is so narrow that it takes a fine grid
 _TOUCH_M = 0.004  # things may stand flush
 
 
 def problems(scene: Scene, grid: NavGrid | None = None) -> list[str]:
     """What is wrong with a scene, one line each; empty when it is sound. `grid`: one of ROBOT_RADIUS_M, if at hand."""
     found = overlaps(scene)
-    grid = grid or NavGrid(scene, clearance_m=ROBOT_RADIUS_M)
+    if grid is None:
+        (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
+        fine = (x1 - x0) * (y1 - y0) < _LARGE_M2
+        grid = NavGrid(scene, clearance_m=ROBOT_RADIUS_M, resolution_m=0.1 if fine else 0.2)
     x, y, _ = scene.start
     if not grid.is_free(x, y):
         return [*found, f"start ({x:.2f}, {y:.2f}) is not free for a robot of radius {ROBOT_RADIUS_M} m"]

@@ -50,6 +50,8 @@ def plaza(builder: Builder, lot: Rect, north: bool) -> None:
                     builder.place("stand", x + 1.6 * cos(angle), y + 1.6 * sin(angle), angle + pi, 1)
                 break
     _somewhere(builder, lot, "kiosk", 1, 1.5, landmark=True)
+    if builder.things[-1].kind != "kiosk":
+        raise LayoutError("no room for the kiosk")
     _somewhere(builder, lot, "planter", 3, 1.2)
     _somewhere(builder, lot, "tree", 4, 0.6)
     _edge(builder, lot, north)
