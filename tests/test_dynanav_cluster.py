@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_hil.benchmark.cluster import ClusterError, ClusterJobs
+from sim_hil.benchmark.cluster import ClusterError, ClusterJobs, run_on_node
 from sim_hil.benchmark.jobs import RunWatcher, run_all
 from sim_hil.benchmark.store import ResultStore, read_results
 from tests import dynanav_fakes as fakes
@@ -85,3 +86,9 @@ def test_a_killed_workers_episode_is_run_again_and_none_is_lost_or_counted_twice
 def test_an_address_without_a_cluster_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClusterError, match=r"--cluster nonsense: no Ray cluster there"):
         ClusterJobs("nonsense")
+
+
+def test_a_node_with_other_code_refuses_its_episodes(tmp_path: Path) -> None:
+    told, files = run_on_node(json.dumps(fakes.task("a", tmp_path).as_json()), "0" * 64, None)
+    content = json.loads(told)
+    assert content["result"] is None and content["refused_code"] == 2 and "other code" in content["why"] and not files

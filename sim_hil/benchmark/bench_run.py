@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.stats import percentiles
+from sim_hil.benchmark.code_version import code_sha256
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.episode_log import read_log
@@ -115,6 +116,7 @@ def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode
 def versions() -> dict[str, str]:
     """What results may depend on beside the conditions."""
     found = {"python": platform.python_version(), "machine": platform.machine(), "system": sys.platform}
+    found["code"] = code_sha256()
     for name in _PACKAGES:
         try:
             found[name] = version(name)
@@ -142,7 +144,8 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
         "suite_sha256": run.config()["suite_sha256"],
         "manifest_sha256": run.manifest_sha256,
         "trained": run.trained,
-        "versions": versions(),
+        "versions": store.config["versions"],
+        "code_changed": store.config["versions"]["code"] != code_sha256(),
         "wall_s": round(wall_s, 1),
         "simulated_s": round(sum(result.time_s for result in results), 1),
         "tagged": "measured",

@@ -216,6 +216,8 @@ def _tell(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) 
         write_result(str(store.directory / "result.json"), result)
         report = write_report(store, result["summary"], f"DynaNav: {Path(args.suite).stem}, {args.policy}")
         sys.stderr.write(f"edge-bench: {report}\n")
+    if result["code_changed"]:
+        _complain("the code has changed while this ran: its episodes may be of two versions", EXIT_DONE)
     if args.json != "-":
         sys.stdout.write(summary_lines(result))
 

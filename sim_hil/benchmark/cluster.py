@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from edge.cli import EXIT_BAD_INPUT
+from sim_hil.benchmark.code_version import code_sha256
 from sim_hil.benchmark.jobs import Ended
 from sim_hil.benchmark.local_jobs import WORKER, LocalJobs
 from sim_hil.benchmark.results import EpisodeResult
@@ -57,6 +59,7 @@ class ClusterJobs:
         # The driver retries, so that every death is told and counted in one place.
         self._remote = ray.remote(num_cpus=CPUS_PER_EPISODE, max_retries=0)(run_on_node)
         self._worker = None if worker is None else list(worker)
+        self._code_sha256 = code_sha256()
         self._running: dict[Any, str] = {}
         self._open = True
 
@@ -67,7 +70,8 @@ class ClusterJobs:
 
     def start(self, task: EpisodeTask) -> None:
         """Hand out a task."""
-        self._running[self._remote.remote(json.dumps(task.as_json()), self._worker)] = task.episode.id
+        reference = self._remote.remote(json.dumps(task.as_json()), self._code_sha256, self._worker)
+        self._running[reference] = task.episode.id
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
         """Tasks that have ended, with or without a result."""
@@ -104,8 +108,15 @@ class ClusterJobs:
         self._ray.shutdown()
 
 
-def run_on_node(task_json: str, worker: Sequence[str] | None) -> tuple[str, list[tuple[str, bytes]]]:
-    """Run a task in a process of this node; (what came of it as JSON, files by their path below the run's folder)."""
+def run_on_node(task_json: str, code: str, worker: Sequence[str] | None) -> tuple[str, list[tuple[str, bytes]]]:
+    """Run a task in a process of this node; (what came of it as JSON, files by their path below the run's folder).
+
+    `code`: the driver's `code_sha256`; with other code on this node the task is refused.
+    """
+    host = os.uname().nodename
+    if code_sha256() != code:
+        why = f"{host} has other code than where the run was started: install the same version on every node"
+        return json.dumps({"result": None, "why": why, "refused_code": EXIT_BAD_INPUT, "host": host}), []
     with tempfile.TemporaryDirectory(prefix="edge-bench-") as folder:
         for name in (EPISODES, VIDEOS):
             (Path(folder) / name).mkdir()
@@ -117,7 +128,7 @@ def run_on_node(task_json: str, worker: Sequence[str] | None) -> tuple[str, list
         "result": None if ended.result is None else ended.result.as_json(),
         "why": ended.why,
         "refused_code": ended.refused_code,
-        "host": os.uname().nodename,
+        "host": host,
     }
     return json.dumps(told), files
 

@@ -1,0 +1,23 @@
+"""Which code computes an episode: a hash of its source and data files, finer than a package's version."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import edge
+import firmware_bridge
+import sim_hil
+
+_SUFFIXES = frozenset((".py", ".toml", ".urdf", ".dbc"))
+
+
+def code_sha256() -> str:
+    """SHA-256 over the names and bytes of what `edge`, `firmware_bridge` and `sim_hil` consist of."""
+    digest = hashlib.sha256()
+    for package in (edge, firmware_bridge, sim_hil):
+        root = Path(package.__path__[0])
+        for path in sorted(path for path in root.rglob("*") if path.suffix in _SUFFIXES):
+            digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
