@@ -8,11 +8,13 @@ import tempfile
 from collections.abc import Iterator
 from math import cos, pi, radians, sin
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from sim_hil import world_renderer
 from sim_hil.camera import CameraWorld
 from sim_hil.people import RENDER_FIELDS
 from sim_hil.scene import load_scene
@@ -215,3 +217,14 @@ def test_the_wheeled_base_sees_from_its_mast_and_takes_its_own_state() -> None:
 def test_an_unknown_robot_is_refused_by_naming_the_known_ones() -> None:
     with pytest.raises(ValueError, match="carter"):
         CameraWorld(load_scene("corridor"), people=0, seed=0, robot="hovercraft")
+
+
+def test_without_its_system_library_the_renderer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    class NoPipes:
+        @staticmethod
+        def get_global_ptr() -> SimpleNamespace:
+            return SimpleNamespace(make_pipe=lambda _: None)
+
+    monkeypatch.setattr(world_renderer.core, "GraphicsPipeSelection", NoPipes)
+    with pytest.raises(world_renderer.RendererError, match="libx11-6"):
+        CameraWorld(load_scene("corridor"), people=0, seed=0)
