@@ -45,6 +45,7 @@ class Groups:
         self._followers = np.flatnonzero(crowd.leader >= 0)
         self._leaders = crowd.leader[self._followers]
         places = [_ABREAST[int(self.size[k])][int(crowd.place_in_group[k]) - 1] for k in self._followers]
+        self._radius = np.array([_CIRCLE_M[int(self.size[k])] for k in self._followers])
         self._slots = np.array(places, dtype=np.float64).reshape(-1, 2)
         self._furthest, self._waited_s = np.zeros(crowd.n), np.zeros(crowd.n)
         self.settled = np.zeros(crowd.n, dtype=np.bool_)  # followers who stand where they are while the others talk
@@ -74,7 +75,7 @@ class Groups:
 
         talks = crowd.doing[lead] == Doing.HOLD
         facing = np.where(talks, crowd.facing[lead], 0.0)
-        radius = np.array([_CIRCLE_M[int(size)] for size in self.size[who]])
+        radius = self._radius
         turn = facing + pi + 2 * pi * crowd.place_in_group[who] / self.size[who]
         middle_x = crowd.target_x[lead] + np.cos(facing) * radius
         middle_y = crowd.target_y[lead] + np.sin(facing) * radius

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import atan2, hypot, pi
+from math import atan2, hypot
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from sim_hil.crowd_groups import Groups
 from sim_hil.crowd_map import CrowdMap
 from sim_hil.crowd_senses import RobotSeen
 from sim_hil.crowd_spots import route_spots, spots_of
+from sim_hil.crowd_start import Start
 from sim_hil.crowd_state import Crowd, Doing
 from sim_hil.scene import Scene, Vec2
 
@@ -40,6 +41,7 @@ class Plans:
         ways.add_destinations([spot.reach for spot in self._spots])
         self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
         self._stop = np.array([_may_stop(scene, *spot.reach) for spot in self._spots])
+        self._ends = np.array([spot.kind != "way" for spot in self._spots])
         self._queues: dict[int, list[int]] = {k: [] for k, s in enumerate(self._spots) if s.kind == "queue"}
         self._taken: dict[tuple[int, int], int] = {}  # (spot, slot) -> person
         self._slot = np.full(crowd.n, -1, dtype=np.int64)
@@ -53,58 +55,21 @@ class Plans:
     def settle(self, scene: Scene, clear_m: float) -> None:
         """Place everybody, further than `clear_m` from the robot's start; raises ValueError when there is no room."""
         crowd, rng = self._crowd, self._rng
-        x, y, gaps = self._ways.walkable()
-        roomy = gaps >= min(0.4, float(gaps.max()))
-        far = np.hypot(x - scene.start[0], y - scene.start[1]) > clear_m
-        x, y = x[roomy & far], y[roomy & far]
+        start = Start(scene, clear_m, self._ways, crowd, rng)
         for person in range(crowd.n):
-            leader = int(crowd.leader[person])
-            if leader >= 0:
-                self._join(person, leader, x, y, scene)
+            together = int(self._groups.size[person]) > 1
+            if crowd.leader[person] >= 0:
+                start.beside(person, int(crowd.leader[person]))
             elif self._routes:
-                self._start_on_route(person, scene, clear_m)
-            elif int(self._groups.size[person]) > 1 or rng.uniform() < 0.45 or not self._start_at_spot(person, scene):
-                self._put(person, x, y, scene)
+                self._start_on_route(person, start)
+            elif together or rng.uniform() < 0.45 or not self._start_at_spot(person, start):
+                start.anywhere(person)
                 self._next(person)
-                if (
-                    self._groups.size[person] > 1
-                    and rng.uniform() < 0.45
-                    and self._roomy(person, _may_stop(scene, crowd.x[person], crowd.y[person]))
-                ):
+                allowed = _may_stop(scene, float(crowd.x[person]), float(crowd.y[person]))
+                if together and rng.uniform() < 0.45 and self._roomy(person, allowed):
                     self._hold(person, float(crowd.heading[person]), (5.0, 30.0))
-        crowd.like_x[:] = crowd.like_y[:] = 0.0
 
-    def _room(self, person: int, x: float, y: float, apart_m: float) -> bool:
-        crowd = self._crowd
-        if person == 0:
-            return True
-        return bool(np.min(np.hypot(crowd.x[:person] - x, crowd.y[:person] - y)) > apart_m)
-
-    def _put(self, person: int, x: np.ndarray, y: np.ndarray, scene: Scene) -> None:
-        crowd, rng = self._crowd, self._rng
-        for attempt in range(400 if len(x) else 0):
-            k = int(rng.integers(len(x)))
-            if self._room(person, float(x[k]), float(y[k]), 1.1 if attempt < 300 else 0.6):
-                crowd.x[person], crowd.y[person] = x[k], y[k]
-                crowd.heading[person] = rng.uniform(-pi, pi)
-                return
-        raise ValueError(f"people: no room for another person in scene {scene.name}")
-
-    def _join(self, person: int, leader: int, x: np.ndarray, y: np.ndarray, scene: Scene) -> None:
-        """Start beside the leader of one's group."""
-        crowd = self._crowd
-        distance = np.hypot(x - crowd.x[leader], y - crowd.y[leader])
-        near = np.flatnonzero((distance < 4.0) & (distance > 0.6))
-        for k in near[np.argsort(distance[near], kind="stable")]:
-            if self._room(person, float(x[k]), float(y[k]), 0.6):
-                crowd.x[person], crowd.y[person] = x[k], y[k]
-                break
-        else:
-            self._put(person, x, y, scene)
-        crowd.heading[person] = crowd.heading[leader]
-        crowd.doing[person] = Doing.FOLLOW
-
-    def _start_on_route(self, person: int, scene: Scene, clear_m: float) -> None:
+    def _start_on_route(self, person: int, start: Start) -> None:
         crowd, rng = self._crowd, self._rng
         for _ in range(300):
             route = int(rng.integers(len(self._routes)))
@@ -112,7 +77,7 @@ class Plans:
             leg, share = int(rng.integers(len(legs) - 1)), float(rng.uniform())
             (ax, ay), (bx, by) = self._spots[legs[leg]].reach, self._spots[legs[leg + 1]].reach
             x, y = ax + (bx - ax) * share, ay + (by - ay) * share
-            if hypot(x - scene.start[0], y - scene.start[1]) > clear_m and self._room(person, x, y, 1.1):
+            if start.fits(person, x, y):
                 crowd.x[person], crowd.y[person] = x, y
                 self._route[person], self._onwards[person] = route, 1 if rng.integers(2) else -1
                 ahead = leg + 1 if self._onwards[person] > 0 else leg
@@ -120,9 +85,9 @@ class Plans:
                 goal = self._spots[legs[ahead]].reach
                 crowd.heading[person] = atan2(goal[1] - y, goal[0] - x)
                 return
-        raise ValueError(f"people: no room for another person in scene {scene.name}")
+        raise start.no_room()
 
-    def _start_at_spot(self, person: int, scene: Scene) -> bool:
+    def _start_at_spot(self, person: int, start: Start) -> bool:
         """Be at a free place from the beginning, as if one had come before; false when none is found."""
         crowd, rng = self._crowd, self._rng
         for _ in range(6):
@@ -134,7 +99,7 @@ class Plans:
             if slot < 0:
                 continue
             x, y = what.slots[slot]
-            if hypot(x - scene.start[0], y - scene.start[1]) < 2.5 or not self._room(person, x, y, 0.6):
+            if not start.fits(person, x, y, apart_m=0.6):
                 continue
             crowd.x[person], crowd.y[person], crowd.heading[person] = x, y, what.heading_rad
             self._go(person, spot)
@@ -377,7 +342,7 @@ class Plans:
         dy = np.where(near, fy, np.where(roomy, sy - y, dy))
         norm = np.sqrt(dx * dx + dy * dy) + 1e-9
         pace = crowd.free_mps[who] * self._groups.patience(crowd)[who]
-        ends = np.array([spot.kind != "way" for spot in self._spots])[crowd.spot[who]]
+        ends = self._ends[crowd.spot[who]]
         pace = np.where(near & ends, np.minimum(pace, 0.35 + 0.6 * left), pace)
         return dx / norm * pace, dy / norm * pace
 
