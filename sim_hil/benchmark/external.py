@@ -66,6 +66,7 @@ class ExternalPolicy:
         self._command = (0.0, 0.0, 0.0)
         self._answer: tuple[tuple[float, float, float], dict[str, Any]] | None = None
         self._asked_ns = 0
+        self._seen_ns: int | None = None
         self._notes: dict[str, Any] = {}
         self.clipped = 0
         """Answers beyond the limits so far in this episode."""
@@ -108,6 +109,7 @@ class ExternalPolicy:
         self._sampler = None if self._latency is None else LatencySampler(self._latency, seed, episode.id)
         self._step, self._due_ns, self._asked_ns, self.clipped = 0, 0, 0, 0
         self._command, self._answer, self._notes = (0.0, 0.0, 0.0), None, {}
+        self._seen_ns = None
         self._channel.send(
             {
                 "type": "reset",
@@ -125,19 +127,20 @@ class ExternalPolicy:
         """The command in force after this observation."""
         now_ns = round(observation.time_s * 1e9)
         if self._answer is not None and now_ns >= self._due_ns:
-            self._take(now_ns)
+            self._take()
         if self._answer is None:
             delay_ns = 0 if self._sampler is None else self._sampler.draw().total_ns
             self._answer, self._asked_ns, self._due_ns = self._ask(observation), now_ns, now_ns + delay_ns
             if delay_ns == 0:
-                self._take(now_ns)
+                self._take()
+        if self._seen_ns is not None:
+            self._notes = {**self._notes, "delay_s": (now_ns - self._seen_ns) / 1e9}
         return self._command
 
-    def _take(self, now_ns: int) -> None:
+    def _take(self) -> None:
         if self._answer is not None:
-            self._command, notes = self._answer
-            self._notes = {**notes, "delay_s": (now_ns - self._asked_ns) / 1e9}
-            self._answer = None
+            self._command, self._notes = self._answer
+            self._seen_ns, self._answer = self._asked_ns, None
 
     def _ask(self, observation: Observation) -> tuple[tuple[float, float, float], dict[str, Any]]:
         peer = self._channel.peer
@@ -173,7 +176,7 @@ class ExternalPolicy:
         return cut
 
     def notes(self) -> dict[str, Any]:
-        """Age of the command in force when it came into force, the server's text and waypoints."""
+        """Age of the observation behind the command in force, the server's text and waypoints."""
         return {**self._notes, "clipped": self.clipped}
 
     def close(self) -> None:
