@@ -46,6 +46,7 @@ from sim_hil.benchmark.progress import BenchProgress
 from sim_hil.benchmark.report import write_report
 from sim_hil.benchmark.store import ResultStore, StoreError
 from sim_hil.benchmark.task import VIDEO_CHOICES
+from sim_hil.realtime.episode import check_realtime, drivable
 from sim_hil.scene import SceneError
 
 EXAMPLES = """examples:
@@ -54,6 +55,7 @@ EXAMPLES = """examples:
   edge-bench --suite dynanav --policy artifacts:out/nano --latency profile:flight.mcap --drift severe --json -
   edge-bench --suite dynanav --policy external:127.0.0.1:7001 --latency 1.5 --video failed --out out/theirs
   edge-bench --suite dynanav --policy expert --cluster 10.0.0.5:6379 --out out/expert
+  edge-bench --suite dynanav --policy artifacts:out/nano --clock realtime --out out/here    # this machine's latency
   edge-bench compare out/nano-2s out/nano-5s      # paired differences with intervals
   edge-bench report out/nano-2s                   # write report.html again
   edge-bench validate --help                      # check a suite: goals reachable, landmarks visible
@@ -83,7 +85,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--suite", required=True, metavar="NAME|FILE", help=f"one of: {', '.join(suite_names())}; or a file")
     p.add_argument("--episodes", action="append", default=[], metavar="GLOB", help="ids to run; may be repeated")
     p.add_argument("--policy", required=True, metavar="P", help=f"artifacts:DIR, external:ADDR, {', '.join(BASELINES)}")
-    p.add_argument("--clock", choices=CLOCKS, default="lockstep", help="default lockstep: virtual time, deterministic")
+    p.add_argument(
+        "--clock", choices=CLOCKS, default="lockstep",
+        help="lockstep (default): virtual time, deterministic; realtime: edge-hil, edge-bridge and edge-run, go2 only",
+    )  # fmt: skip
     p.add_argument("--mode", choices=MODES, help="of a policy from artifacts (default async)")
     p.add_argument(
         "--latency", metavar="S|profile:FILE",
@@ -155,7 +160,15 @@ def _run(args: argparse.Namespace) -> int:
     if args.out is None and (args.resume or args.video != "none"):
         raise ConditionsError("--resume and --video: expected --out DIR with them")
     conditions = conditions_of(args)
-    run = BenchRun.plan(args.suite, choose(load_suite(args.suite), args.episodes), conditions)
+    episodes, skipped = choose(load_suite(args.suite), args.episodes), []
+    if conditions.clock == "realtime":
+        check_realtime(conditions, jobs=args.jobs, cluster=args.cluster is not None, video=args.video)
+        episodes, skipped = drivable(episodes)
+        if skipped:
+            _complain(f"{len(skipped)} episodes skipped: edge-bridge drives no other robot than the go2", EXIT_DONE)
+        if not episodes:
+            raise ConditionsError("--clock realtime: expected an episode of the go2 among --episodes, found none")
+    run = BenchRun.plan(args.suite, episodes, conditions)
     started_ns = time.monotonic_ns()
     with _directory(args.out) as folder, stop_flag() as stop:
         backend, store = _backend(args), None
@@ -168,6 +181,7 @@ def _run(args: argparse.Namespace) -> int:
             if store is not None:
                 store.close()
         result = bench_result(run, store, finished=finished, started_ns=started_ns)
+        result["skipped"] = skipped
         _tell(args, store, result)
     if not finished:
         again = f"; continue with --resume --out {args.out}" if args.out is not None else ""
