@@ -23,7 +23,7 @@ STEP_S: Final = 0.2
 STEPS: Final = 20
 CONTROL_S: Final = 0.1
 PERSON_M: Final = 0.5  # the benchmark's collision distance, centre to centre
-_SHIFTS_M: Final = (0.0, 0.35, -0.35, 0.7, -0.7, 1.1, -1.1, 1.6, -1.6)
+_SHIFTS_M: Final = (0.0, 0.18, -0.18, 0.4, -0.4, 0.7, -0.7, 1.1, -1.1, 1.6, -1.6)
 _SIDES: Final = np.array(_SHIFTS_M)
 _PACES: Final = (1.0, 0.75, 0.5, 0.25)
 # Futures that do not follow the way: share of the top speed, share of the top turning rate.
@@ -196,8 +196,9 @@ class Motion:
         gaps = np.minimum(np.sqrt(dx * dx + dy * dy) - PERSON_M, nose - (driving.body_radius_m + PERSON_RADIUS_M))
         # Nobody walks exactly as foreseen, least of all somebody who walks fast.
         unsure = 0.05 * self._times[:, None] * np.minimum(np.hypot(velocities[:, 0], velocities[:, 1]), 1.5)
-        margin_m = driving.margin_m * max(patience, 0.4)
-        room = gaps - (margin_m + np.minimum(unsure, 0.25))[:, :, None]
+        # The slower, the nearer it may pass; and so it may who has waited long.
+        margin_m = driving.margin_m * max(patience, 0.4) * (0.4 + 0.6 * _within(np.abs(v) / 0.8, 1.0))
+        room = gaps - margin_m[:, None, :] - np.minimum(unsure, 0.25)[:, :, None]
         hit = _within(-room / 0.25, 2.5)
         near = _within(1.0 - room / (driving.comfort_m * patience), 1.0)
         # People walk round a robot that stands: running into it is up to them. Into one that drives, less so.

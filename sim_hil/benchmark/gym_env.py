@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import hypot
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -35,7 +35,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     and holds the `outcome` once it is over. The reward is the paper's equation 5 with the straight distance.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium types it
 
     def __init__(
         self,
