@@ -34,7 +34,6 @@ _PACKAGES = (
     "pybullet",
     "panda3d",
     "scipy",
-    "pyrvo",
     "onnxruntime",
     "opencv-python-headless",
 )
