@@ -233,7 +233,9 @@ def _step(scene: Scene, grid: NavGrid, before: _Leg, after: _Leg, first: bool) -
     if ahead < -0.5:
         raise RouteError("the way turns back")
     side = "left" if turn > 0.5 else "right" if turn < -0.5 else "straight"
-    ordinal, at_end, near, passed = 0, False, (), ()
+    ordinal, at_end = 0, False
+    near: tuple[Passed, ...] = ()
+    passed: tuple[Passed, ...] = ()
     start = before.frame.along(before.start)
     if before.kind in LINEAR:
         limit = before.frame.along(after.start)
