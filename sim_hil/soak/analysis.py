@@ -57,11 +57,6 @@ class LifeData:
     delay_error_ms_max: float | None = None
     dropped: int = 0
 
-    @property
-    def period_ns(self) -> int:
-        """Of the control thread."""
-        return 100_000_000
-
 
 def read_life(path: Path, result: Path, run: int) -> LifeData | None:
     """One runner's numbers; None when it never drove (no log)."""
@@ -118,8 +113,9 @@ class TraceData:
     command_gap_ms: Array
     command_ns: NDArray[np.int64]
     people_gap_m: list[tuple[int, float]]
+    contacts: list[tuple[int, str]]
+    """When the robot began to touch what."""
     end: dict[str, Any]
-    footprints: list[dict[str, Any]]
 
 
 def read_trace(path: Path) -> TraceData:
@@ -128,13 +124,16 @@ def read_trace(path: Path) -> TraceData:
     poses: list[tuple[float, float, float]] = []
     sent: list[int] = []
     near: list[tuple[int, float]] = []
+    contacts: list[tuple[int, str]] = []
+    touched: set[str] = set()
     end: dict[str, Any] = {}
-    footprints: list[dict[str, Any]] = []
     for line in read_lines(path):
         kind = line.get("kind")
         if kind == "pose":
             stamps.append(line["t_ns"])
             poses.append((line["x"], line["y"], line["theta"]))
+            contacts += [(line["t_ns"], label) for label in line["touching"] if label not in touched]
+            touched = set(line["touching"])
         elif kind == "wire" and line["name"] in ("Move", "StopMove") and line["service"] == "sport":
             # Stamped by the bridge as it sends: when this side has time to look is not its doing.
             sent.append(int(line["request_id"]))
@@ -143,8 +142,6 @@ def read_trace(path: Path) -> TraceData:
             near.append((line["t_ns"], min(hypot(p[0] - x, p[1] - y) for p in line["poses"])))
         elif kind == "end":
             end = line
-        elif kind == "scene":
-            footprints = line["footprints"]
     at = np.array(sent, np.int64)
     gaps = np.diff(at)
     kept = (gaps > _REPEAT_NS / 4) & (gaps < _WIRE_GAP_NS)
@@ -154,8 +151,8 @@ def read_trace(path: Path) -> TraceData:
         gaps[kept] / 1e6,
         at[1:][kept] if len(at) else at,
         near,
+        contacts,
         end,
-        footprints,
     )
 
 
@@ -252,6 +249,7 @@ def analyse(folder: Path) -> dict[str, Any]:
         "command_ns": [int(t) for t in trace.command_ns],
         "truth": [[int(t), *(round(float(v), 3) for v in pose)] for t, pose in _each(trace, 5)],
         "nearest_person": _nearest(trace),
+        "contacts": trace.contacts,
     }
     write_whole(folder / ANALYSIS, json.dumps(analysis) + "\n")
     return analysis

@@ -31,11 +31,16 @@ from sim_hil.soak import budget as budgets
 from sim_hil.soak import schedule
 from sim_hil.soak.budget import FAIL, BudgetLine
 from sim_hil.soak.measures import names
+from sim_hil.soak.moments import keep_moments
+from sim_hil.soak.report import write_report
 from sim_hil.soak.schedule import FaultMenu, SoakInputError
 from sim_hil.soak.soak_run import SoakFolder, SoakOptions, run_legs, soak_result
 
 MODES: Final = ("async", "sync", "no-reasoning")
 PLAIN_S: Final = 30.0
+UNTRAINED_MPS: Final = 0.14
+"""Untrained weights drive into walls. Below 0.2 m/s (edge.odometry_gate) that does not end the run for good, so that
+the runner lives long enough to show whether it grows."""
 _UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 EXAMPLES = """examples:
@@ -69,7 +74,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="of edge-run (default 0)")
     p.add_argument("--odometry-noise", choices=tuple(LEVELS), default="none", help="of edge-hil (default none)")
     p.add_argument(
-        "--speed-limit", type=float, metavar="MPS", help="forward, instead of the robot file's (untrained: slowly)"
+        "--speed-limit",
+        type=float,
+        metavar="MPS",
+        help=f"forward (default: the robot file's; untrained: {UNTRAINED_MPS})",
     )
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: one that is free)")
     p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
@@ -101,13 +109,16 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except (SoakInputError, SceneError, ValueError, OSError) as error:
         return _complain(error, EXIT_BAD_INPUT)
     if not options.trained:
-        _say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
+        _say(
+            "the weights of these artifacts are untrained: the robot will move, it will not navigate; "
+            f"speed limit {options.speed_mps:g} m/s"
+        )
     with stop_signals() as stop:
         progress, failure = _Progress(), ""
         try:
             finished = run_legs(
                 soak, options, menu, stopped=lambda: bool(stop), tell=progress.tell, say=progress.say,
-                keep_logs=args.keep_logs, commands=commands,
+                keep_logs=args.keep_logs, commands=commands, after_leg=keep_moments,
             )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
@@ -128,6 +139,8 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
     for scene in scenes:
         load_scene(scene)
     limit_mps = args.speed_limit
+    if limit_mps is None and not artifacts.trained:
+        limit_mps = UNTRAINED_MPS
     if limit_mps is not None and not 0.02 <= limit_mps <= 2.0:
         raise SoakInputError(f"--speed-limit: expected 0.02 to 2 m/s, found {limit_mps}")
     return SoakOptions(
@@ -164,6 +177,7 @@ def _write(
 ) -> None:
     write_result(str(soak.path / "result.json"), result)
     write_result(args.json, result)
+    _say(str(write_report(soak, result)))
     if args.json != "-":
         sys.stdout.write(summary_lines(result))
 

@@ -102,7 +102,9 @@ class Leg:
             except _StoppedError:
                 why = "stopped"
             self._end_task("cut")
-            self._note("life_end", run=self._stack.runs, code=self._stack.end_runner(), cause="leg", explained="leg")
+            if self._stack.runner is not None:
+                code = self._stack.end_runner()
+                self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
             self._stack.end_bridge()
             self._stack.end_robot()
             self._note("leg_end", why=why)
@@ -172,16 +174,16 @@ class Leg:
     def _life_over(self) -> bool:
         """Count a runner that has ended by itself; True when the robot has got stuck."""
         self._look()
+        explained = self._explanation()
+        during = None if self._injector is None else self._injector.active
         self._end_task("stopped")
         bridge = self._stack.bridge
         bridge_died = bridge is not None and not bridge.running
         code = self._stack.end_runner()  # it may take a moment longer when its bridge was killed
         self._stack.end_bridge()
         cause = _last_fault(self._stack.result(f"edge-run-{self._stack.runs}"))
-        explained = self._explanation()
-        self._note(
-            "life_end", run=self._stack.runs, code=code, cause=cause, explained=explained, bridge_died=bridge_died
-        )
+        about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
+        self._note("life_end", run=self._stack.runs, code=code, **about)
         self.stops += 1
         if self._injector is not None:
             self._injector.clear()
@@ -193,10 +195,12 @@ class Leg:
         return len(last) == STUCK_LIVES and all(hypot(x - last[-1][0], y - last[-1][1]) < STUCK_M for x, y in last)
 
     def _explanation(self) -> str:
-        """What a stop is put down to: a fault that was injected, a contact, or nothing ("")."""
+        """What a stop is put down to: a fault that should end the run, a contact, or nothing ("")."""
         now_ns, injector = time.monotonic_ns(), self._injector
-        if injector is not None and injector.newest is not None and now_ns - injector.newest_ns < FAULT_AFTER_NS:
-            return injector.newest.fault.name
+        newest = None if injector is None else injector.newest
+        stops = newest is not None and newest.fault.expect == "stop"
+        if injector is not None and newest is not None and stops and now_ns - injector.newest_ns < FAULT_AFTER_NS:
+            return newest.fault.name
         return "contact" if now_ns - self._touched_ns < FAULT_AFTER_NS else ""
 
     def _next_task(self) -> SoakTask | None:

@@ -1,0 +1,186 @@
+"""The soak report's pictures: analyses and samples in, PNG bytes out. Time is the soak's, leg after leg."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from sim_hil.report_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
+from sim_hil.scene import Scene
+from sim_hil.scene_map import draw_map, draw_mark, draw_path, map_view
+from sim_hil.soak.measures import BRIDGE_PERIOD_MS, MIB
+
+Array = NDArray[np.float64]
+Analysis = Mapping[str, Any]
+Samples = Sequence[Mapping[str, Any]]
+
+WINDOWS: Final = 150
+_COLOURS: Final = {"edge-run": TRUTH, "edge-bridge": COMMAND, "edge-hil": MUTED}
+_MAP_PX: Final = 1400
+_PATH, _GOAL, _REACHED, _STOP, _FAULT = (31, 111, 139), (107, 119, 133), (44, 140, 74), (179, 38, 30), (230, 140, 20)
+
+
+def offsets_s(legs: Sequence[Analysis]) -> list[float]:
+    """When each leg began, s of the soak."""
+    return [float(sum(leg["elapsed_s"] for leg in legs[:index])) for index in range(len(legs))]
+
+
+def _minutes(leg: Analysis, offset_s: float, stamps_ns: Sequence[int]) -> Array:
+    return (np.array(stamps_ns, float) - leg["begin_ns"]) / 6e10 + offset_s / 60
+
+
+def timing(legs: Sequence[Analysis]) -> bytes:
+    """Ticks, semantic delay, generations and the bridge's jitter over time; orange: a fault was in force."""
+    figure = new_figure(11.0, 8.4)
+    axes = figure.subplots(4, 1, sharex=True)
+    columns: list[list[tuple[Array, Array]]] = [[], [], [], []]
+    for leg, offset_s in zip(legs, offsets_s(legs), strict=True):
+        for life in leg["lives"]:
+            at = _minutes(leg, offset_s, life["tick_ns"])
+            columns[0].append((at, np.array(life["tick_ms"], float)))
+            columns[1].append((at, np.array([np.nan if v is None else v for v in life["delay_s"]], float)))
+            columns[2].append((_minutes(leg, offset_s, life["ready_ns"]), np.array(life["generation_ms"], float)))
+        jitter = np.abs(np.array(leg["command_gap_ms"], float) - BRIDGE_PERIOD_MS)
+        columns[3].append((_minutes(leg, offset_s, leg["command_ns"]), jitter))
+    labels = ("tick, ms", "Δt, s", "generation, ms", "bridge jitter, ms")
+    for each, label, data in zip(axes, labels, columns, strict=True):
+        _over_time(each, data)
+        _mark(each, legs)
+        each.set_ylabel(label, fontsize=9)
+        each.set_ylim(bottom=0)
+        tidy(each)
+    legend_above(axes[0])
+    axes[-1].set_xlabel("minutes of the soak", fontsize=9)
+    return png(figure)
+
+
+def _over_time(axes: Axes, data: Sequence[tuple[Array, Array]]) -> None:
+    """Median and worst of windows, all lives together."""
+    at = np.concatenate([times for times, _ in data]) if data else np.array([])
+    values = np.concatenate([each for _, each in data]) if data else np.array([])
+    good = np.isfinite(values)
+    at, values = at[good], values[good]
+    if not len(at):
+        return
+    edges = np.linspace(0, at.max() + 1e-9, WINDOWS + 1)
+    where = np.digitize(at, edges) - 1
+    windows = [(edges[w] + edges[1] / 2, values[where == w]) for w in np.unique(where)]
+    middle = [t for t, _ in windows]
+    axes.plot(middle, [each.max() for _, each in windows], color=BAD, linewidth=0.9, label="worst of a window")
+    axes.plot(middle, [np.median(each) for _, each in windows], color=INK, linewidth=1.2, label="median")
+
+
+def _mark(axes: Axes, legs: Sequence[Analysis]) -> None:
+    for leg, offset_s in zip(legs, offsets_s(legs), strict=True):
+        axes.axvline(offset_s / 60, color=MUTED, linewidth=0.8, linestyle=":")
+        for fault in leg["faults"]:
+            span = _minutes(leg, offset_s, [fault["t_ns"], fault["end_ns"] or fault["t_ns"]])
+            axes.axvspan(span[0], max(span[1], span[0] + 0.01), color="#f2b84b", alpha=0.45, linewidth=0)
+        for end in leg["life_ends"]:
+            if end["cause"] != "leg":
+                axes.axvline(_minutes(leg, offset_s, [end["t_ns"]])[0], color=BAD, linewidth=0.8, alpha=0.6)
+
+
+def processes(legs: Sequence[Analysis], samples: Sequence[Samples]) -> bytes:
+    """Memory, descriptors and CPU of each process over time."""
+    figure = new_figure(11.0, 6.4)
+    axes = figure.subplots(3, 1, sharex=True)
+    panels = (
+        ("rss_bytes", MIB, "memory (RSS), MiB"),
+        ("fds", 1.0, "descriptors"),
+        ("cpu_percent", 1.0, "CPU, % of a core"),
+    )
+    for each, (key, unit, label) in zip(axes, panels, strict=True):
+        for name, colour in _COLOURS.items():
+            shown = name
+            for at, values in _lives(legs, samples, name, key, unit):
+                each.plot(at, values, color=colour, linewidth=1.0, label=shown)
+                shown = "_"
+        each.set_ylabel(label, fontsize=9)
+        each.set_ylim(bottom=0)
+        tidy(each)
+    legend_above(axes[0])
+    axes[-1].set_xlabel("minutes of the soak", fontsize=9)
+    return png(figure)
+
+
+def _lives(
+    legs: Sequence[Analysis], samples: Sequence[Samples], name: str, key: str, unit: float
+) -> Iterator[tuple[Array, Array]]:
+    for offset_s, leg in zip(offsets_s(legs), samples, strict=True):
+        lives: dict[int, list[tuple[float, float]]] = {}
+        for sample in leg:
+            row = sample["processes"].get(name)
+            if row is not None:
+                lives.setdefault(row["pid"], []).append(((offset_s + sample["elapsed_s"]) / 60, row[key] / unit))
+        for life in lives.values():
+            at, values = np.array(life).T
+            yield at, values
+
+
+def histograms(legs: Sequence[Analysis]) -> bytes:
+    """Ticks and the bridge's jitter: how often, on a scale on which one of a hundred thousand still shows."""
+    figure = new_figure(11.0, 3.1)
+    ticks = [v for leg in legs for life in leg["lives"] for v in life["tick_ms"]]
+    gaps = [abs(v - BRIDGE_PERIOD_MS) for leg in legs for v in leg["command_gap_ms"]]
+    panels = ((ticks, "tick: deadline to command sent, ms", TRUTH), (gaps, "bridge: |gap − 20 ms|, ms", COMMAND))
+    for axes, (values, label, colour) in zip(figure.subplots(1, 2), panels, strict=True):
+        if values:
+            axes.hist(values, bins=80, color=colour, log=True)
+        axes.set_xlabel(label, fontsize=9)
+        axes.set_ylabel("times", fontsize=9)
+        tidy(axes)
+    return png(figure)
+
+
+def drift_and_battery(legs: Sequence[Analysis]) -> bytes:
+    """Odometry's error over ten seconds against the path in them, and the battery as the robot reports it."""
+    figure = new_figure(11.0, 3.1)
+    left, right = figure.subplots(1, 2)
+    segments = [segment for leg in legs for segment in leg["drift"]]
+    if segments:
+        left.scatter([path for _, path in segments], [100 * e for e, _ in segments], s=10, color=PERSON, linewidths=0)
+    left.set_xlabel("path in 10 s, m (ground truth)", fontsize=9)
+    left.set_ylabel("error of the estimate, cm", fontsize=9)
+    for leg, offset_s in zip(legs, offsets_s(legs), strict=True):
+        for life in leg["lives"]:
+            rows = [(t, soc) for t, soc in life["battery"] if soc is not None]
+            if rows:
+                right.plot(_minutes(leg, offset_s, [t for t, _ in rows]), [soc for _, soc in rows], color=TRUTH)
+    right.set_xlabel("minutes of the soak", fontsize=9)
+    right.set_ylabel("battery, % (the simulated robot's)", fontsize=9)
+    for axes in (left, right):
+        axes.set_ylim(bottom=0)
+        tidy(axes)
+    return png(figure)
+
+
+def leg_map(scene: Scene, leg: Analysis) -> bytes:
+    """The leg's true path: green rings reached goals, grey rings others, orange dots faults, red dots stops."""
+    span_m = max(scene.floor_max_m[0] - scene.floor_min_m[0], 1.0)
+    px_per_m = min(40.0, _MAP_PX / (span_m + 1))
+    image, view = draw_map(scene, px_per_m, names=True), map_view(scene, px_per_m)
+    truth = leg["truth"]
+    draw_path(image, view, [(x, y) for _, x, y, _ in truth], _PATH, 3)
+    reached = {task["number"] for task in leg["tasks"] if task["success"]}
+    for begin in leg["task_begins"]:
+        task = begin["task"]
+        colour = _REACHED if task["number"] in reached else _GOAL
+        draw_mark(image, view, (task["goal_xy"][0], task["goal_xy"][1]), colour, 0.45, filled=False)
+    if truth:
+        stamps = np.array([row[0] for row in truth], float)
+        marks = [(fault["t_ns"], _FAULT) for fault in leg["faults"]]
+        marks += [(end["t_ns"], _STOP) for end in leg["life_ends"] if end["cause"] != "leg"]
+        for t_ns, colour in marks:
+            _, x, y, _ = truth[int(np.argmin(np.abs(stamps - t_ns)))]
+            draw_mark(image, view, (x, y), colour, 0.14)
+        draw_mark(image, view, (truth[0][1], truth[0][2]), _PATH, 0.22)
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise ValueError(f"map of {scene.name}: cannot be written as PNG")
+    return bytes(data.tobytes())
