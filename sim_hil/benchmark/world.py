@@ -40,7 +40,7 @@ class WorldOptions:
 
     camera: tuple[int, int] | None = None
     drift: str = "none"
-    rate_hz: int = 240
+    rate_hz: int = 480  # at 240 the Go2 fell once in half an hour of random commands, at 480 never in an hour
 
     def __post_init__(self) -> None:
         if self.camera is not None and not all(16 <= size <= MAX_PIXELS for size in self.camera):
