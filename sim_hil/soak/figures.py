@@ -125,11 +125,11 @@ def _lives(
 
 def histograms(legs: Sequence[Analysis]) -> bytes:
     """Ticks and the bridge's jitter: how often, on a scale on which one of a hundred thousand still shows."""
-    figure = new_figure(11.0, 3.1)
+    figure = new_figure(5.4, 4.2)
     ticks = [v for leg in legs for life in leg["lives"] for v in life["tick_ms"]]
     gaps = [abs(v - BRIDGE_PERIOD_MS) for leg in legs for v in leg["command_gap_ms"]]
     panels = ((ticks, "tick: deadline to command sent, ms", TRUTH), (gaps, "bridge: |gap − 20 ms|, ms", COMMAND))
-    for axes, (values, label, colour) in zip(figure.subplots(1, 2), panels, strict=True):
+    for axes, (values, label, colour) in zip(figure.subplots(2, 1), panels, strict=True):
         if values:
             axes.hist(values, bins=80, color=colour, log=True)
         axes.set_xlabel(label, fontsize=9)

@@ -46,8 +46,10 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
                 "stopped for good; dotted: a new leg.",
                 wide=True,
             ),
+            '<div class="pair">',
             page.figure(figures.histograms(soak.legs), "Histograms of ticks and jitter", "All ticks and commands."),
             page.figure(delay_histogram(np.array(delays, float)), "Histogram of the delay", "Δt of all ticks."),
+            "</div>",
         ]
     if any(samples):
         parts += [
