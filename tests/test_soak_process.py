@@ -1,0 +1,212 @@
+"""One short soak with the real processes, and everything that is made of what it recorded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from sim_hil.realtime.truth import read_lines
+from sim_hil.scene import Vec3
+from sim_hil.soak import cli
+from sim_hil.soak.analysis import ANALYSIS
+from sim_hil.soak.journey import Journey, SoakTask
+from sim_hil.soak.leg import EVENTS, SAMPLES
+from sim_hil.soak.measures import measures
+from sim_hil.soak.soak_run import SoakFolder
+
+DURATION_S = 30
+FAULTS = """
+format = 1
+gap_s = [2.0, 3.0]
+[[faults]]
+name = "camera stops"
+inject = "camera-stop"
+for_s = [1.2, 1.5]
+weight = 1.0
+fault = "camera-stopped"
+expect = "zero"
+"""
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """A finished soak: its command, folder and exit code."""
+
+    arguments: list[str]
+    folder: Path
+    code: int
+
+    @property
+    def leg(self) -> Path:
+        return self.folder / "legs" / "001"
+
+    @property
+    def result(self) -> dict[str, Any]:
+        return dict(json.loads((self.folder / "result.json").read_text(encoding="utf-8")))
+
+    def events(self, kind: str) -> list[dict[str, Any]]:
+        return [event for event in read_lines(self.leg / EVENTS) if event["kind"] == kind]
+
+
+def hurried(draw: Callable[[Journey, Vec3], SoakTask | None]) -> Callable[[Journey, Vec3], SoakTask | None]:
+    """Tasks that are over after four seconds, so that a short soak has several."""
+
+    def hurry(journey: Journey, at: Vec3) -> SoakTask | None:
+        task = draw(journey, at)
+        return None if task is None else replace(task, timeout_s=4.0)
+
+    return hurry
+
+
+@pytest.fixture(scope="module")
+def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soaked:
+    folder = tmp_path_factory.mktemp("soak")
+    faults = folder / "faults.toml"
+    faults.write_text(FAULTS, encoding="utf-8")
+    arguments = ["--artifacts", str(artifacts_dir), "--duration", f"{DURATION_S}s", "--leg", "10m", "--scene", "office"]
+    arguments += ["--people", "2", "--faults", str(faults), "--out", str(folder / "out"), "--json", "-"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Journey, "next", hurried(Journey.next))
+        code = cli.main(arguments)
+    return Soaked(arguments, folder / "out", code)
+
+
+def test_it_ends_by_itself_and_leaves_no_process(soaked: Soaked) -> None:
+    assert soaked.code in (0, 1) and soaked.result["finished"]
+    lines = [" ".join(process.info["cmdline"] or []) for process in psutil.process_iter(["cmdline"])]
+    assert not [line for line in lines if str(soaked.folder) in line]
+
+
+def test_tasks_follow_each_other_without_a_new_runner(soaked: Soaked) -> None:
+    begun = [(event["run"], event["task"]["instruction"]) for event in soaked.events("task_begin")]
+    assert len(begun) >= 2 and begun[0][0] == begun[1][0] and begun[0][1] != begun[1][1]
+
+
+def test_the_runner_has_taken_every_instruction(soaked: Soaked) -> None:
+    assert soaked.events("not_told") == []
+    log = (soaked.leg / "edge-run-1.log").read_text(encoding="utf-8")
+    for event in soaked.events("task_begin")[1:2]:
+        assert f"new instruction: {event['task']['instruction']}" in log
+
+
+def test_a_fault_takes_effect_and_the_runner_answers_it(soaked: Soaked) -> None:
+    assert soaked.events("fault_effect")
+    leg = json.loads((soaked.leg / ANALYSIS).read_text(encoding="utf-8"))
+    ended = [fault for fault in leg["faults"] if fault["end_ns"] is not None]
+    assert ended and all(fault["raised_ns"] is not None for fault in ended)
+
+
+def test_every_second_has_its_sample(soaked: Soaked) -> None:
+    samples = list(read_lines(soaked.leg / SAMPLES))
+    assert len(samples) >= 0.5 * DURATION_S  # a busy machine may skip some
+    assert {"edge-hil", "edge-bridge", "edge-run"} <= set(samples[-1]["processes"])
+    assert samples[-1]["processes"]["edge-run"]["rss_bytes"] > 50e6 and samples[-1]["pose"] is not None
+
+
+def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
+    found = soaked.result["measures"]
+    assert found["tick_ms.p999"]["count"] > 50 and found["delay_s.p50"]["value"] > 0
+    assert found["bridge_jitter_ms.p50"]["count"] > 250 and found["bridge_jitter_ms.p50"]["value"] < 20
+
+
+def test_slopes_of_so_short_a_life_are_undecided(soaked: Soaked) -> None:
+    lines = {line["measure"]: line for line in soaked.result["budget"]}
+    assert lines["memory_slope_mib_per_h.edge-run"]["verdict"] == "UNDECIDED"
+
+
+def test_the_result_has_the_keys_of_edge_run(soaked: Soaked) -> None:
+    result = soaked.result
+    assert {"ticks", "missed", "tick_ms"} <= set(result["control"])
+    assert set(result["delay_s"]) == {"p50", "p99", "max"} and set(result["power_w"]) == {"mean", "p99", "source"}
+
+
+def test_the_report_is_one_page_without_loads(soaked: Soaked) -> None:
+    text = (soaked.folder / "report.html").read_text(encoding="utf-8")
+    assert "untrained" in text and "camera stops" in text and "data:image/gif" in text
+    assert "<script" not in text and 'src="http' not in text
+
+
+def test_flight_logs_are_deleted_once_they_are_read(soaked: Soaked) -> None:
+    assert list(soaked.leg.glob("*.mcap")) == []
+
+
+def test_a_second_soak_does_not_overwrite_the_first(soaked: Soaked, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(soaked.arguments) == 2
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_resumed_when_it_is_over_there_is_nothing_left_to_do(soaked: Soaked) -> None:
+    before = soaked.result["measures"]
+    assert cli.main([*soaked.arguments, "--resume"]) == soaked.code
+    assert soaked.result["measures"] == before
+
+
+def test_resumed_with_other_options_is_refused(soaked: Soaked, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*soaked.arguments, "--resume", "--people", "3"]) == 2
+    assert "people" in capsys.readouterr().err
+
+
+def test_what_a_killed_soak_had_written_is_counted(soaked: Soaked, tmp_path: Path) -> None:
+    copy = tmp_path / "out"
+    shutil.copytree(soaked.folder, copy)
+    (copy / "legs" / "001" / ANALYSIS).unlink()
+    samples = copy / "legs" / "001" / SAMPLES
+    samples.write_text(samples.read_text(encoding="utf-8")[:-40], encoding="utf-8")  # cut in the last line
+    (copy / "legs" / "002").mkdir()  # killed before its first second
+    soak = SoakFolder.open(copy)
+    assert len(soak.legs) == 1 and 0 < soak.elapsed_s <= DURATION_S + 1
+    assert measures(soak.legs, soak.samples())["cpu_percent.edge-run.mean"].value is not None
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1.5h", 5400), ("1d", 86_400), ("45", 45)])
+def test_times_are_written_as_people_do(text: str, seconds: float) -> None:
+    assert cli.parse_seconds(text) == seconds
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (["--duration", "1s"], "--duration"),
+        (["--leg", "1s"], "--leg"),
+        (["--scene", "nowhere"], "nowhere"),
+        (["--faults", "absent.toml"], "absent.toml"),
+        (["--budget", "absent.toml"], "absent.toml"),
+        (["--speed-limit", "9"], "--speed-limit"),
+        (["--people", "-1"], "--people"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_starts(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: list[str], named: str
+) -> None:
+    arguments = ["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(tmp_path / "out"), *change]
+    assert cli.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_artifacts_that_are_none_are_refused(tmp_path: Path) -> None:
+    assert cli.main(["--artifacts", str(tmp_path), "--duration", "1m", "--out", str(tmp_path / "out")]) == 3
+
+
+def test_ctrl_c_writes_the_report_of_what_there_is(artifacts_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "sim_hil.soak.cli", "--artifacts", str(artifacts_dir), "--duration", "1h"]
+    samples = out / "legs" / "001" / SAMPLES
+    with subprocess.Popen([*command, "--scene", "office", "--people", "0", "--out", str(out)]) as process:
+        while process.poll() is None and not (samples.exists() and samples.stat().st_size > 0):
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert not result["finished"] and (out / "report.html").exists()
