@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, isnan
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -24,7 +24,10 @@ UNSUPPORTED: Final = int(common.MAV_RESULT_UNSUPPORTED)
 
 @dataclass(frozen=True)
 class Command:
-    """One command as it came; `params` are param1..param7, COMMAND_INT's x and y among them."""
+    """One command as it came; `params` are param1..param7, COMMAND_INT's x and y among them.
+
+    A NaN says that a parameter is not used (MAVSDK sends it for all the rest), which is 0 for every command here.
+    """
 
     number: int
     params: tuple[float, ...]
@@ -32,10 +35,12 @@ class Command:
     @staticmethod
     def of(message: Message) -> Command:
         """Of a COMMAND_LONG or COMMAND_INT."""
-        first = (message.param1, message.param2, message.param3, message.param4)
+        params = [message.param1, message.param2, message.param3, message.param4]
         if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_INT:
-            return Command(message.command, (*first, message.x, message.y, message.z))
-        return Command(message.command, (*first, message.param5, message.param6, message.param7))
+            params += [message.x, message.y, message.z]
+        else:
+            params += [message.param5, message.param6, message.param7]
+        return Command(message.command, tuple(0.0 if isnan(value) else value for value in params))
 
     @property
     def is_emergency_stop(self) -> bool:

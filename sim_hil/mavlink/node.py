@@ -137,8 +137,7 @@ class MavlinkNode:
     # Handlers
 
     def _heartbeat(self, message: Message, station: Station, now_s: float) -> bool:
-        if message.type == common.MAV_TYPE_GCS or message.autopilot == common.MAV_AUTOPILOT_INVALID:
-            self.vehicle.heartbeat(station, now_s)
+        self.vehicle.heartbeat(station, now_s)  # whatever it says that it is: not only ground stations drive
         return False
 
     def _command(self, message: Message, station: Station, now_s: float) -> bool:
