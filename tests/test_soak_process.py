@@ -25,7 +25,7 @@ from sim_hil.soak.leg import EVENTS, SAMPLES
 from sim_hil.soak.measures import measures
 from sim_hil.soak.soak_run import SoakFolder
 
-DURATION_S = 30
+DURATION_S = 20
 FAULTS = """
 format = 1
 gap_s = [2.0, 3.0]
@@ -165,7 +165,7 @@ def test_what_a_killed_soak_had_written_is_counted(soaked: Soaked, tmp_path: Pat
     samples.write_text(samples.read_text(encoding="utf-8")[:-40], encoding="utf-8")  # cut in the last line
     (copy / "legs" / "002").mkdir()  # killed before its first second
     soak = SoakFolder.open(copy)
-    assert len(soak.legs) == 1 and 0 < soak.elapsed_s <= DURATION_S + 1
+    assert len(soak.legs) == 1 and soak.elapsed_s > 0.5 * DURATION_S
     assert measures(soak.legs, soak.samples())["cpu_percent.edge-run.mean"].value is not None
 
 

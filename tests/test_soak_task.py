@@ -40,13 +40,12 @@ def test_the_same_seed_gives_the_same_tasks(office: Scene) -> None:
     assert second.begin() == at and first.next(at) == second.next(at)
 
 
-def test_a_slow_robot_has_more_time(office: Scene) -> None:
-    fast, slow = (Journey(office, seed=4, leg=2, speed_mps=speed) for speed in (0.8, 0.2))
-    at = fast.begin()
-    slow.begin()
-    quick, long = fast.next(at), slow.next(at)
-    assert quick is not None and long is not None
-    assert long.timeout_s - 20 == pytest.approx(4 * (quick.timeout_s - 20))
+def test_a_slow_robot_has_more_time_and_shorter_ways(office: Scene) -> None:
+    for speed_mps in (0.8, 0.1):
+        journey = Journey(office, seed=4, leg=2, speed_mps=speed_mps)
+        task = journey.next(journey.begin())
+        assert task is not None and task.timeout_s == pytest.approx(20 + task.shortest_m / (0.6 * speed_mps))
+        assert task.shortest_m <= max(8.0, 60 * speed_mps)
 
 
 def test_numbers_count_up(office: Scene) -> None:

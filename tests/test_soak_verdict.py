@@ -16,7 +16,7 @@ from sim_hil.soak.slopes import slope
 LIMIT = BudgetLine("x", "here", max=1.0)
 
 
-def grown(per_h: float, seconds: int = 900, noise: float = 0.0) -> tuple[list[float], list[float]]:
+def grown(per_h: float, seconds: int = 1200, noise: float = 0.0) -> tuple[list[float], list[float]]:
     times = [float(t) for t in range(seconds)]
     rng = np.random.default_rng(5)
     return times, [100.0 + per_h * t / 3600 + float(rng.normal(0, noise)) for t in times]
@@ -34,7 +34,7 @@ def test_what_does_not_grow_has_an_interval_around_zero() -> None:
 
 def test_the_warm_up_does_not_count() -> None:
     times, values = grown(0.0)
-    values = [value + (0.0 if t > 110 else -50.0) for t, value in zip(times, values, strict=True)]
+    values = [value + (0.0 if t > 290 else -50.0) for t, value in zip(times, values, strict=True)]
     found = slope(times, values)
     assert found is not None and found.per_h == pytest.approx(0.0, abs=1e-9)
 
@@ -46,7 +46,7 @@ def test_spikes_do_not_move_a_slope() -> None:
 
 
 def test_a_short_life_has_no_slope() -> None:
-    assert slope(*grown(12.0, seconds=300)) is None
+    assert slope(*grown(12.0, seconds=500)) is None
 
 
 def test_within_the_limit_passes_and_beyond_it_fails() -> None:
@@ -100,7 +100,7 @@ def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
 
 def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
     for growth, verdict in ((3.0, FAIL), (0.1, PASS)):
-        leg = [sample(float(t), 250 + growth * t / 3600) for t in range(900)]
+        leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
         found = {j.line.measure: j for j in judge(load_budget(budget.DEFAULT), measures([], [leg]))}
         assert found["memory_slope_mib_per_h.edge-run"].verdict == verdict
         assert found["descriptor_slope_per_h.edge-run"].verdict == PASS
@@ -108,6 +108,6 @@ def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
 
 def test_every_process_has_a_life_of_its_own() -> None:
     """A runner that is started anew at another size has not grown."""
-    leg = [sample(float(t), 250, 7) for t in range(900)] + [sample(900.0 + t, 300, 8) for t in range(900)]
+    leg = [sample(float(t), 250, 7) for t in range(1200)] + [sample(1200.0 + t, 300, 8) for t in range(1200)]
     found = measures([], [leg])["memory_slope_mib_per_h.edge-run"]
     assert found.value == pytest.approx(0.0, abs=1e-6) and found.count == 2

@@ -119,7 +119,7 @@ class TraceData:
 
 
 def read_trace(path: Path) -> TraceData:
-    """A leg's trace; raises OSError."""
+    """A leg's trace, empty where the robot's side was not started any more; raises OSError."""
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     sent: list[int] = []
@@ -127,7 +127,7 @@ def read_trace(path: Path) -> TraceData:
     contacts: list[tuple[int, str]] = []
     touched: set[str] = set()
     end: dict[str, Any] = {}
-    for line in read_lines(path):
+    for line in read_lines(path) if path.exists() else ():
         kind = line.get("kind")
         if kind == "pose":
             stamps.append(line["t_ns"])
@@ -173,9 +173,7 @@ def drift_segments(
         if (times[last] - times[first]) / 1e9 < SEGMENT_S:
             continue
         a_ns, b_ns = int(times[first]), int(times[last])
-        inside = (trace.pose_ns >= a_ns) & (trace.pose_ns <= b_ns)
-        steps = np.diff(trace.pose[inside][:, :2], axis=0)
-        path_m = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        path_m = _path_m(trace, a_ns, b_ns)
         hit = any(begin <= b_ns and end >= a_ns for begin, end in disturbed)
         if path_m >= SEGMENT_M and not hit:
             truth = [
@@ -202,14 +200,18 @@ def disturbed_spans(events: list[dict[str, Any]]) -> list[tuple[int, int]]:
     return spans
 
 
-def faults_of(events: list[dict[str, Any]], lives: list[LifeData]) -> list[dict[str, Any]]:
-    """Each injection with what came of it: when it took effect and when the runner raised the fault that it should."""
+def faults_of(events: list[dict[str, Any]], lives: list[LifeData], trace: TraceData) -> list[dict[str, Any]]:
+    """Each injection with what came of it: its effect, the fault that the runner should raise, any fault it raised.
+
+    `moved_m`: the robot's true path meanwhile; a picture that freezes before a robot that stands looks right.
+    """
     raised = sorted(entry for life in lives for entry in life.raised)
     found: dict[int, dict[str, Any]] = {}
     for event in events:
         if event["kind"] == "fault_on":
             row = {key: event[key] for key in ("number", "name", "fault", "expect", "t_ns")}
-            found[event["number"]] = {**row, "end_ns": None, "effect_ns": None, "raised_ns": None}
+            nothing = {"end_ns": None, "effect_ns": None, "raised_ns": None, "other_ns": None, "moved_m": 0.0}
+            found[event["number"]] = {**row, **nothing}
         elif event["kind"] == "fault_effect" and event["number"] in found:
             found[event["number"]]["effect_ns"] = event["effect_ns"]
         elif event["kind"] == "fault_off" and event["number"] in found:
@@ -218,7 +220,15 @@ def faults_of(events: list[dict[str, Any]], lives: list[LifeData]) -> list[dict[
         until_ns = (row["end_ns"] or row["t_ns"]) + 2_000_000_000
         answers = [t for t, name in raised if name == row["fault"] and row["t_ns"] <= t <= until_ns]
         row["raised_ns"] = answers[0] if answers else None
+        row["other_ns"] = next((t for t, _ in raised if row["t_ns"] <= t <= until_ns), None)
+        row["moved_m"] = round(_path_m(trace, row["t_ns"], row["end_ns"] or row["t_ns"]), 3)
     return list(found.values())
+
+
+def _path_m(trace: TraceData, begin_ns: int, end_ns: int) -> float:
+    inside = (trace.pose_ns >= begin_ns) & (trace.pose_ns <= end_ns)
+    steps = np.diff(trace.pose[inside][:, :2], axis=0)
+    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
 
 def analyse(folder: Path) -> dict[str, Any]:
@@ -240,7 +250,7 @@ def analyse(folder: Path) -> dict[str, Any]:
         "task_begins": [event for event in events if event["kind"] == "task_begin"],
         "life_ends": [event for event in events if event["kind"] == "life_end"],
         "why": next((event["why"] for event in events if event["kind"] == "leg_end"), "killed"),
-        "faults": faults_of(events, lives),
+        "faults": faults_of(events, lives, trace),
         "lives": [life.__dict__ for life in lives],
         "drift": drift,
         "real_time_factor": trace.end.get("real_time_factor"),

@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--scene", action="append", metavar="NAME|FILE", help="default hospital; repeated: leg by leg")
     p.add_argument("--people", type=int, default=6, metavar="N", help="walking people (default 6)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of tasks, people and faults (default 0)")
-    p.add_argument("--leg", type=parse_seconds, default=600.0, metavar="T", help="length of a leg (default 10m)")
+    p.add_argument("--leg", type=parse_seconds, default=1200.0, metavar="T", help="length of a leg (default 20m)")
     p.add_argument("--mode", choices=MODES, default="async", help="of edge-run (default async)")
     p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="of edge-run (default 0)")
     p.add_argument("--odometry-noise", choices=tuple(LEVELS), default="none", help="of edge-hil (default none)")

@@ -18,6 +18,8 @@ from sim_hil.scene import Scene, Vec2, Vec3
 
 THRESHOLD_M: Final = 1.5  # paper, equation 6
 LENGTH_M: Final = (4.0, 40.0)
+LONGEST_S: Final = 60.0
+"""At full speed: a slow robot gets shorter ways, or it would be on a single one for a whole leg."""
 TRIES: Final = 24
 _SLOW: Final = 0.6  # of the speed limit: a robot among people does not drive at it all the time
 
@@ -47,13 +49,14 @@ class Journey:
         self._rng = np.random.default_rng((seed, 62, leg))
         self._grid = NavGrid(scene, clearance_m=footprint_m("go2"))
         self._speed_mps = speed_mps
+        self._length_m = (LENGTH_M[0], min(LENGTH_M[1], max(2 * LENGTH_M[0], LONGEST_S * speed_mps)))
         self._count = 0
 
     def begin(self) -> Vec3:
         """A pose to begin a leg at, from which there is a task. Raises ValueError."""
         for _ in range(TRIES):
             try:
-                return sample_task(self.scene, self._grid, self._rng, length_m=LENGTH_M).start
+                return sample_task(self.scene, self._grid, self._rng, length_m=self._length_m).start
             except RouteError:
                 continue
         raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
@@ -65,7 +68,7 @@ class Journey:
             try:
                 task = make_task(self.scene, self._grid, at, things[int(index)])
                 length_m = _length_m(task.path)
-                if not LENGTH_M[0] <= length_m <= LENGTH_M[1]:
+                if not self._length_m[0] <= length_m <= self._length_m[1]:
                     continue
                 text = wordings(task.told, 1, int(self._rng.integers(2**31)), held_out=True)[0]
             except (RouteError, WordingError):

@@ -33,6 +33,9 @@ FAULT_AFTER_NS: Final = 3_000_000_000
 STUCK_LIVES: Final = 3
 """So many runners in a row that have ended within STUCK_M of each other: the robot does not get away."""
 STUCK_M: Final = 0.5
+CONTACT: Final = "contact"
+CONTACT_STOPS: Final = frozenset(("odometry-stays-frozen", "odometry-speed-mismatch", "tipped-over"))
+"""What a robot that has walked into something is stopped for."""
 SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
 
 
@@ -42,7 +45,7 @@ class _StoppedError(Exception):
 
 @dataclass(frozen=True)
 class LegOptions:
-    """What a leg is: its number from 1 on, its stack and how long it may last."""
+    """What a leg is: its number from 1 on, its stack and how long it drives."""
 
     number: int
     seed: int
@@ -76,6 +79,7 @@ class Leg:
         self._task: TaskRun | None = None
         self._touched_ns = 0
         self._begin_ns = 0
+        self._driven_ns: int | None = None
         self._sampled_ns = 0
         self._armed = False
         self._lives: list[tuple[float, float]] = []
@@ -138,6 +142,7 @@ class Leg:
             time.sleep(POLL_S)
         self._armed = self._stack.armed()
         if self._armed:
+            self._driven_ns = self._driven_ns or time.monotonic_ns()
             self._note("armed", run=self._stack.runs)
 
     def _drive(self) -> str | None:
@@ -150,7 +155,7 @@ class Leg:
             now_ns = time.monotonic_ns()
             if self._injector is not None:
                 self._injector.step(now_ns)
-            if (now_ns - self._begin_ns) / 1e9 >= self._options.duration_s:
+            if self._left_s(now_ns) <= 0:
                 return "duration"
             if end is not None:
                 self._end_task(end)
@@ -181,7 +186,9 @@ class Leg:
         bridge_died = bridge is not None and not bridge.running
         code = self._stack.end_runner()  # it may take a moment longer when its bridge was killed
         self._stack.end_bridge()
-        cause = _last_fault(self._stack.result(f"edge-run-{self._stack.runs}"))
+        cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
+        if explained == CONTACT and not raised & CONTACT_STOPS:
+            explained = ""
         about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
         self._note("life_end", run=self._stack.runs, code=code, **about)
         self.stops += 1
@@ -201,7 +208,7 @@ class Leg:
         stops = newest is not None and newest.fault.expect == "stop"
         if injector is not None and newest is not None and stops and now_ns - injector.newest_ns < FAULT_AFTER_NS:
             return newest.fault.name
-        return "contact" if now_ns - self._touched_ns < FAULT_AFTER_NS else ""
+        return CONTACT if now_ns - self._touched_ns < FAULT_AFTER_NS else ""
 
     def _next_task(self) -> SoakTask | None:
         while self._truth.newest is None:
@@ -262,12 +269,16 @@ class Leg:
             "processes": self._sampler.sample(self._stack.processes()),
         }
         self._samples.add(sample)
-        left_s = self._options.duration_s - sample["elapsed_s"]
         self._tell(
-            f"leg {self._options.number}, {max(0.0, left_s):.0f} s left · "
+            f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
             f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
             + (f" · {sample['fault']}" if sample["fault"] else "")
         )
+
+    def _left_s(self, now_ns: int) -> float:
+        """A leg's time begins when its first runner drives: how long that takes is the machine's affair."""
+        begun_ns = now_ns if self._driven_ns is None else self._driven_ns
+        return self._options.duration_s - (now_ns - begun_ns) / 1e9
 
     def _look_for_sample(self) -> None:
         """While nothing is driven nobody else looks at the ground truth."""
@@ -278,10 +289,11 @@ class Leg:
         self._events.add({"t_ns": time.monotonic_ns(), "kind": kind, **fields})
 
 
-def _last_fault(result: Path) -> str:
-    """What the runner itself says it ended by; nothing when it was killed."""
+def _end_of_run(result: Path) -> tuple[str, set[str]]:
+    """What the runner itself says it ended by, and all faults that it has raised; nothing when it was killed."""
     try:
-        faults = json.loads(result.read_text(encoding="utf-8"))["faults"]
+        content = json.loads(result.read_text(encoding="utf-8"))
+        faults, raised = content["faults"], set(content["control"]["faults"])
     except (OSError, ValueError, KeyError):
-        return ""
-    return str(faults[0]) if faults else ""
+        return "", set()
+    return (str(faults[0]) if faults else ""), raised

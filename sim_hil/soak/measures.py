@@ -14,6 +14,8 @@ from sim_hil.soak.slopes import SHORTEST_S, WARM_UP_S, slope
 
 PROCESSES: Final = ("edge-run", "edge-bridge", "edge-hil")
 BRIDGE_PERIOD_MS: Final = 20.0  # rate_hz = 50 of the simulated robot's file
+MOVED_M: Final = 0.1
+"""A fault during which the robot has moved less is not counted among those that the runner must answer."""
 MIB: Final = 2.0**20
 
 Analysis = Mapping[str, Any]
@@ -122,9 +124,15 @@ def _stops(found: dict[str, Measure], legs: Sequence[Analysis]) -> None:
     ends = [end for leg in legs for end in leg["life_ends"] if end["cause"] != "leg"]
     found["stops"] = Measure(len(ends), "", len(ends))
     found["stops_unexplained"] = Measure(sum(not end["explained"] for end in ends), "", len(ends))
-    faults = [fault for leg in legs for fault in leg["faults"] if fault["fault"] and fault["end_ns"] is not None]
+    # Before a robot that stands, a picture that stays the same is right.
+    faults = [
+        fault
+        for leg in legs
+        for fault in leg["faults"]
+        if fault["fault"] and fault["end_ns"] is not None and fault["moved_m"] >= MOVED_M
+    ]
     found["faults_injected"] = Measure(sum(len(leg["faults"]) for leg in legs), "", len(legs))
-    silent = sum(fault["raised_ns"] is None for fault in faults)
+    silent = sum(fault["raised_ns"] is None and fault["other_ns"] is None for fault in faults)
     found["faults_unanswered"] = Measure(silent if faults else None, "", len(faults), note="" if faults else "no fault")
 
 

@@ -16,8 +16,9 @@ from scipy.stats import theilslopes
 
 Array = NDArray[np.float64]
 
-WARM_UP_S: Final = 120.0
-"""Of a process's life: caches and arenas fill (measured on nano: the runner grows by some MiB in its first minute)."""
+WARM_UP_S: Final = 300.0
+"""Of a process's life: caches, histories and arenas fill (nano, 2 cores: of the runner's 279 MiB after five minutes,
+12 came in the first of them, 4 in the next four, the last of them 0.2)."""
 SHORTEST_S: Final = 240.0
 """After the warm-up; over less time a slope per hour says nothing."""
 BLOCK_S: Final = 10.0

@@ -120,7 +120,7 @@ class SoakFolder:
         for folder in sorted((path / LEGS).iterdir()):
             if (folder / ANALYSIS).exists():
                 found.legs.append(json.loads((folder / ANALYSIS).read_text(encoding="utf-8")))
-            elif (folder / LEG).exists() and (folder / SAMPLES).exists() and (folder / "trace.jsonl").exists():
+            elif (folder / LEG).exists() and (folder / SAMPLES).exists():
                 found.legs.append(analyse(folder))  # its soak was killed
             else:
                 shutil.rmtree(folder)  # killed before its first second
