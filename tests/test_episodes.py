@@ -102,6 +102,14 @@ def test_a_timeout_grows_with_distance_and_crowd() -> None:
     assert timeout_s(50, 100, True) < timeout_s(50, 200, True)
 
 
+def test_a_go2_that_halts_to_think_can_be_in_time_indoors() -> None:
+    # At its limits 0.365 m in 0.5 s of driving and coasting; then 2 s of thought, 0.3 s of which the frame may wait.
+    stop_and_go_mps = 0.365 / (0.5 + 2.0 + 0.3)
+    for episode in EPISODES:
+        if episode.robot == "go2" and episode.scene != "sidewalk":
+            assert (episode.shortest_m - episode.threshold_m) / episode.timeout_s < 0.85 * stop_and_go_mps
+
+
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [

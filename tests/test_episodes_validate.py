@@ -51,6 +51,11 @@ def test_a_timeout_that_cannot_be_met_is_found(validator: Validator) -> None:
     assert "timeout_s" in problems(validator, timeout_s=5.0)
 
 
+def test_a_timeout_that_leaves_no_time_to_stop_and_think_is_found(validator: Validator) -> None:
+    assert "at 0.12 m/s" in problems(validator, timeout_s=SOUND.shortest_m / 0.13)
+    assert problems(validator, timeout_s=SOUND.shortest_m / 0.11) == ""
+
+
 def test_a_start_in_a_rack_is_found(validator: Validator) -> None:
     rack = next(thing for thing in load_scene("warehouse").objects if thing.kind == "storage_rack")
     assert "start is not free" in problems(validator, start=(*rack.position_m[:2], 0.0))

@@ -9,7 +9,6 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from sim_hil.benchmark.visibility import Sightlines
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene, load_scene
 
-NAME, VERSION = "dynanav", 1
+NAME, VERSION = "dynanav", 2
 TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, whatever robot then drives
 WORDINGS = 6
 INDOOR_CROWDS = (0, 10, 20, 40, 60)
@@ -109,10 +108,10 @@ PARTS = (
 def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
     """In proportion to distance, and the more the fuller it is (paper appendix C); whole 5 s.
 
-    20 s to begin with, then 0.5 m/s through nobody, down to 0.3 m/s among 60 people indoors or 200 outdoors.
+    Enough for one who stops to think: halts of 2 s and 0.5 s of driving in turn make 0.146 m/s at the Go2's limits.
     """
-    crowd = people / (300.0 if outdoor else 90.0)
-    return 5.0 * ceil((20.0 + shortest_m / 0.5 * (1.0 + crowd)) / 5.0)
+    driving_s = 30.0 + shortest_m / 0.2 if outdoor else 20.0 + shortest_m / 0.12
+    return 5.0 * round((driving_s + 0.5 * people) / 5.0)
 
 
 def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) -> list[Episode]:
