@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import hypot
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sim_hil.benchmark.robots import footprint_m
@@ -46,6 +47,20 @@ def test_a_slow_robot_has_more_time_and_shorter_ways(office: Scene) -> None:
         task = journey.next(journey.begin())
         assert task is not None and task.timeout_s == pytest.approx(20 + task.shortest_m / (0.6 * speed_mps))
         assert task.shortest_m <= max(8.0, 60 * speed_mps)
+
+
+def test_from_every_free_place_there_is_a_task(office: Scene) -> None:
+    """Also where no way can be told well: a soak goes on wherever the robot has got to."""
+    journey = Journey(office, seed=1, leg=1, speed_mps=0.1)
+    grid = NavGrid(office, clearance_m=footprint_m("go2"))
+    rng = np.random.default_rng(0)
+    (x0, y0), (x1, y1) = office.floor_min_m, office.floor_max_m
+    found = 0
+    while found < 6:
+        at = (float(rng.uniform(x0, x1)), float(rng.uniform(y0, y1)), float(rng.uniform(-3, 3)))
+        if grid.is_free(at[0], at[1]):
+            found += 1
+            assert journey.next(at) is not None, at
 
 
 def test_numbers_count_up(office: Scene) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from sim_hil.benchmark.instructions import WordingError, wordings
 from sim_hil.benchmark.robots import footprint_m
 from sim_hil.benchmark.route import RouteError
-from sim_hil.benchmark.tasks import goals, make_task, sample_task
+from sim_hil.benchmark.tasks import goal_before, goals, make_task, sample_task
 from sim_hil.nav_grid import NavGrid
-from sim_hil.scene import Scene, Vec2, Vec3
+from sim_hil.scene import Scene, SceneObject, Vec2, Vec3
 
 THRESHOLD_M: Final = 1.5  # paper, equation 6
 LENGTH_M: Final = (4.0, 40.0)
@@ -62,21 +62,35 @@ class Journey:
         raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
 
     def next(self, at: Vec3) -> SoakTask | None:
-        """A task from here; None where no landmark can be told the way to (a robot that stands in a corner)."""
+        """A task from here; None where there is no way to any landmark.
+
+        Where no way can be told unmistakably (a robot in a corner), a plain "Go to the ..." takes its place.
+        """
         things = goals(self.scene)
-        for index in self._rng.permutation(len(things)):
-            try:
-                task = make_task(self.scene, self._grid, at, things[int(index)])
-                length_m = _length_m(task.path)
-                if not self._length_m[0] <= length_m <= self._length_m[1]:
+        order = [things[int(index)] for index in self._rng.permutation(len(things))]
+        seed = int(self._rng.integers(2**31))
+        for lengths_m in (self._length_m, LENGTH_M):
+            for thing in order:
+                try:
+                    task = make_task(self.scene, self._grid, at, thing)
+                    length_m = _length_m(task.path)
+                    if lengths_m[0] <= length_m <= lengths_m[1]:
+                        return self._task(
+                            at, task.goal, thing, length_m, wordings(task.told, 1, seed, held_out=True)[0]
+                        )
+                except (RouteError, WordingError):
                     continue
-                text = wordings(task.told, 1, int(self._rng.integers(2**31)), held_out=True)[0]
-            except (RouteError, WordingError):
-                continue
-            self._count += 1
-            timeout_s = 20.0 + length_m / (_SLOW * self._speed_mps)
-            return SoakTask(self._count, text, at, task.goal, task.goal_label, length_m, timeout_s)
+        for thing in order:
+            goal = goal_before(self._grid, thing)
+            path = None if goal is None else self._grid.path((at[0], at[1]), goal)
+            if goal is not None and path is not None and _length_m(tuple(path)) >= LENGTH_M[0]:
+                return self._task(at, goal, thing, _length_m(tuple(path)), f"Go to the {thing.landmark}.")
         return None
+
+    def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str) -> SoakTask:
+        self._count += 1
+        timeout_s = 20.0 + length_m / (_SLOW * self._speed_mps)
+        return SoakTask(self._count, text, at, goal, thing.label, length_m, timeout_s)
 
 
 def _length_m(path: tuple[Vec2, ...]) -> float:
