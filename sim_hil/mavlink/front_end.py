@@ -191,7 +191,9 @@ class MavlinkFrontEnd:
         self._log.note(name, self._node.vehicle.wanted() if self._node.vehicle.armed else None, moves=moves)
         fields = message.to_dict()
         skipped = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
-        content = " ".join(f"{key}={value}" for key, value in fields.items() if key not in skipped and value)
+        content = " ".join(
+            f"{key}={value}" for key, value in fields.items() if key not in skipped and value and value == value
+        )
         return [Heard(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
 
     def publish(self, step: int, stamp_s: float) -> None:

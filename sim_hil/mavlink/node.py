@@ -24,6 +24,8 @@ from sim_hil.mavlink.wire import Counts, Message
 COMPONENT: Final = common.MAV_COMP_ID_AUTOPILOT1
 READ_S: Final = 1 / telemetry.MAX_HZ
 _TEXT_BYTES: Final = 50
+_FTP_NAK: Final = 129
+_FTP_FILE_NOT_FOUND: Final = 10
 _MAX_WAITING_PARAMETERS: Final = 2 * len(parameters.NAMES)
 _PARAMETERS_A_STEP: Final = 2  # a list is no burst
 
@@ -215,6 +217,18 @@ class MavlinkNode:
         )
         return False
 
+    def _file_transfer(self, message: Message, station: Station, now_s: float) -> bool:
+        """There are no files: a refusal at once, instead of a client that waits for its time to run out."""
+        number, session, opcode = message.payload[0] | message.payload[1] << 8, message.payload[2], message.payload[3]
+        head = ((number + 1) & 0xFFFF).to_bytes(2, "little") + bytes((session, _FTP_NAK, 1, opcode, 0, 0))
+        payload = (head + bytes(4) + bytes((_FTP_FILE_NOT_FOUND,))).ljust(251, b"\0")
+        self.answer(
+            common.MAVLink_file_transfer_protocol_message(
+                0, message.get_srcSystem(), message.get_srcComponent(), list(payload)
+            )
+        )
+        return False
+
     def _timesync(self, message: Message, station: Station, now_s: float) -> bool:
         if message.tc1 == 0:  # a question; anything else is an answer
             self.answer(common.MAVLink_timesync_message(round(now_s * 1e9), message.ts1))
@@ -251,6 +265,7 @@ HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
         common.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: MavlinkNode._mission_list,
         common.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: MavlinkNode._mission_clear,
         common.MAVLINK_MSG_ID_MISSION_COUNT: MavlinkNode._mission_upload,
+        common.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: MavlinkNode._file_transfer,
         common.MAVLINK_MSG_ID_TIMESYNC: MavlinkNode._timesync,
         common.MAVLINK_MSG_ID_PING: MavlinkNode._ping,
     }

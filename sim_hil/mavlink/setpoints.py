@@ -50,7 +50,7 @@ class Setpoint:
             if hypot(self.vx_mps, self.vy_mps) > _STILL_MPS:
                 direction = atan2(self.vy_mps, self.vx_mps)
         if self.yaw_rate_radps is not None:
-            return ahead, -self.yaw_rate_radps
+            return ahead, 0.0 - self.yaw_rate_radps  # no -0.0
         aim = direction if self.yaw_rad is None else self.yaw_rad
         if aim is None:
             return ahead, 0.0

@@ -122,7 +122,7 @@ def _heartbeat(now: Picture) -> Message:
 
 def _sys_status(now: Picture) -> Message:
     sensors = now.sensors
-    healthy = _SENSORS
+    healthy = _SENSORS | common.MAV_SYS_STATUS_GEOFENCE  # MAVProxy calls a fence breached that is not there
     if now.vehicle.obstacle_to_arming() is not None:
         healthy &= ~common.MAV_SYS_STATUS_PREARM_CHECK
     return common.MAVLink_sys_status_message(

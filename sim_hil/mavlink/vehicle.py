@@ -169,8 +169,6 @@ class Vehicle:
         obstacle = self.obstacle_to_arming(forced=forced)
         if obstacle is not None:
             return self._refuse(f"Arming denied: {obstacle}", FAILED)
-        if station not in self._heartbeats_s:
-            return self._refuse("Arming denied: no heartbeat of this station yet", REJECTED)
         self.armed = True
         self._base.stand()
         self.say(_SEVERITY_NEWS, "Armed")

@@ -81,13 +81,15 @@ async def note_texts(rover: System, texts: list[str]) -> None:
 
 async def die(port: int) -> None:
     rover = await connect(port)
-    await rover.action.arm()
-    await rover.offboard.set_velocity_body(VelocityBodyYawspeed(0.0, 0.0, 0.0, 0.0))
-    await rover.offboard.start()
-    await drive(rover, 0.5, 0.0, 3.0)
     server = rover._server_process  # what sends the setpoints
-    server.kill()
-    server.wait()
+    try:
+        await rover.action.arm()
+        await rover.offboard.set_velocity_body(VelocityBodyYawspeed(0.0, 0.0, 0.0, 0.0))
+        await rover.offboard.start()
+        await drive(rover, 0.5, 0.0, 3.0)
+    finally:
+        server.kill()
+        server.wait()
     sys.stdout.write(json.dumps({"killed_monotonic_ns": time.monotonic_ns()}) + "\n")
     sys.stdout.flush()
     os._exit(0)
@@ -111,7 +113,7 @@ async def session(port: int) -> dict[str, Any]:
 async def visit(rover: System) -> dict[str, Any]:
     seen: dict[str, Any] = {}
     seen["version"] = str((await asyncio.wait_for(rover.info.get_version(), ANSWER_S)).flight_sw_major)
-    seen["health_armable"] = (await first(rover.telemetry.health())).is_armable
+    seen["armable"] = (await first(rover.telemetry.health(), lambda health: health.is_armable)).is_armable
     battery = await first(rover.telemetry.battery())
     seen["battery"] = {"volts": round(battery.voltage_v, 2), "percent": round(battery.remaining_percent, 1)}
     await rover.telemetry.set_rate_odometry(50.0)
