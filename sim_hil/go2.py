@@ -23,6 +23,7 @@ RADIUS_M = 0.33
 HALF_LENGTH_M = 0.36
 RENDER_FIELDS = 19
 ACCEL_CUTOFF_HZ = 40.0  # our choice
+FOOT_GRIP, SHELL_GRIP = 0.9, 0.4  # our choice: rubber feet, hard plastic everywhere else
 # A moving joint's dry friction, as a torque: rises over this range of speed instead of at once.
 _FRICTION_FULL_RADPS = 0.2
 _FRICTION_SLOPE = JOINT_FRICTION_NM / _FRICTION_FULL_RADPS
@@ -101,12 +102,11 @@ class Go2:
         self._feet = [names[f"{leg}_foot"] for leg in LEGS]
         self._set_friction(JOINT_FRICTION_NM)
         self._trotting = False
+        pybullet.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=client)
+        # In a call of its own: beside a damping, PyBullet gives the base the friction that is meant for the link.
         for link in range(-1, links):
-            grip = 0.9 if link in self._feet else 0.4
-            pybullet.changeDynamics(
-                self.body, link, lateralFriction=grip, linearDamping=0.0, angularDamping=0.0,
-                physicsClientId=client,
-            )  # fmt: skip
+            grip = FOOT_GRIP if link in self._feet else SHELL_GRIP
+            pybullet.changeDynamics(self.body, link, lateralFriction=grip, physicsClientId=client)
         self._torques: tuple[float, ...] = (0.0,) * 12
         self._accel: Vec3 = (0.0, 0.0, GRAVITY_MPS2)
         self._accel_blend = 1.0 - exp(-2.0 * pi * ACCEL_CUTOFF_HZ * dt_s)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import pybullet
 import pytest
 
-from sim_hil.go2 import RENDER_FIELDS
-from sim_hil.go2_urdf import TORQUE_LIMITS_NM, TOTAL_MASS_KG, VELOCITY_LIMITS_RADPS
+from sim_hil.go2 import FOOT_GRIP, RENDER_FIELDS, SHELL_GRIP
+from sim_hil.go2_urdf import LEGS, TORQUE_LIMITS_NM, TOTAL_MASS_KG, VELOCITY_LIMITS_RADPS
 from sim_hil.robot import BaseTruth, Robot
 from sim_hil.sport import MODE_DAMPING
 from tools.bench.locomotion_course import Command, Course
@@ -63,6 +64,17 @@ def test_a_light_push_is_taken_and_a_hard_one_topples_it_until_it_gets_up(index:
     pushed = push_over(index, 500)
     assert pushed.kept, pushed
     assert pushed.fell == PUSHES[index][3]
+
+
+def test_the_feet_grip_and_the_rest_of_the_robot_slides(course: Course) -> None:
+    body, client = course.robot.body, course.client
+    grips = {"base": pybullet.getDynamicsInfo(body, -1, physicsClientId=client)[1]}
+    for link in range(pybullet.getNumJoints(body, physicsClientId=client)):
+        name = pybullet.getJointInfo(body, link, physicsClientId=client)[1].decode()
+        grips[name] = pybullet.getDynamicsInfo(body, link, physicsClientId=client)[1]
+    feet = {f"{leg}_foot" for leg in LEGS}
+    assert feet < set(grips)
+    assert grips == {name: FOOT_GRIP if name in feet else SHELL_GRIP for name in grips}
 
 
 def test_a_robot_that_has_fallen_is_limp_and_stays_down_until_it_is_asked_to_stand(course: Course) -> None:
