@@ -34,6 +34,8 @@ from sim_hil.simulation import Simulation
 CAMERA_PORT: Final = 8090
 DEFAULT_LINK: Final = "udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550"
 
+_NOT_SHOWN: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
+
 
 @dataclass(frozen=True)
 class LinkOptions:
@@ -189,10 +191,10 @@ class MavlinkFrontEnd:
             command = Command.of(message)
             number, name = command.number, common.enums["MAV_CMD"][command.number].name
         self._log.note(name, self._node.vehicle.wanted() if self._node.vehicle.armed else None, moves=moves)
-        fields = message.to_dict()
-        skipped = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
         content = " ".join(
-            f"{key}={value}" for key, value in fields.items() if key not in skipped and value and value == value
+            f"{key}={value}"
+            for key, value in message.to_dict().items()
+            if key not in _NOT_SHOWN and value and value == value  # MAVSDK fills what it does not use with NaN
         )
         return [Heard(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
 
