@@ -22,6 +22,7 @@ from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.semantic import Context, SemanticState
 from edge.stats import Samples
+from edge.sync_halt import seen_standing
 
 IDLE_S = 0.02
 FRAME_POLL_S = 0.002
@@ -220,11 +221,11 @@ class ReasoningLoop:
 
     def _is_due(self, now_ns: int, budget: ReasoningBudget) -> bool:
         """Whether every pause is over and there is a frame that has not been thought about."""
-        newest_ns, halted_ns = self._ring.newest_ns, self._slot.drive_until_ns
+        newest_ns = self._ring.newest_ns
         if newest_ns is None or newest_ns <= self._last_anchor_ns or now_ns < self._retry_ns:
             return False
-        if halted_ns is not None and newest_ns < halted_ns:
-            return False  # it still drives, or nothing has been seen since it was told to halt
+        if self._sync and not seen_standing(self._ring.newest(2), self._slot.drive_until_ns):
+            return False
         return self._finished_ns is None or now_ns - self._finished_ns >= budget.pause_s * 1e9
 
     def _fail(self, why: str) -> None:

@@ -60,6 +60,13 @@ class TokenRing:
         """Capture stamp of the newest frame, None while there is none."""
         return max((frame.stamp_ns for frame in list(self._slots) if frame is not None), default=None)
 
+    def newest(self, count: int) -> list[tuple[int, SE2]]:
+        """Capture stamp and pose of the newest frames that there are, at most `count`, oldest first."""
+        frames = [frame for frame in list(self._slots) if frame is not None]
+        return [(frame.stamp_ns, frame.T_odom_base) for frame in sorted(frames, key=lambda frame: frame.stamp_ns)][
+            -count:
+        ]
+
     def nearest(self, stamp_ns: int, tolerance_s: float = TOLERANCE_S) -> EncodedFrame | None:
         """The frame captured nearest to an instant, its tokens a reader's own; None if none is near enough."""
         frames = [frame for frame in list(self._slots) if frame is not None]

@@ -123,8 +123,9 @@ class Bench:
         self.thread.join(5)
         assert not self.thread.is_alive()
 
-    def frame(self, second: float) -> None:
-        self.ring.put(EncodedFrame(round(second * 1e9), SE2(second, 0, 0), KV))
+    def frame(self, second: float, x_m: float | None = None) -> None:
+        """A frame, captured at `x_m`; without one the robot is driving at 1 m/s."""
+        self.ring.put(EncodedFrame(round(second * 1e9), SE2(second if x_m is None else x_m, 0, 0), KV))
 
     def wait_for(self, what: Callable[[], bool]) -> None:
         deadline = time.monotonic() + 5

@@ -21,9 +21,20 @@ class Policy(FakePolicy):
 
 
 class Bench:
-    """Ticks of 0.1 s from 1 s on: a frame each, the robot 0.05 m further in every one."""
+    """Ticks of 0.1 s from 1 s on: a frame each, the robot 0.05 m further in every one in which it may drive.
 
-    def __init__(self, latency_s: float = 2.0, *, mode: Mode = Mode.ASYNC, anchor_after_s: float = 0.0) -> None:
+    `coasting`: by how much further in each of the ticks after a halt, m.
+    """
+
+    def __init__(
+        self,
+        latency_s: float = 2.0,
+        *,
+        mode: Mode = Mode.ASYNC,
+        anchor_after_s: float = 0.0,
+        coasting: tuple[float, ...] = (),
+    ) -> None:
+        self.x_m, self.coasting, self.left = 0.0, coasting, ()
         self.language, self.policy = FakeLanguage(), Policy()
         self.language.begin = lambda cancelled: type(self.language).begin(  # type: ignore[method-assign]
             self.language, cancelled, interrupt=None, before_call=lambda _: None
@@ -47,12 +58,20 @@ class Bench:
         """Tick up to a time; `seen` has (time, generation, delay) as each tick sees them."""
         while (now_ns := 1_000_000_000 + self.tick * TICK_NS) <= round((1 + until_s) * 1e9):
             self.reasoner.release(now_ns)
-            self.ring.put(EncodedFrame(now_ns, SE2(0.05 * self.tick, 0.0, 0.0), KV))
+            self.ring.put(EncodedFrame(now_ns, SE2(self.x_m, 0.0, 0.0), KV))
             state = self.slot.state
             delay = None if state is None else round(state.delay_s(now_ns), 3)
             self.seen.append((round(self.tick / 10, 3), None if state is None else state.generation, delay))
             self.reasoner.start(now_ns)
             self.tick += 1
+            self.x_m += self._moves(now_ns)
+
+    def _moves(self, now_ns: int) -> float:
+        if self.slot.drive_until_ns is None or now_ns < self.slot.drive_until_ns:
+            self.left = self.coasting
+            return 0.05
+        now_m, *self.left = self.left or (0.0,)
+        return now_m
 
 
 def test_before_the_first_latency_is_over_there_is_no_semantic_state() -> None:
@@ -117,10 +136,27 @@ def test_without_reasoning_nothing_is_decoded() -> None:
 
 def test_sync_drives_half_a_second_after_each_answer_and_then_thinks_anew() -> None:
     bench = Bench(2.0, mode=Mode.SYNC)
-    bench.run(5.0)
+    bench.run(5.1)
     starts = [record["started_s"] - 1 for record in bench.reasoner.released]
-    assert starts == pytest.approx([0.0, 2.5])
-    assert bench.slot.drive_until_ns == round((1 + 4.5 + 0.5) * 1e9)
+    # The halt takes effect in the tick at 2.5 s, whose frame it has driven up to.
+    assert starts == pytest.approx([0.0, 2.6])
+    assert bench.slot.drive_until_ns == round((1 + 4.6 + 0.5) * 1e9)
+
+
+def test_sync_anchors_where_the_robot_has_come_to_stand() -> None:
+    bench = Bench(2.0, mode=Mode.SYNC, coasting=(0.06, 0.04, 0.02, 0.005))
+    bench.run(4.8)
+    stands_m = bench.x_m
+    bench.run(4.9)
+    assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 0.4)
+    state = bench.slot.state
+    assert state is not None and state.T_odom_anchor.x_m == pytest.approx(stands_m)
+
+
+def test_sync_does_not_wait_for_ever_for_odometry_to_rest() -> None:
+    bench = Bench(2.0, mode=Mode.SYNC, coasting=(0.02,) * 100)
+    bench.run(6.0)
+    assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 1.0)
 
 
 def test_sync_may_not_drive_before_the_first_answer() -> None:

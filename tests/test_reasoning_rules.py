@@ -102,11 +102,23 @@ def test_in_sync_mode_the_next_generation_sees_only_what_was_captured_after_the_
     bench = Bench(clock=clock, mode=Mode.SYNC)
     bench.frame(100.0)
     assert bench.loop.step()
-    bench.frame(100.4)
+    bench.frame(100.4, x_m=1.0)
     assert not bench.loop.step()
-    bench.frame(100.5)
+    bench.frame(100.5, x_m=1.0)
     assert bench.loop.step()
     assert bench.language.prompts[1][-1] == 100.5
+
+
+def test_in_sync_mode_the_next_generation_sees_only_what_was_captured_by_a_standing_robot(clock: Clock) -> None:
+    bench = Bench(clock=clock, mode=Mode.SYNC)
+    bench.frame(100.0)
+    assert bench.loop.step()
+    for second, x_m in ((100.4, 0.28), (100.5, 0.36), (100.6, 0.40), (100.7, 0.415)):
+        bench.frame(second, x_m=x_m)
+        assert not bench.loop.step()
+    bench.frame(100.8, x_m=0.42)
+    assert bench.loop.step()
+    assert bench.language.prompts[1][-1] == 100.8
 
 
 def test_async_mode_sets_no_limit_to_driving(bench: Bench) -> None:

@@ -36,6 +36,11 @@ def test_an_empty_ring_gives_nothing() -> None:
     assert (ring.newest_ns, ring.nearest(0)) == (None, None)
 
 
+def test_the_newest_frames_are_told_by_stamp_and_pose_oldest_first() -> None:
+    assert filled(4.0).newest(2) == [(3_900_000_000, SE2(39 * 0.05, 0, 0)), (4_000_000_000, SE2(40 * 0.05, 0, 0))]
+    assert filled(0.0).newest(2) == [(0, SE2(0, 0, 0))] and TokenRing(8).newest(2) == []
+
+
 def test_a_full_ring_forgets_its_oldest_frame() -> None:
     ring = filled(20.0, capacity=120)
     assert ring.newest_ns == 20_000_000_000

@@ -20,6 +20,7 @@ from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_
 from edge.reasoning_text import parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
+from edge.sync_halt import seen_standing
 from sim_hil.benchmark.latency import Timing
 
 
@@ -41,7 +42,7 @@ class _UnderWay:
 
 
 class LockstepReasoner:
-    """One generation at a time; the next starts on the release of the one before (sync: when its drive is over)."""
+    """One generation at a time; the next starts on the release of the one before (sync: when the robot stands)."""
 
     def __init__(
         self,
@@ -103,11 +104,9 @@ class LockstepReasoner:
             job.frames = self._frames()
 
     def _may_start(self, now_ns: int) -> bool:
-        newest_ns, halted_ns = self._ring.newest_ns, self._slot.drive_until_ns
-        if self.failure is not None or newest_ns is None or now_ns < self._retry_ns:
+        if self.failure is not None or now_ns < self._retry_ns:
             return False
-        # Sync: not while it still drives, nor from a frame that it was driving in.
-        return halted_ns is None or newest_ns >= halted_ns
+        return seen_standing(self._ring.newest(2), self._slot.drive_until_ns)
 
     def _frames(self) -> list[EncodedFrame] | None:
         """Those at the offsets that there are, oldest first, the newest last; as the reasoning thread selects them."""
