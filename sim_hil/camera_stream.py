@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from sim_hil.camera import CameraWorld
 from sim_hil.scene import load_scene
 from sim_hil.sensor_noise import SensorNoise
-from sim_hil.unitree.snapshot import SnapshotReader, SnapshotWriter
+from sim_hil.unitree.snapshot import SnapshotReader, SnapshotWriter, TornSnapshotError
 
 JPEG_QUALITY: Final = 85
 RATE_HZ: Final = 15.0
@@ -122,7 +122,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """One picture or a stream of them."""
         if self.path == "/frame.jpg":
-            self._frame()
+            with contextlib.suppress(OSError):
+                self._frame()
         elif self.path == "/stream.mjpg":
             with contextlib.suppress(OSError):  # the client has gone, or stopped reading
                 self._stream()
@@ -285,7 +286,12 @@ def _render_while_parent_lives(
             continue
         next_ns = max(next_ns + period_ns, time.monotonic_ns())
         captured_ns = time.monotonic_ns()
-        state = poses.read()
+        try:
+            state = poses.read()
+        except TornSnapshotError as error:
+            # The physics is held up or has gone; the next look finds out which.
+            sys.stderr.write(f"edge-hil camera: a picture was left out: {error}\n")
+            continue
         if state is not None:
             shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
             _tell(pipe, event="picture")

@@ -97,6 +97,20 @@ def test_a_babbling_idiot_fills_the_bus_and_starves_the_others() -> None:
     assert len(babble) == pytest.approx((COUNT * TICK_S + 10.5 - 2.0) / FRAME_S, rel=0.01)
 
 
+def test_a_babbler_that_is_switched_on_late_says_nothing_of_the_time_before() -> None:
+    shim = FaultShim(FaultPlan(), 0, 0)
+    shim.take(600.0)
+    shim.plan = FaultPlan(babble_hz=1000.0)
+    assert len(shim.take(600.01)) == 10
+
+
+def test_a_babbler_that_is_slowed_down_goes_on_at_its_new_rate() -> None:
+    shim = FaultShim(FaultPlan(babble_hz=1000.0), 0, 0)
+    shim.take(1.0)
+    shim.plan = FaultPlan(babble_hz=100.0)
+    assert len(shim.take(2.0)) == 100
+
+
 def test_a_babbler_that_leaves_gaps_delays_the_others() -> None:
     shim = FaultShim(FaultPlan(babble_hz=0.75 / FRAME_S), 0, 0)
     for number in range(10):

@@ -61,6 +61,7 @@ def test_every_fault_survives_the_line_that_asks_for_it(name: str) -> None:
         b"", b"[]", b"\xff", b"{" * 3000, b'{"fault": "rain"}', b'{"fault": "deaf", "on": 1}',
         b'{"fault": "deaf", "loud": 1}', b'{"fault": "state-loss", "percent": 101}',
         b'{"fault": "state-loss", "percent": NaN}', b'{"fault": "odometry-nan", "field": "soul"}',
+        b'{"fault": ["deaf"]}', b'{"fault": "state-loss", "percent": 1' + b"0" * 400 + b"}",
     ],
 )  # fmt: skip
 def test_a_line_that_asks_for_nothing_we_know_is_refused(line: bytes) -> None:

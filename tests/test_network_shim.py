@@ -389,3 +389,23 @@ class TestCable:
         assert "192.168.123.99/24" in done.stdout
         after = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
         assert len(after.splitlines()) == len(before.splitlines())
+
+
+class TestWhatMayNotEndTheRelay:
+    @pytest.mark.parametrize("value", [10**400, 1e308, float("inf"), float("nan"), -1])
+    def test_a_number_that_no_clock_can_count_is_refused(self, value: float) -> None:
+        with pytest.raises(ValueError, match="delay_ms: expected"):
+            Impairment(delay_ms=value)
+
+    def test_an_address_that_no_way_leads_to_is_silence(self) -> None:
+        # Without SO_BROADCAST nothing may be sent there: the call fails as it does while an interface is down.
+        relay = Relay(
+            NetworkConfig((LinkConfig("l", "udp", "127.0.0.1:0", "255.255.255.255:9", Impairment(), Impairment()),), 1)
+        )
+        ends = relay.links["l"].ends
+        assert isinstance(ends, UdpEnds)
+        with contextlib.closing(relay), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.sendto(b"hello", ends.address)
+            for _ in range(3):
+                relay.turn(0.01)
+            assert ends.sources()

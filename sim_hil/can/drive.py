@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from typing import Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_target,
+    write_result,
+)
 from sim_hil.can import frames
 from sim_hil.can.buses import INTERFACES, BusAddress, BusError, BusLink, open_bus
 from sim_hil.can.client import CanClient, Odometry
@@ -18,7 +26,8 @@ _REPORT_S: Final = 0.5
 EPILOG: Final = """examples, beside `edge-hil --robot carter --protocol can --scene corridor --link serial:carter-can`:
   python -m sim_hil.can.drive --channel carter-can --vx 0.5 --duration 5
   python -m sim_hil.can.drive --interface socketcan --channel can0 --vx 0 --wz 0.5 --duration 3 --json -
-exit codes: 0 driven and stopped; 1 the base did not answer, arm or stop; 2 bad arguments or no such bus"""
+exit codes: 0 driven and stopped; 1 the base did not answer, arm or stop; 2 bad arguments or no such bus; 130
+interrupted, the base told to stand"""
 
 
 class DriveError(RuntimeError):
@@ -111,6 +120,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         result = drive(client, args.vx, args.wz, args.duration)
         write_result(args.json, result)
+    except KeyboardInterrupt:
+        sys.stderr.write("drive: interrupted; the base is told to stand\n")
+        with contextlib.suppress(BusError, OSError):
+            client.drive(0.0, 0.0)
+            client.disarm()
+        return EXIT_INTERRUPTED
     except (DriveError, BusError, OSError) as error:
         sys.stderr.write(f"drive: {error}\n")
         return EXIT_CHECK_FAILED

@@ -23,6 +23,7 @@ SWITCHES: Final = ("button", "bus_off")
 _FIELDS: Final = tuple(each.name for each in fields(FaultPlan))
 _MAX_BYTES: Final = 2000
 _MAX_A_POLL: Final = 16
+_LARGEST: Final = 1e9
 
 
 class CanFaults:
@@ -83,8 +84,9 @@ class CanFaults:
     def _value(self, name: str, on: bool, value: object) -> float:
         if not on:
             return float(getattr(self._begin, name))
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{name}: expected a number as value, found {value!r}")
+        # An integer may be longer than any float.
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
+            raise ValueError(f"{name}: expected a number up to {_LARGEST:g} as value, found {str(value)[:60]}")
         return float(value)
 
     def close(self) -> None:

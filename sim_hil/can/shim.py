@@ -81,8 +81,9 @@ class FaultShim:
         self._waiting: list[tuple[float, int, Frame]] = []
         self._order = 0
         self._free_s = 0.0
-        self._babbled = 0
+        self._babbled_until_s: float | None = None  # None: it is silent
         self._off = False
+        self._looked_s = 0.0
         self._done = dict.fromkeys(("drop", "corrupt", "duplicate", "delay", "bus_off", "babble", "starved"), 0)
 
     @property
@@ -151,6 +152,7 @@ class FaultShim:
         arrived = self._bus_state(now_s)
         if not self.is_off(now_s):
             arrived += self._babble(now_s)
+        self._looked_s = now_s
         while self._waiting and self._waiting[0][0] <= now_s:
             frame = heapq.heappop(self._waiting)[2]
             if not self._off:
@@ -167,10 +169,13 @@ class FaultShim:
 
     def _babble(self, now_s: float) -> list[Frame]:
         """The babbler's frames since the last look; it fills the bus and no more."""
-        plan = self.plan
         if not self._babbling(now_s):
+            self._babbled_until_s = None
             return []
-        due = int(min(plan.babble_hz, 1 / FRAME_S) * (now_s - plan.babble_from_s))
-        count, self._babbled = due - self._babbled, due
+        if self._babbled_until_s is None:  # from now on, however long its time has been running
+            self._babbled_until_s = max(self.plan.babble_from_s, self._looked_s)
+        period_s = max(1 / self.plan.babble_hz, FRAME_S)
+        count = int((now_s - self._babbled_until_s) / period_s + 1e-9)
+        self._babbled_until_s += count * period_s
         self._done["babble"] += count
         return [Frame(BABBLER_ID, bytes(8))] * count

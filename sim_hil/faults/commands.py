@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -129,7 +128,7 @@ def parse(line: bytes) -> FaultCommand:
     name, on = table.pop("fault", None), table.pop("on", True)
     if name == CLEAR and not table:
         return FaultCommand(CLEAR, False, {})
-    if name not in KINDS or not isinstance(on, bool):
+    if not isinstance(name, str) or name not in KINDS or not isinstance(on, bool):
         raise FaultCommandError(f"expected on or off of one of {', '.join(KINDS)}, found fault {name!r}, on {on!r}")
     return FaultCommand(name, on, _values(name, KINDS[name], table))
 
@@ -142,7 +141,8 @@ def _values(name: str, kind: FaultKind, table: dict[str, object]) -> dict[str, V
     values: dict[str, Value] = {}
     for key, (default, (low, high)) in kind.numbers.items():
         value = table.get(key, default)
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        # Compared, not converted: an integer may be longer than any float, and NaN is within no range.
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value <= high:  # type: ignore[operator]
             raise FaultCommandError(f"{name}.{key}: expected {low:g} to {high:g}, found {value!r}")
         values[key] = float(value)  # type: ignore[arg-type]

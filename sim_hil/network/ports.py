@@ -72,8 +72,8 @@ class UdpEnds:
         owners = {out.fileno(): (client, out) for client, out in self._clients.items()}
         owner, end = owners.get(descriptor, (None, self._listener))
         packets: list[Packet] = []
-        # ConnectionError: nobody listens at the other address, which on a network is silence.
-        with contextlib.suppress(BlockingIOError, ConnectionError):
+        # Nobody listens at the other address, or no way leads there: on a network that is silence.
+        with contextlib.suppress(OSError):
             for _ in range(_BATCH):
                 data, sender = end.recvfrom(_MAX_DATAGRAM)
                 packets.append((LEFT, data, sender) if owner is None else (RIGHT, data, owner))
@@ -81,7 +81,7 @@ class UdpEnds:
 
     def give(self, packet: Packet) -> None:
         side, data, client = packet
-        with contextlib.suppress(BlockingIOError, ConnectionError):
+        with contextlib.suppress(OSError):
             if side == RIGHT:
                 self._listener.sendto(data, client)  # type: ignore[arg-type]
             else:
@@ -93,7 +93,11 @@ class UdpEnds:
                 self._clients.popitem(last=False)[1].close()
             out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             out.setblocking(False)
-            out.connect(self._right)
+            try:
+                out.connect(self._right)
+            except OSError:
+                out.close()
+                raise
             self._clients[client] = out
         self._clients.move_to_end(client)
         return self._clients[client]
