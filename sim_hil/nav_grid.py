@@ -7,7 +7,6 @@ free cells to 16 neighbours (off by at most 2.8 % before smoothing); a path is t
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from math import ceil, cos, floor, hypot, sin
 
 import numpy as np
@@ -221,21 +220,6 @@ class NavGrid:
             field[self._free] = tree[0]
         return field
 
-    def cost_tree(self, goal: Vec2, price: Array) -> CostTree:
-        """Cheapest ways to the goal, every metre costing the mean price [rows, columns] of the cells it joins."""
-        field, onwards = np.full(self.shape, np.inf), np.full(self.shape, -1, dtype=np.int64)
-        if self.nearest_free(*goal) is not None:
-            joins = self._links.tocoo()
-            cells = price[self._free]
-            data = joins.data * 0.5 * (cells[joins.row] + cells[joins.col])
-            priced = csr_matrix((data, (joins.row, joins.col)), shape=joins.shape)
-            start = int(self._ids[self.free_cell(*goal)])
-            costs, nodes = dijkstra(priced, directed=False, indices=start, return_predecessors=True)
-            field[self._free] = costs
-            flat = self._cells[:, 0] * self.shape[1] + self._cells[:, 1]
-            onwards[self._free] = np.where(nodes >= 0, flat[np.maximum(nodes, 0)], -1)
-        return CostTree(field, onwards)
-
     def field_at(self, field: Array, x_m: float, y_m: float) -> float:
         """A field's value at a point, from the free cells around it; inf where there is none within 1 m."""
         row, column = self.free_cell(x_m, y_m)
@@ -323,14 +307,6 @@ class NavGrid:
             else:
                 high = middle
         return best
-
-
-@dataclass(frozen=True)
-class CostTree:
-    """Cheapest ways to one goal: `cost` [rows, columns], inf out of reach; `onwards` each cell's next, flat, or -1."""
-
-    cost: Array
-    onwards: NDArray[np.int64]
 
 
 def links(

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from edge.geometry import SE2
-from sim_hil.benchmark.baselines import BASELINES, PointGoalPolicy, RandomPolicy, StillPolicy, make_baseline
+from sim_hil.benchmark.baselines import PointGoalPolicy, RandomPolicy, StillPolicy, make_baseline
+from sim_hil.benchmark.conditions import BASELINES
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.policy import Policy
 from sim_hil.benchmark.world import EpisodeWorld

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_hil.benchmark.metrics import collided, is_success, navigation_error_m, path_length_m, spl
+from sim_hil.benchmark.metrics import is_success, navigation_error_m, path_length_m, spl
 from sim_hil.benchmark.outcome import Outcome, measure, trajectory_sha256
 from sim_hil.benchmark.reward import PAPER, RewardWeights, reward
 from tests.benchmark_episodes import corridor_episode
@@ -53,8 +53,6 @@ def test_spl_without_a_shortest_path_is_refused() -> None:
 
 
 def test_one_collision_makes_an_episode_one_with_a_collision() -> None:
-    assert collided([False, True, False])
-    assert not collided([False, False])
     assert outcome(collisions=("person",)).collided and not outcome().collided
 
 

@@ -132,14 +132,6 @@ def test_a_distance_field_falls_to_zero_at_the_goal_and_is_infinite_out_of_reach
     assert grid.field_at(field, 7.0, 0.0) == inf
 
 
-def test_a_price_moves_the_cheapest_way_but_not_what_is_free() -> None:
-    grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
-    plain = grid.cost_tree((8.0, 0.0), np.ones(grid.shape))
-    assert np.allclose(plain.cost, grid.distance_field((8.0, 0.0)))
-    doubled = grid.cost_tree((8.0, 0.0), np.full(grid.shape, 2.0))
-    assert np.allclose(doubled.cost[grid.free], 2 * plain.cost[grid.free])
-
-
 @pytest.mark.parametrize(("rise", "expected"), [(0.04, True), (0.15, False)])
 def test_a_platform_too_high_to_step_on_is_kept_off(rise: float, expected: bool) -> None:
     step = Terrain("step", "platform", (0.0, 0.0, 0.0), 0.0, (4.0, 9.9), rise, "concrete")

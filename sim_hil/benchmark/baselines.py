@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from edge.geometry import SE2, wrap_angle
+from sim_hil.benchmark.conditions import BASELINES
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.policy import Policy, Velocity
@@ -117,17 +118,14 @@ class PointGoalPolicy:
         """Nothing to release."""
 
 
-BASELINES: Final = ("expert", "point-goal", "random", "still")
-
-
 def make_baseline(name: str) -> Policy:
-    """One of BASELINES. Raises ValueError for another name."""
+    """One of BASELINES (`conditions`). Raises ValueError for another name."""
     if name == "expert":
         # Imported here: the planner's libraries take a while to load.
         from sim_hil.benchmark.expert import ExpertPolicy
 
         return ExpertPolicy()
-    made: dict[str, Policy] = {"point-goal": PointGoalPolicy(), "random": RandomPolicy(), "still": StillPolicy()}
-    if name not in made:
+    kinds: dict[str, type[Policy]] = {"point-goal": PointGoalPolicy, "random": RandomPolicy, "still": StillPolicy}
+    if name not in kinds:
         raise ValueError(f"policy: unknown baseline {name!r}, expected one of {', '.join(BASELINES)}")
-    return made[name]
+    return kinds[name]()

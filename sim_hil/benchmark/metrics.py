@@ -1,4 +1,4 @@
-"""The paper's evaluation metrics, equations 6 to 10, of one episode's planar trajectory; pure functions."""
+"""The paper's evaluation metrics, equations 6 to 9, of one episode's planar trajectory; pure functions."""
 
 from __future__ import annotations
 
@@ -37,8 +37,3 @@ def spl(success: bool, shortest_m: float, path_m: float) -> float:
     if not shortest_m > 0:
         raise ValueError(f"spl: expected a shortest path of more than 0 m, found {shortest_m}")
     return shortest_m / max(shortest_m, path_m) if success else 0.0
-
-
-def collided(collisions: Array | list[bool]) -> bool:
-    """C, equation 10: whether there was a collision at any time of the episode."""
-    return bool(np.any(np.asarray(collisions, dtype=bool)))

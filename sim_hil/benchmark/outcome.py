@@ -67,7 +67,7 @@ def measure(
         end=end,
         ne_m=navigation_error_m(last, episode.goal_xy),
         spl=spl(success, episode.shortest_m, path_m),
-        collided=bool(collisions),
+        collided=bool(collisions),  # equation 10: at any time of the episode
         collisions=collisions,
         first_collision_s=first_collision_s,
         fell=fell,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import firmware_bridge
 from edge.artifact_files import ArtifactError
 from firmware_bridge.config import RobotConfig, load_robot_config
-from sim_hil.benchmark.baselines import PointGoalPolicy, RandomPolicy, StillPolicy
+from sim_hil.benchmark.baselines import make_baseline
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.policy import Policy
 
@@ -34,15 +34,7 @@ def open_policy(conditions: Conditions, manifest_sha256: str = "") -> Policy:
     kind = conditions.policy.kind
     if kind == "artifacts":
         return _artifacts(conditions, manifest_sha256)
-    if kind == "external":
-        return _external(conditions)
-    if kind == "expert":
-        from sim_hil.benchmark.expert import ExpertPolicy
-
-        return ExpertPolicy()
-    if kind == "point-goal":
-        return PointGoalPolicy()
-    return RandomPolicy() if kind == "random" else StillPolicy()
+    return _external(conditions) if kind == "external" else make_baseline(kind)
 
 
 def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:
