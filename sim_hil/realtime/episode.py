@@ -9,10 +9,14 @@ from __future__ import annotations
 import json
 import platform
 import shutil
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any, Final
 
 import numpy as np
@@ -92,7 +96,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
     )
-    with Stack(options) as stack:
+    with _asked_to_end(), Stack(options) as stack:
         drive = _run(stack, task, tell)
         stack.end_runner()
         stack.end_bridge()
@@ -114,6 +118,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
     stopped_by = next(iter(_json(stack.result("edge-run-1")).get("faults", [])), "") if drive.end == "stopped" else ""
     return EpisodeResult(
         id=episode.id,
+        task=episode.task,
         scene=episode.scene,
         people=episode.people,
         robot=episode.robot,
@@ -141,6 +146,23 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         attempts=task.attempt,
         host=platform.node(),
     )
+
+
+@contextmanager
+def _asked_to_end() -> Iterator[None]:
+    """Let SIGTERM, by which a worker is ended, unwind the stack: the runner first, then the rest."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def unwind(number: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, unwind)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
