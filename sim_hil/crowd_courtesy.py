@@ -14,6 +14,8 @@ _NOTICE_S = 1.2  # after that, and a share of one's patience, one understands th
 _ASIDE_M, _FURTHER_M = 0.95, 1.3
 _STAY_ASIDE_S = 7.0
 _PACE_MPS = 0.55
+_BACK_M = (0.7, 1.3)
+_STAY_BACK_S = 3.0
 
 
 class Courtesy:
@@ -54,6 +56,21 @@ class Courtesy:
             self._x[person], self._y[person] = x[best], y[best]
             self._until_s[person] = crowd.now_s + _STAY_ASIDE_S
             self._waits_s[person] = 0.0
+
+    def step_back(self, person: int, crowd: Crowd, ways: CrowdMap) -> None:
+        """Make room for others where nobody gets on: go for a moment to where there is most of it."""
+        angles = np.arange(8) * (np.pi / 4)
+        x = crowd.x[person] + np.outer(_BACK_M, np.cos(angles)).ravel()
+        y = crowd.y[person] + np.outer(_BACK_M, np.sin(angles)).ravel()
+        here_x, here_y = np.full(len(x), crowd.x[person]), np.full(len(y), crowd.y[person])
+        others = np.hypot(x[:, None] - crowd.x, y[:, None] - crowd.y)
+        others[:, person] = np.inf
+        room = np.minimum(others.min(axis=1), 1.2) + np.minimum(ways.gaps_at(x, y), 0.6)
+        room[(ways.gaps_at(x, y) < 0.3) | (others.min(axis=1) < 0.5) | ~ways.sees(here_x, here_y, x, y)] = -1.0
+        best = int(np.argmax(room))
+        if room[best] > 0.0:
+            self._x[person], self._y[person] = x[best], y[best]
+            self._until_s[person] = crowd.now_s + _STAY_BACK_S
 
     def like(self, crowd: Crowd, like_x: Array, like_y: Array) -> None:
         """Overrule what those who step aside would like otherwise."""

@@ -73,7 +73,7 @@ class Groups:
         sx = np.where(narrow, crowd.x[lead] + c * behind, sx)
         sy = np.where(narrow, crowd.y[lead] + s * behind, sy)
 
-        talks = crowd.doing[lead] == Doing.HOLD
+        talks = crowd.doing[lead] >= Doing.HOLD
         facing = np.where(talks, crowd.facing[lead], 0.0)
         radius = self._radius
         turn = facing + pi + 2 * pi * crowd.place_in_group[who] / self.size[who]

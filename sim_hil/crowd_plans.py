@@ -8,6 +8,7 @@ import numpy as np
 
 from sim_hil.crowd_courtesy import Courtesy
 from sim_hil.crowd_groups import Groups
+from sim_hil.crowd_jams import Jams
 from sim_hil.crowd_map import CrowdMap
 from sim_hil.crowd_senses import RobotSeen
 from sim_hil.crowd_spots import route_spots, spots_of
@@ -17,7 +18,7 @@ from sim_hil.scene import Scene, Vec2
 
 TALKING, PHONE = 1.0, 2.0
 _WEIGHTS = {"way": 1.0, "stand": 1.6, "queue": 1.6, "sit": 1.2, "door": 1.0}
-_STAY_S = {"way": (6.0, 18.0), "stand": (10.0, 40.0), "door": (1.5, 3.0), "sit": (30.0, 120.0)}
+_STAY_S = {"way": (8.0, 30.0), "stand": (15.0, 60.0), "door": (1.5, 3.0), "sit": (30.0, 120.0)}
 _SERVED_S = (4.0, 10.0)
 _NEAR_M, _AT_M, _PASSED_M = 1.3, 0.3, 0.9
 _OPEN_M, _WALL_SIDE_M = 0.85, 0.5  # who stands about does so in the open, or close by a wall
@@ -25,6 +26,7 @@ _GIVE_WAY_M = 0.75  # from the robot's body axis
 _SEAT_S = 1.2
 _PASSAGES = frozenset(("corridor", "aisle", "street", "crossing"))
 _GROUP_GAP_M = 0.9  # groups do not crowd into corners
+_STEP_BACK_S = 8.0  # blocked so long, one steps back and lets the others past
 _PROGRESS_M = 0.4  # who has not got this far from where one was is stuck
 
 
@@ -49,6 +51,7 @@ class Plans:
         self._onwards = np.ones(crowd.n, dtype=np.int64)
         self._groups = Groups(crowd, rng, alone=bool(self._routes))
         self._courtesy = Courtesy(crowd.n)
+        self._jams = Jams(crowd.n)
 
     # -- the beginning ---------------------------------------------------------------------------------------------
 
@@ -164,13 +167,17 @@ class Plans:
             if together and self._spot_gaps[k] < _GROUP_GAP_M:
                 continue
             weights[k] = _WEIGHTS[spot.kind] / (1.0 + (costs[k] / 30.0) ** 2)
+        weights /= self._jams.prices(self._ways, len(self._spots), x, y)
         if away_from is not None:
             everywhere = np.arange(len(self._spots))
             tx, ty = self._ways.ahead(everywhere, np.full(len(everywhere), x), np.full(len(everywhere), y))
             blocked = (tx - x) * away_from[0] + (ty - y) * away_from[1] > 0.3 * np.hypot(tx - x, ty - y)
             weights[blocked] *= 0.02
         total = float(weights.sum())
-        chosen = int(rng.choice(len(weights), p=weights / total)) if total > 0 else int(rng.integers(len(weights)))
+        if not total > 0:
+            weights = np.where(self._ends, 0.01, 1.0)
+            total = float(weights.sum())
+        chosen = int(rng.choice(len(weights), p=weights / total))
         self._go(person, chosen)
 
     def _hold(self, person: int, heading: float, stay_s: tuple[float, float]) -> None:
@@ -235,6 +242,10 @@ class Plans:
             if line:
                 self._advance(spot, line)
         self._unstick(dt)
+        self._jams.update(crowd, dt)
+        if not self._routes:
+            for person in self._jams.turn_round(crowd, self._ways, self._rng):
+                self._next(int(person))
         self._courtesy.update(crowd, self._ways, robot, dt)
         self._like(robot)
         self._sit(dt)
@@ -299,6 +310,8 @@ class Plans:
         crowd = self._crowd
         crowd.stuck_s[person] = 0.0
         crowd.squeeze_s[person] = 3.0
+        if crowd.blocked_s[person] > _STEP_BACK_S and crowd.doing[person] in (Doing.WALK, Doing.QUEUE):
+            self._courtesy.step_back(person, crowd, self._ways)
         if crowd.doing[person] == Doing.WALK:
             spot = self._spots[int(crowd.spot[person])]
             left = hypot(crowd.target_x[person] - crowd.x[person], crowd.target_y[person] - crowd.y[person])
@@ -307,6 +320,8 @@ class Plans:
                 return
             norm = hypot(crowd.like_x[person], crowd.like_y[person]) or 1.0
             self._next(person, away_from=(crowd.like_x[person] / norm, crowd.like_y[person] / norm))
+        elif crowd.doing[person] == Doing.QUEUE and crowd.blocked_s[person] > _STEP_BACK_S:
+            self._next(person)  # who cannot get to the queue's next place gives it up
         elif crowd.doing[person] == Doing.FOLLOW:
             self._groups.lose_patience(crowd, person)
         elif crowd.doing[person] == Doing.HOLD:

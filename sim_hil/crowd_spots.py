@@ -16,6 +16,7 @@ _SIDE_M = 0.8
 _WANDER_M2, _WANDER_MIN, _WANDER_MAX = 35.0, 10, 20
 _PLACES_MIN, _PLACES_MAX = 10, 40  # each costs a field of ways over the whole floor
 _WANDER_GAP_M = 0.55
+_JUNCTION_M = 2.6  # more than two free ways of this length meet at a junction
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ def spots_of(scene: Scene, ways: CrowdMap, people: int, rng: np.random.Generator
     """Where so many people go: some of a large scene's places, drawn from the seed, and points of its floor."""
     most = int(np.clip(people + _PLACES_MIN, _PLACES_MIN, _PLACES_MAX))
     drawn = sorted(rng.permutation(len(scene.places))[:most].tolist())
-    found = (_of_place(scene.places[k], ways) for k in drawn)
+    places = (scene.places[k] for k in drawn)
+    found = (_of_place(place, ways) for place in places if place.kind == "door" or not _at_junction(scene, place, ways))
     return [spot for spot in found if spot is not None] + _scattered(ways, rng)
 
 
@@ -50,6 +52,17 @@ def _of_place(place: Place, ways: CrowdMap) -> Spot | None:
         return Spot("queue", reach, _in_line(place, ways), place.heading_rad)
     slots = [slot for slot in _abreast(place) if _gap(ways, slot) > 0.27]
     return Spot(place.kind, reach, tuple(slots) or (reach,), place.heading_rad)
+
+
+def _at_junction(scene: Scene, place: Place, ways: CrowdMap) -> bool:
+    """Whether a place lies where corridors meet: who stands there stands in everybody's way."""
+    x, y = place.position_m
+    area = scene.area_at(x, y)
+    if area is None or area.kind != "corridor":
+        return False
+    here = np.full(4, x), np.full(4, y)
+    there = x + _JUNCTION_M * np.array((1.0, 0.0, -1.0, 0.0)), y + _JUNCTION_M * np.array((0.0, 1.0, 0.0, -1.0))
+    return int(ways.sees(*here, *there).sum()) > 2
 
 
 def _in_line(place: Place, ways: CrowdMap) -> tuple[Vec2, ...]:

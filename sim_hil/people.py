@@ -6,7 +6,7 @@ a wall, another person or the robot; ten times a second they look around, decide
 
 from __future__ import annotations
 
-from math import pi
+from math import hypot, pi
 from typing import Final
 
 import numpy as np
@@ -41,6 +41,7 @@ _SQUEEZE_TOUCH_M, _SQUEEZE_CLOSE_M = 0.45, 0.55
 _BODIES_M = 0.45  # two people are never closer
 _ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
 _ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
+_ROBOT_STANDS_MPS = 0.15
 _PUSHED: Final = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
 _WALL_M = 0.22
 _HURRY_PER_S = 0.3  # see crowd_steering.choose
@@ -229,10 +230,16 @@ class People:
             return
         rx, ry, gap = robot.nearest(x, y)
         close = np.flatnonzero((gap < _ROBOT_BODY_M) & (crowd.doing != Doing.SIT))
+        stands = hypot(robot.vx, robot.vy) < _ROBOT_STANDS_MPS
         for k in close:
             nx, ny = rx[k] / (gap[k] + 1e-9), ry[k] / (gap[k] + 1e-9)
             inwards = (x[k] - crowd.x[k]) * nx + (y[k] - crowd.y[k]) * ny
-            push = max(-inwards, 0.0) if gap[k] > 0.4 else max(-inwards, 0.0) + min(0.4 - gap[k], 0.03)
+            push = max(-inwards, 0.0)
+            if gap[k] <= 0.4:
+                push += min(0.4 - gap[k], 0.03)
+            elif stands:
+                # Next to one that has come to a stop people move off; from one that drives they must have walked.
+                push += min(_ROBOT_BODY_M - gap[k], 0.02)
             x[k] += nx * push
             y[k] += ny * push
 
