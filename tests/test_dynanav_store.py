@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim_hil.benchmark.results import EpisodeResult, FailedRun, ResultError
-from sim_hil.benchmark.store import RESULTS, ResultStore, StoreError, read_results
+from sim_hil.benchmark.store import FAILED, RESULTS, ResultStore, StoreError, read_failed, read_results
 from tests import dynanav_fakes as fakes
 
 CONFIG = {"suite": "dynanav", "conditions": {"drift": "none"}, "episodes": ["a", "b"]}
@@ -77,6 +77,22 @@ def test_failed_runs_are_recorded_and_tried_again_by_a_resumed_run(tmp_path: Pat
     store.close()
     resumed = ResultStore.resume(store.directory, CONFIG)
     assert not resumed.failed and not resumed.has("a") and not (store.directory / "failed.jsonl").exists()
+
+
+def test_failed_runs_are_read_back_without_a_torn_last_line(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    assert read_failed(store.directory) == []
+    store.add_failed(FailedRun("a", 2, "died"))
+    with (store.directory / FAILED).open("a") as file:
+        file.write('{"id": "b", "att')
+    assert read_failed(store.directory) == [FailedRun("a", 2, "died")] == store.failed
+
+
+def test_a_damaged_failed_run_is_one_clear_line_with_its_number(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    (store.directory / FAILED).write_text('{"id": "a", "attempts": "two", "why": "died"}\n')
+    with pytest.raises(StoreError, match=r"failed.jsonl:1: failed run: expected an object with id"):
+        read_failed(store.directory)
 
 
 def test_a_damaged_line_is_one_clear_line_with_its_number(tmp_path: Path) -> None:

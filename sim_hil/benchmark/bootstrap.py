@@ -1,4 +1,4 @@
-"""Confidence intervals by resampling episodes: seeded, so that the same results give the same interval."""
+"""Confidence intervals by resampling tasks and their episodes: seeded, so the same results give the same interval."""
 
 from __future__ import annotations
 
@@ -10,27 +10,64 @@ from numpy.typing import NDArray
 RESAMPLES = 10_000
 SEED = 85  # of every interval of a report
 _TAG = 0xB007
+_Z2 = 1.959964**2  # 97.5 % point of the normal distribution, squared
+
+Range = tuple[float, float]
 
 
-def mean_ci95(values: Sequence[float], seed: int = SEED, resamples: int = RESAMPLES) -> tuple[float, float] | None:
-    """95 % percentile bootstrap interval of the mean of per-episode values; None for fewer than two of them."""
+def mean_ci95(
+    values: Sequence[float],
+    tasks: Sequence[str],
+    bounds: Range | None = None,
+    seed: int = SEED,
+    resamples: int = RESAMPLES,
+) -> Range | None:
+    """95 % interval of the mean of per-episode values; None for fewer than two of them. Raises ValueError on lengths.
+
+    Percentile bootstrap in two stages, as episodes of one task resemble each other: tasks with replacement, then of
+    each as many of its episodes (of one task alone: its episodes). Values that are all equal tell nothing when they are
+    resampled; where a value has `bounds` (lowest, highest) the interval is then Wilson's for an event that none of so
+    many episodes showed, at its worst: of 85 successes in 85 episodes [95.7, 100] %.
+    """
+    if len(values) != len(tasks):
+        raise ValueError(f"bootstrap: expected a task for every value, found {len(values)} and {len(tasks)}")
     if len(values) < 2:
         return None
-    means = _resampled_means(np.asarray(values, dtype=np.float64), seed, resamples)
-    low, high = np.percentile(means, (2.5, 97.5))
+    array = np.asarray(values, dtype=np.float64)
+    if bounds is not None and np.ptp(array) == 0:
+        value, share = float(array[0]), _Z2 / (len(array) + _Z2)
+        return value - share * (value - bounds[0]), value + share * (bounds[1] - value)
+    low, high = np.percentile(_resampled_means(array, tasks, seed, resamples), (2.5, 97.5))
     return float(low), float(high)
 
 
 def paired_ci95(
-    before: Sequence[float], after: Sequence[float], seed: int = SEED, resamples: int = RESAMPLES
-) -> tuple[float, float] | None:
-    """The same for the mean of `after - before`, episode by episode. Raises ValueError on different lengths."""
+    before: Sequence[float],
+    after: Sequence[float],
+    tasks: Sequence[str],
+    bounds: Range | None = None,
+    seed: int = SEED,
+    resamples: int = RESAMPLES,
+) -> Range | None:
+    """The same for the mean of `after - before`, episode by episode; `bounds` are those of one value."""
     if len(before) != len(after):
         raise ValueError(f"paired bootstrap: expected as many values on both sides, found {len(before)}, {len(after)}")
-    return mean_ci95([b - a for a, b in zip(before, after, strict=True)], seed, resamples)
+    most = None if bounds is None else bounds[1] - bounds[0]
+    differences = [b - a for a, b in zip(before, after, strict=True)]
+    return mean_ci95(differences, tasks, None if most is None else (-most, most), seed, resamples)
 
 
-def _resampled_means(values: NDArray[np.float64], seed: int, resamples: int) -> NDArray[np.float64]:
+def _resampled_means(
+    values: NDArray[np.float64], tasks: Sequence[str], seed: int, resamples: int
+) -> NDArray[np.float64]:  # fmt: skip
+    _, task_of, sizes = np.unique(np.asarray(tasks), return_inverse=True, return_counts=True)
+    by_task = np.zeros((len(sizes), int(sizes.max())))  # [task, episode of it], zeros behind its last
+    for task in range(len(sizes)):
+        by_task[task, : sizes[task]] = values[task_of == task]
     rng = np.random.default_rng((seed, _TAG))
-    picks = rng.integers(0, len(values), size=(resamples, len(values)))
-    return np.asarray(values[picks].mean(axis=1))
+    picked = rng.integers(0, len(sizes), size=(resamples, len(sizes)))
+    sums = np.zeros(picked.shape)
+    for turn in range(by_task.shape[1]):  # one episode of every picked task at a time, to stay small
+        which = rng.integers(0, sizes[picked])
+        sums += np.where(turn < sizes[picked], by_task[picked, which], 0.0)
+    return np.asarray(sums.sum(axis=1) / sizes[picked].sum(axis=1))

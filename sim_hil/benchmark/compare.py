@@ -12,7 +12,7 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_resul
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.report import write_report
 from sim_hil.benchmark.results import ResultError
-from sim_hil.benchmark.store import ResultStore, StoreError, read_config, read_results
+from sim_hil.benchmark.store import ResultStore, StoreError, read_config, read_failed, read_results
 from sim_hil.benchmark.summary import compare, summarise
 
 EXAMPLES = """examples:
@@ -20,7 +20,8 @@ EXAMPLES = """examples:
   edge-bench compare out/nano-2s out/nano-5s --json difference.json
   edge-bench report out/nano-2s
 
-A difference is B less A over the episodes that both have; its interval is a paired bootstrap over them.
+A difference is B less A over the episodes that both have; its interval is a paired bootstrap over
+tasks and their episodes.
 exit codes: 0 done, 2 bad arguments or input
 """
 _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, points"}
@@ -54,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def compared(before: Path, after: Path) -> dict[str, Any]:
-    """Both runs' conditions and their paired differences. Raises StoreError if no episode is in both."""
+    """Both runs' conditions and their paired differences. Raises StoreError or ResultError if none can be."""
     configs = [read_config(directory) for directory in (before, after)]
     if configs[0].get("suite") != configs[1].get("suite"):
         raise StoreError(
@@ -71,7 +72,7 @@ def compared(before: Path, after: Path) -> dict[str, Any]:
 
 def _report(directory: Path) -> int:
     config = read_config(directory)
-    store = ResultStore(directory, config, read_results(directory))
+    store = ResultStore(directory, config, read_results(directory), failed=read_failed(directory))
     title = f"DynaNav: {Path(config['suite']).stem}, {config['conditions']['policy']}"
     sys.stdout.write(f"{write_report(store, summarise(store.results), title)}\n")
     return EXIT_DONE

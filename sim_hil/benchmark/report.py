@@ -52,7 +52,7 @@ def _parts(
         f"<h1>{page.text_html(title)}</h1>",
         f'<p class="quiet">{page.text_html(conditions.describe())}; suite “{page.text_html(store.config["suite"])}”, '
         f"{len(results)} of {asked} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
-        "over episodes. Paths and collisions are the simulator's own, not the robot's odometry.</p>",
+        "over tasks and their episodes. Paths and collisions are the simulator's own, not the robot's odometry.</p>",
         _untrained(store.config),
         page.tiles(_headline(summary)),
         _failed(store),

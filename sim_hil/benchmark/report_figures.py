@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.benchmark.bootstrap import mean_ci95
 from sim_hil.benchmark.results import EpisodeResult
-from sim_hil.benchmark.summary import GROUPS, METRICS, grouped_by
+from sim_hil.benchmark.summary import GROUPS, METRICS, grouped_by, interval_of
 from sim_hil.report_style import BAD, GOOD, INK, MUTED, TRUTH, legend_above, new_figure, png, tidy
 from sim_hil.scene import Scene
 from sim_hil.scene_map import draw_map, draw_mark, draw_path, map_view
@@ -32,9 +31,8 @@ def rates(results: Sequence[EpisodeResult]) -> bytes:
     for axes, (name, members) in zip(all_axes, groups, strict=True):
         at = np.arange(len(members), dtype=float)
         for offset, metric, colour, label in ((-0.2, "sr", TRUTH, "success"), (0.2, "cr", BAD, "collision")):
-            values = [[METRICS[metric](result) for result in each] for _, each in members]
-            means = np.array([float(np.mean(each)) for each in values])
-            spans = [mean_ci95(each) or (mean, mean) for each, mean in zip(values, means, strict=True)]
+            means = np.array([float(np.mean([METRICS[metric](result) for result in each])) for _, each in members])
+            spans = [interval_of(each, metric) or (mean, mean) for (_, each), mean in zip(members, means, strict=True)]
             errors = np.array([[m - low, high - m] for m, (low, high) in zip(means, spans, strict=True)]).T
             axes.bar(at + offset, means, 0.36, color=colour, alpha=0.9, label=f"{label} rate")
             axes.errorbar(at + offset, means, np.maximum(errors, 0), fmt="none", ecolor=INK, elinewidth=1, capsize=2.5)

@@ -22,6 +22,8 @@ class EpisodeResult:
     """
 
     id: str
+    task: str
+    """Episodes of one task share start, goal and instructions; intervals resample tasks."""
     scene: str
     people: int
     robot: str
@@ -59,6 +61,8 @@ class EpisodeResult:
             value = getattr(self, name)
             if not (_is_number(value) and value >= 0):
                 raise ResultError(f"episode {self.id}: expected {name} of 0 or more, found {value!r}")
+        if not (isinstance(self.task, str) and self.task):
+            raise ResultError(f"episode {self.id}: expected the name of its task, found {self.task!r}")
         if self.spl > 100 or (self.spl > 0 and not self.success):
             raise ResultError(f"episode {self.id}: expected spl of 0..100 and 0 without success, found {self.spl!r}")
         for name in ("success", "collided", "fell"):
@@ -95,6 +99,14 @@ class FailedRun:
     id: str
     attempts: int
     why: str
+
+    @staticmethod
+    def of_json(content: object) -> FailedRun:
+        """What `asdict` makes of one; raises ResultError."""
+        types = {"id": str, "attempts": int, "why": str}
+        if not isinstance(content, Mapping) or {key: type(value) for key, value in content.items()} != types:
+            raise ResultError("failed run: expected an object with id (text), attempts (whole number) and why (text)")
+        return FailedRun(**content)
 
 
 def _is_number(value: object) -> bool:

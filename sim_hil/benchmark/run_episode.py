@@ -60,6 +60,7 @@ def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         wall_s = (time.monotonic_ns() - started_ns) / 1e9
         return EpisodeResult(
             id=episode.id,
+            task=episode.task,
             scene=episode.scene,
             people=episode.people,
             robot=episode.robot,

@@ -36,13 +36,14 @@ class ResultStore:
         config: Mapping[str, Any],
         results: Sequence[EpisodeResult],
         lock: IO[bytes] | None = None,
+        failed: Sequence[FailedRun] = (),
     ) -> None:
         """`lock` keeps other runs out for as long as it is open."""
         self._lock = lock
         self.directory = directory
         self.config = config
         self._results = {result.id: result for result in results}
-        self._failed: list[FailedRun] = []
+        self._failed = list(failed)
 
     @staticmethod
     def create(directory: Path, config: Mapping[str, Any]) -> ResultStore:
@@ -136,6 +137,18 @@ def read_results(directory: Path) -> list[EpisodeResult]:
             raise StoreError(f"{path}:{number}: episode {result.id} is there twice")
         results[result.id] = result
     return list(results.values())
+
+
+def read_failed(directory: Path) -> list[FailedRun]:
+    """Episodes of a run that have no result, a torn last line left out; raises StoreError."""
+    path = directory / FAILED
+    failed = []
+    for number, line in enumerate(_whole_lines(path) if path.exists() else (), 1):
+        try:
+            failed.append(FailedRun.of_json(json.loads(line)))
+        except (ValueError, ResultError) as error:
+            raise StoreError(f"{path}:{number}: {error}") from error
+    return failed
 
 
 def _locked(directory: Path) -> IO[bytes]:

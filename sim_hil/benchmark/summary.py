@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from sim_hil.benchmark.bootstrap import mean_ci95, paired_ci95
-from sim_hil.benchmark.results import EpisodeResult
+from sim_hil.benchmark.bootstrap import Range, mean_ci95, paired_ci95
+from sim_hil.benchmark.results import EpisodeResult, ResultError
 
 CROWD_LEVELS = ((0, "0"), (20, "1-20"), (40, "21-40"), (60, "41-60"), (10_000, "61 and more"))
 """(up to so many people, name)."""
@@ -18,6 +18,10 @@ METRICS: dict[str, Callable[[EpisodeResult], float]] = {
     "cr": lambda result: 100.0 * result.collided,
 }
 """What each episode adds to a mean (paper equations 6 to 10)."""
+BOUNDS: dict[str, Range | None] = {"sr": (0.0, 100.0), "spl": (0.0, 100.0), "ne_m": None, "cr": (0.0, 100.0)}
+"""Lowest and highest that one episode can add."""
+_SAME = ("task", "scene", "robot", "people", "seed", "shortest_m", "timeout_s")
+"""What makes two results ones of the same episode; its id is only a name."""
 
 GROUPS: dict[str, Callable[[EpisodeResult], str]] = {
     "scene": lambda result: result.scene,
@@ -33,8 +37,7 @@ def crowd_level(people: int) -> str:
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """`episodes`, every metric's mean and `*_ci95`, and the same under `by_scene`, `by_crowd`, `by_robot`."""
-    # Resampling depends on the order, and with several jobs results come in any.
-    results = sorted(results, key=lambda result: result.id)
+    results = sorted(results, key=lambda result: result.id)  # a sum's last digits depend on the order
     grouped = {f"by_{name}": {key: _means(members) for key, members in grouped_by(results, name)} for name in GROUPS}
     return {**_means(results), **grouped}
 
@@ -48,11 +51,18 @@ def grouped_by(results: Iterable[EpisodeResult], name: str) -> list[tuple[str, l
     return sorted(groups.items(), key=lambda item: (order.index(item[0]) if item[0] in order else 0, item[0]))
 
 
+def interval_of(results: Sequence[EpisodeResult], name: str) -> Range | None:
+    """95 % interval of a metric's mean, None for fewer than two results."""
+    # Resampling depends on the order, and with several jobs results come in any.
+    results = sorted(results, key=lambda result: result.id)
+    return mean_ci95([METRICS[name](result) for result in results], [result.task for result in results], BOUNDS[name])
+
+
 def _means(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     means: dict[str, Any] = {"episodes": len(results)}
     for name, value_of in METRICS.items():
         values = [value_of(result) for result in results]
-        interval = mean_ci95(values)
+        interval = interval_of(results, name)
         means[name] = round(sum(values) / len(values), 4) if values else None
         means[f"{name}_ci95"] = None if interval is None else [round(bound, 4) for bound in interval]
     return means
@@ -61,15 +71,18 @@ def _means(results: Sequence[EpisodeResult]) -> dict[str, Any]:
 def compare(before: Sequence[EpisodeResult], after: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Differences `after - before` over the episodes that both have, with paired bootstrap intervals.
 
-    `significant`: the interval does not hold zero.
+    `significant`: the interval does not hold zero. Raises ResultError where a name stands for two different episodes.
     """
     first, second = ({result.id: result for result in results} for results in (before, after))
     ids = sorted(name for name in first if name in second)
     pairs = [(first[name], second[name]) for name in ids]
+    for one, other in pairs:
+        _check_same_episode(one, other)
+    tasks = [one.task for one, _ in pairs]
     differences: dict[str, Any] = {}
     for name, value_of in METRICS.items():
         a, b = [value_of(one) for one, _ in pairs], [value_of(other) for _, other in pairs]
-        interval = paired_ci95(a, b)
+        interval = paired_ci95(a, b, tasks, BOUNDS[name])
         differences[name] = {
             "before": round(sum(a) / len(a), 4) if a else None,
             "after": round(sum(b) / len(b), 4) if b else None,
@@ -85,3 +98,13 @@ def compare(before: Sequence[EpisodeResult], after: Sequence[EpisodeResult]) -> 
         "succeeded_in_after_only": [b.id for a, b in pairs if b.success and not a.success],
         "differences": differences,
     }
+
+
+def _check_same_episode(before: EpisodeResult, after: EpisodeResult) -> None:
+    for name in _SAME:
+        was, now = getattr(before, name), getattr(after, name)
+        if was != now:
+            raise ResultError(
+                f"episode {before.id}: expected the same {name} in both runs, found {was} and {now}; they are of two "
+                "versions of the suite: run one of them again"
+            )
