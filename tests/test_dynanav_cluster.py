@@ -8,13 +8,13 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from sim_hil.benchmark.cluster import ClusterError, ClusterJobs, run_on_node
-from sim_hil.benchmark.jobs import RunWatcher, run_all
+from sim_hil.benchmark.jobs import POLL_S, RunWatcher, run_all
 from sim_hil.benchmark.store import ResultStore, read_results
 from tests import dynanav_fakes as fakes
 from tests.processes import REPOSITORY
@@ -86,6 +86,62 @@ def test_a_killed_workers_episode_is_run_again_and_none_is_lost_or_counted_twice
 def test_an_address_without_a_cluster_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClusterError, match=r"--cluster nonsense: no Ray cluster there"):
         ClusterJobs("nonsense")
+
+
+class NoProcessors:
+    """A cluster, as Ray tells of it, whose processors come and go as a test says."""
+
+    def __init__(self) -> None:
+        self.processors = 0
+        self.now_ns = 0
+        self.slept_s: list[float] = []
+
+    def sleep(self, time_s: float) -> None:
+        self.slept_s.append(time_s)
+        self.now_ns += round(time_s * 1e9)
+
+    def init(self, **_: object) -> None:
+        """Nothing to reach."""
+
+    def remote(self, **_: object) -> Callable[[object], object]:
+        return lambda function: function
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": float(self.processors)} if self.processors else {}
+
+    def shutdown(self) -> None:
+        """Nothing to leave."""
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> NoProcessors:
+    cluster = NoProcessors()
+    monkeypatch.setitem(sys.modules, "ray", cluster)
+    return cluster
+
+
+def jobs_on(cluster: NoProcessors) -> ClusterJobs:
+    return ClusterJobs("here:1", now_ns=lambda: cluster.now_ns, sleep=cluster.sleep)
+
+
+def test_a_cluster_without_processors_is_given_up_in_one_line_and_not_spun_on(
+    bare: NoProcessors, tmp_path: Path
+) -> None:
+    store = ResultStore.create(tmp_path / "out", {"episodes": []})
+    with pytest.raises(ClusterError, match=r"--cluster here:1: expected a processor .* none for 60 s; add a node"):
+        run_all([fakes.task("a", store.directory)], jobs_on(bare), store)
+    assert set(bare.slept_s) == {POLL_S} and sum(bare.slept_s) == pytest.approx(60, abs=1)
+
+
+def test_a_cluster_whose_processors_come_back_is_not_given_up(bare: NoProcessors) -> None:
+    jobs = jobs_on(bare)
+    bare.sleep(59)
+    assert jobs.free() == 0
+    bare.processors = 2
+    assert jobs.free() == 2
+    bare.processors = 0
+    bare.sleep(59)
+    assert jobs.wait(0.2) == () and jobs.free() == 0
 
 
 def test_a_node_with_other_code_refuses_its_episodes(tmp_path: Path) -> None:

@@ -160,6 +160,25 @@ def test_it_is_told_what_a_robot_knows_and_nothing_of_the_goal(tmp_path: Path) -
     assert "goal" not in json.dumps([message.header for message in told])
 
 
+def test_it_is_not_told_which_episode_of_the_suite_it_drives(tmp_path: Path) -> None:
+    told: list[Mapping[str, Any]] = []
+
+    def answer(message: Message, channel: Channel) -> Answer:
+        if message.kind == "reset":
+            told.append(message.header)
+        return driving([0.0, 0.0, 0.0])(message, channel)
+
+    with serving(tmp_path, answer) as address:
+        policy = connect(address)
+        for name, seed in (("hospital-reception-20-go2", 10022), ("office-desk-0-go2", 10022)) * 2:
+            policy.reset(fakes.episode(name, seed=seed), "go on", None, seed)
+        policy.close()
+    first, second, again, _ = told
+    assert first == again and first["episode"] != second["episode"] and first["seed"] != second["seed"]
+    said = json.dumps(told)
+    assert "reception" not in said and "desk" not in said and "10022" not in said
+
+
 def test_velocities_are_cut_to_the_robots_limits(tmp_path: Path) -> None:
     with serving(tmp_path, driving([99.0, -9.0, -9.0])) as address:
         policy = connect(address)

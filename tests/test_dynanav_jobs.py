@@ -132,6 +132,16 @@ def test_what_no_further_attempt_can_mend_ends_the_run_with_its_line(tmp_path: P
     assert caught.value.code == 2
 
 
+def test_a_worker_that_is_slow_to_exit_is_waited_for_without_spinning(tmp_path: Path) -> None:
+    jobs, waits, ended = LocalJobs(1, FAKE_WORKER), 0, []
+    jobs.start(fakes.task("lingers", tmp_path))
+    while not ended and waits < 200:
+        ended = list(jobs.wait(0.2))
+        waits += 1
+    jobs.close()
+    assert ended and ended[0].result is not None and waits < 200
+
+
 def test_closing_ends_the_workers_that_still_run(tmp_path: Path) -> None:
     jobs = LocalJobs(1, FAKE_WORKER)
     jobs.start(fakes.task("hangs", tmp_path))

@@ -10,7 +10,8 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,18 +28,30 @@ from sim_hil.benchmark.task import EpisodeTask
 ATTEMPTS = 4
 """On a cluster a node takes its episodes along when it dies, which says nothing of the episode."""
 CPUS_PER_EPISODE = 1
+NO_PROCESSOR_S = 60.0
+"""How long a cluster may be without any processor: a node that starts again is back by then."""
 
 
 class ClusterError(RuntimeError):
-    """No cluster to hand episodes to; one line."""
+    """No cluster, or none with a processor, to hand episodes to; one line."""
 
 
 class ClusterJobs:
-    """As many episodes at a time as the cluster has processors. Raises ClusterError when it cannot be reached."""
+    """As many episodes at a time as the cluster has processors. Raises ClusterError when it cannot be reached.
+
+    `free` and `wait` raise it too, after NO_PROCESSOR_S in which the cluster had no processor at all.
+    """
 
     attempts = ATTEMPTS
 
-    def __init__(self, address: str, worker: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        address: str,
+        worker: Sequence[str] | None = None,
+        *,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         """`worker`: the command of a worker process on a node, if it is not its own interpreter's."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
@@ -62,11 +75,24 @@ class ClusterJobs:
         self._code_sha256 = code_sha256()
         self._running: dict[Any, str] = {}
         self._open = True
+        self._address, self._now_ns, self._sleep = address, now_ns, sleep
+        self._had_processor_ns = now_ns()
 
     def free(self) -> int:
         """Processors of the cluster without an episode of this run."""
-        cpus = int(self._ray.cluster_resources().get("CPU", 0))
-        return cpus // CPUS_PER_EPISODE - len(self._running)
+        return self._slots() - len(self._running)
+
+    def _slots(self) -> int:
+        slots = int(self._ray.cluster_resources().get("CPU", 0)) // CPUS_PER_EPISODE
+        now_ns = self._now_ns()
+        if slots > 0:
+            self._had_processor_ns = now_ns
+        elif now_ns - self._had_processor_ns > NO_PROCESSOR_S * 1e9:
+            raise ClusterError(
+                f"--cluster {self._address}: expected a processor for an episode, found none for {NO_PROCESSOR_S:g} s; "
+                "add a node with `ray start --address`, then repeat the command (with --resume if it had --out)"
+            )
+        return slots
 
     def start(self, task: EpisodeTask) -> None:
         """Hand out a task."""
@@ -75,7 +101,9 @@ class ClusterJobs:
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
         """Tasks that have ended, with or without a result."""
+        self._slots()
         if not self._running:
+            self._sleep(timeout_s)
             return ()
         ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=timeout_s)
         return [self._ended(reference) for reference in ready]

@@ -7,6 +7,7 @@ a time, as a model would run on the robot.
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -105,18 +106,22 @@ class ExternalPolicy:
         return None if self._image is None else (self._image["width"], self._image["height"])
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
-        """Tell the server that an episode begins; it is told nothing that a robot would not know."""
+        """Tell the server that an episode begins; it is told nothing that a robot would not know.
+
+        Episode and seed are told as numbers derived from them: an id names the goal, and the seed is the crowd's.
+        """
         self._sampler = None if self._latency is None else LatencySampler(self._latency, seed, episode.id)
         self._step, self._due_ns, self._asked_ns, self.clipped = 0, 0, 0, 0
         self._command, self._answer, self._notes = (0.0, 0.0, 0.0), None, {}
         self._seen_ns = None
+        digest = hashlib.sha256(f"{PROTOCOL} {seed} {episode.id}".encode()).hexdigest()
         self._channel.send(
             {
                 "type": "reset",
-                "episode": episode.id,
+                "episode": digest[:16],
                 "robot": episode.robot,
                 "instruction": instruction,
-                "seed": seed,
+                "seed": int(digest[16:24], 16),
                 "control_period_s": CONTROL_PERIOD_S,
                 "limits": asdict(self._limits),
             }

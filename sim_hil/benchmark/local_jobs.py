@@ -27,6 +27,8 @@ ATTEMPTS = 2
 LONGEST_NS = 7_200_000_000_000
 """An episode that takes more than two hours of real time hangs."""
 GRACE_S = 2.0
+EXIT_POLL_S = 0.05
+"""How soon the exit of a worker is seen that has said its last."""
 TAIL_CHARS = 400
 _GREETING = "pybullet build time"
 """What every process says that loads the engine; no reason to die."""
@@ -45,6 +47,8 @@ class Attempt:
     buffer: bytearray = field(default_factory=bytearray)
     time_s: float = 0.0
     ended: Ended | None = None
+    at_end: bool = False
+    """Nothing more can come: the worker has closed its end, or has died."""
 
 
 class LocalJobs:
@@ -97,6 +101,8 @@ class LocalJobs:
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
         """Attempts whose process has ended."""
+        if any(attempt.at_end for attempt in self._running.values()):
+            timeout_s = min(timeout_s, EXIT_POLL_S)
         for key, _ in self._selector.select(timeout_s):
             self._read(key.data)
         ended: list[Ended] = []
@@ -128,8 +134,11 @@ class LocalJobs:
         self._selector.close()
 
     def _read(self, attempt: Attempt) -> None:
-        while data := _available(attempt.lines):
+        while not attempt.at_end and (data := attempt.lines.read(1 << 16)) is not None:  # None: nothing yet
             attempt.buffer += data
+            if not data:  # a pipe at its end is always readable: left registered, it would wake `wait` at once for ever
+                attempt.at_end = True
+                self._selector.unregister(attempt.lines)
         *whole, rest = bytes(attempt.buffer).split(b"\n")
         attempt.buffer[:] = rest
         for line in whole:
@@ -137,7 +146,8 @@ class LocalJobs:
 
     def _finish(self, name: str, attempt: Attempt) -> Ended:
         del self._running[name]
-        self._selector.unregister(attempt.lines)
+        if not attempt.at_end:  # a process that the worker has left behind holds its end open
+            self._selector.unregister(attempt.lines)
         attempt.lines.close()
         if attempt.ended is not None:
             attempt.log.unlink(missing_ok=True)
@@ -155,13 +165,6 @@ def _hand_over(process: subprocess.Popen[bytes], data: bytes) -> None:
         process.stdin.flush()
     with suppress(BrokenPipeError):
         process.stdin.close()
-
-
-def _available(lines: IO[bytes]) -> bytes | None:
-    try:
-        return lines.read(1 << 16)
-    except BlockingIOError:
-        return None
 
 
 def _understand(attempt: Attempt, line: bytes) -> None:
