@@ -20,7 +20,10 @@ CLOCKS = ("lockstep", "realtime")
 MODES = ("async", "sync", "no-reasoning")
 DRIFTS = tuple(LEVELS)
 DEFAULT_LATENCY_S = {"async": 2.0, "sync": 2.0, "no-reasoning": 0.25}
-"""Of a policy from artifacts: about 2 s (paper, appendix D), and without reasoning 4 Hz (section 4.4)."""
+"""Of a policy from artifacts: about 2 s (paper, appendix D), and without reasoning 4 Hz (section 4.4).
+
+Releases are at ticks of 10 Hz, so that 0.25 s becomes 0.3 s in lockstep: 3.3 Hz.
+"""
 MAX_EXTERNAL_TIMEOUT_S = 3600.0
 _VARIANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", re.ASCII)
 _CAMERA = re.compile(r"(\d{2,4})x(\d{2,4})", re.ASCII)
