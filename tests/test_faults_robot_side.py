@@ -270,3 +270,8 @@ def test_without_the_flag_the_code_that_injects_is_not_even_loaded() -> None:
     code = "import sim_hil.hil, sim_hil.unitree.videohub, sys; print(any('sim_hil.faults' in m for m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("False")
+
+
+def test_slower_topics_carry_the_same_faults_between_two_states_of_the_main_one() -> None:
+    assert faults_with("error-code", code=7).beside(state())[0].error_code == 7
+    assert faults_with("state-silent").beside(state()) == []

@@ -146,6 +146,13 @@ class TestPostures:
         stage.run(2.5, lambda: stage.ask(1008, x=0.5, y=0, z=0))
         assert stage.pose().x_m - where.x_m > 0.4
 
+    def test_one_velocity_that_ends_a_turned_body_moves_nothing_after_its_second(self, stage: Stage) -> None:
+        stage.ask(1007, x=0.3, y=0, z=0)
+        stage.run(1.5)
+        stage.ask(1008, x=0.5, y=0, z=0)
+        stage.run(1.0)
+        assert stage.behaviour.commanded == (0.0, 0.0, 0.0)
+
     def test_a_pose_keeps_its_mode_however_it_is_turned_until_it_is_ended(self, stage: Stage) -> None:
         stage.ask(1028, data=True)
         stage.run(1.5)

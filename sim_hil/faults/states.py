@@ -88,6 +88,11 @@ class StateFaults:
         self._waiting.clear()
         return out
 
+    def beside(self, message: Any) -> list[Any]:
+        """What goes out now on a slower topic, between two states of the main one; the message itself is altered."""
+        self._alter(message)
+        return [] if "state-silent" in self._on else [message]
+
     def due(self, now_ns: int) -> list[Any]:
         """Sport states whose delay is over, and what was held back by a fault that is off again."""
         out = []

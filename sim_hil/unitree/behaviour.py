@@ -128,13 +128,14 @@ class Go2Behaviour:
         return self._script is not None or self._awaited is not None
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity, as the controller does; it ends a turned attitude, and is ignored in any other posture."""
+        """Take a velocity, as the controller does; one that ends a turned attitude or comes in a posture is not obeyed."""
         if self._released:
             return
         moves = any((vx_mps, vy_mps, wz_radps))
         if self._script is not None and self._script.mode == MODE_BALANCE_STAND and moves:
-            self._stand_again()  # the velocity is obeyed as soon as it stands level
-        elif self._busy:
+            self._stand_again()  # kept until it stands level, a velocity would be in force for longer than its second
+            return
+        if self._busy:
             return
         top_mps = self.gait.top_mps
         share, speed_mps = SPEED_SHARE[self.speed_level], math.hypot(vx_mps, vy_mps)

@@ -293,12 +293,15 @@ class StatePublishers:
                 self._sport[0].write(late)
 
     def _write_sport(self, topics: list[_Periodic], state: SportModeState_) -> None:
+        if self._faults is None:
+            messages = [state]
+        elif self._sport[0] in topics:
+            messages = self._faults.deliver(state, time.monotonic_ns())
+        else:
+            messages = self._faults.beside(state)
         for topic in topics:
-            if self._faults is None:
-                topic.write(state)
-            elif topic is self._sport[0]:
-                for message in self._faults.deliver(state, time.monotonic_ns()):
-                    topic.write(message)
+            for message in messages:
+                topic.write(message)
 
     def _write_low(self, topics: list[_Periodic], truth: RobotTruth) -> None:
         self._low_message.message.wireless_remote = self._remote.as_bytes()
