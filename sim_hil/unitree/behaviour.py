@@ -128,7 +128,7 @@ class Go2Behaviour:
         return self._script is not None or self._awaited is not None
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity, as the controller does; one that ends a turned attitude or comes in a posture is not obeyed."""
+        """Take a velocity, as the controller does; in a posture it is not obeyed, a turned attitude it only ends."""
         if self._released:
             return
         moves = any((vx_mps, vy_mps, wz_radps))
