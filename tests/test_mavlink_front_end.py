@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import socket
 from collections.abc import Iterator
 from math import atan2
 from pathlib import Path
@@ -183,6 +185,27 @@ def test_it_listens_on_the_loopback_unless_told_otherwise() -> None:
     assert LinkOptions.parse(None).bind[0] == "127.0.0.1"
 
 
-def test_faults_are_refused_as_it_has_none(tmp_path: Path) -> None:
-    with pytest.raises(FrontEndError, match="--faults"):
-        open_rig(faults=tmp_path / "faults")
+def _switch(path: Path, **fault: object) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+        asking.sendto(json.dumps(fault).encode(), str(path))
+
+
+def test_a_button_and_a_dead_radio_are_switched_from_outside(tmp_path: Path) -> None:
+    path = tmp_path / "faults"
+    rig = open_rig(faults=path)
+    try:
+        rig.make_ready()
+        sent = _wire(rig)["sent"]
+        _switch(path, fault="mute")
+        rig.run(0.5)
+        assert _wire(rig)["sent"] - sent <= 1
+        _switch(path, fault="clear")
+        rig.run(0.2)
+        assert _wire(rig)["sent"] - sent > 5
+        _switch(path, fault="button")
+        rig.run(0.2)
+        assert not rig.simulation.robot.ready
+        rig.until(lambda: not _client(rig).armed, 1.0, "the station sees that it is stopped")
+    finally:
+        rig.close()
+    assert not path.exists()

@@ -23,6 +23,7 @@ from sim_hil.carter import Carter
 from sim_hil.carter_sensors import CarterSensors, Sensors
 from sim_hil.front_end import FrontEndError, FrontEndOptions, Heard
 from sim_hil.mavlink.commands import Command
+from sim_hil.mavlink.faults import MavlinkFaults
 from sim_hil.mavlink.node import COMPONENT, MavlinkNode
 from sim_hil.mavlink.parameters import Parameters
 from sim_hil.mavlink.signing import Verifier, read_key
@@ -118,8 +119,6 @@ class MavlinkFrontEnd:
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
         """Raises FrontEndError or OSError when port or camera cannot be had."""
-        if options.faults is not None:
-            raise FrontEndError("--faults: expected --protocol unitree or can, found mavlink")
         ticks = 0 if link.key is None else now_ticks()
         self._reader = Reader(None if link.key is None else Verifier(link.key, ticks))
         self._writer = Writer(link.system, COMPONENT, link.key, ticks)
@@ -130,9 +129,12 @@ class MavlinkFrontEnd:
         self._now_s = 0.0
         self._states = 0
         self._camera: CameraStream | None = None
+        self._faults: MavlinkFaults | None = None
         self._link = UdpLink(link.bind, link.to)
         self._host = link.bind[0]
         try:
+            if options.faults is not None:
+                self._faults = MavlinkFaults(options.faults)
             if options.camera_size is not None:
                 self._camera = CameraStream(
                     options.scene_source,
@@ -172,6 +174,8 @@ class MavlinkFrontEnd:
         """Obey and answer what has arrived."""
         heard = []
         for data, address in self._link.receive():
+            if self._muted:
+                continue
             received_ns = time.monotonic_ns()
             messages = self._reader.read(data)
             if messages and self._link.accept(address, self._now_s):
@@ -201,6 +205,9 @@ class MavlinkFrontEnd:
     def publish(self, step: int, stamp_s: float) -> None:
         """Let the rover's clock go on, and send what is due."""
         self._now_s = stamp_s
+        if self._faults is not None:
+            self._faults.poll()
+            self._node.vehicle.button = self._faults.button
         self._node.step(stamp_s)
         self._flush(self._node.due(stamp_s))
 
@@ -208,8 +215,14 @@ class MavlinkFrontEnd:
         for message in messages:
             number = message.get_msgId()
             self._states += number == common.MAVLINK_MSG_ID_ODOMETRY
+            if self._muted:
+                continue
             call = number == common.MAVLINK_MSG_ID_HEARTBEAT
             self._link.send(self._writer.pack(message), self._now_s, call=call)
+
+    @property
+    def _muted(self) -> bool:
+        return self._faults is not None and self._faults.mute
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
@@ -220,7 +233,9 @@ class MavlinkFrontEnd:
             self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process, close the socket."""
+        """End the camera process, close the sockets."""
+        if self._faults is not None:
+            self._faults.close()
         if self._camera is not None:
             self._camera.close()
         self._link.close()
