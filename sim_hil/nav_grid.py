@@ -228,6 +228,17 @@ class NavGrid:
             return float("inf")
         return float(field[row, column])
 
+    def blended_at(self, field: Array, x_m: float, y_m: float) -> float:
+        """`field_at`, blended from the cells around the point that have a value, so that it changes without steps."""
+        u = (x_m - self.origin_m[0]) / self.resolution_m - 0.5
+        v = (y_m - self.origin_m[1]) / self.resolution_m - 0.5
+        total = weights = 0.0
+        for row, column in itertools.product((floor(v), floor(v) + 1), (floor(u), floor(u) + 1)):
+            if 0 <= row < self.shape[0] and 0 <= column < self.shape[1] and np.isfinite(field[row, column]):
+                weight = (1 - abs(row - v)) * (1 - abs(column - u))
+                total, weights = total + weight * float(field[row, column]), weights + weight
+        return total / weights if weights > 0 else self.field_at(field, x_m, y_m)
+
     def path(self, start: Vec2, goal: Vec2) -> list[Vec2] | None:
         """Points of a shortest feasible path from start to goal, both included, any angle; None where there is none."""
         first, last, tree = self.nearest_free(*start), self.nearest_free(*goal), self._tree(goal)

@@ -84,6 +84,7 @@ class Simulation:
         self._steps = 0
         self._contact_every = max(1, round(_CONTACT_S * rate_hz))
         self._touched: dict[str, int] = {}  # label -> the latest step in which it was touched
+        self._contacts: dict[str, int] = {}  # the same without those who were only near
         self._fell = False
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
@@ -233,6 +234,7 @@ class Simulation:
         for _ in range(round(_SETTLE_S * self.rate_hz)):
             if self._robot.ready:
                 self._touched.clear()
+                self._contacts.clear()
                 return
             self._physics()
         raise RuntimeError(f"simulation: the robot was not ready to move within {_SETTLE_S} s of its start")
@@ -278,6 +280,7 @@ class Simulation:
                     labels.add("person")
                 elif contact[2] in self._solids:
                     labels.add(_nearest_label(self._solids[contact[2]], contact[6]))
+        self._contacts.update((label, self._steps) for label in labels)
         (x, y, _), _ = self._robot.pose()
         if len(self._people) and bool(
             np.any(np.hypot(self._people[:, 0] - x, self._people[:, 1] - y) < PERSON_COLLISION_M)
@@ -346,8 +349,20 @@ class Simulation:
     @property
     def touching(self) -> frozenset[str]:
         """The same for the last 0.1 s: legs that push against something touch it on and off."""
+        return self._lately(self._touched)
+
+    def contacts(self) -> set[str]:
+        """Labels of what the robot has had contact with so far: what it could feel; nobody for being near."""
+        return set(self._contacts)
+
+    @property
+    def in_contact(self) -> frozenset[str]:
+        """The same for the last 0.1 s."""
+        return self._lately(self._contacts)
+
+    def _lately(self, steps: dict[str, int]) -> frozenset[str]:
         since = self._steps - _TOUCHING_S * self.rate_hz
-        return frozenset(label for label, step in self._touched.items() if step > since)
+        return frozenset(label for label, step in steps.items() if step > since)
 
     @property
     def fell(self) -> bool:

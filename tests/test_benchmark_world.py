@@ -92,6 +92,15 @@ def test_an_outcome_before_the_end_is_refused_unless_the_episode_is_stopped() ->
         assert world.done and world.outcome().end == "stopped"
 
 
+def test_somebody_near_is_a_collision_that_the_robot_is_not_told_of() -> None:
+    with EpisodeWorld(corridor_episode(), scene=hall()) as world:
+        pose = world.pose()
+        world._simulation._people = np.array([(pose.x_m, pose.y_m + 0.4, 0.0)])
+        world.step((0.0, 0.0, 0.0))
+        assert world.touching == {"person"} and world.collided
+        assert not world.observe().touching and not world.observe().collided
+
+
 def test_walking_into_a_thing_is_a_collision_with_it() -> None:
     scene, episode = hall(block(-6.5, 0.0, 0.5, 2.0)), corridor_episode(start=(-8.0, 0.0, 0.0), goal_xy=(8.0, 0.0))
     with EpisodeWorld(episode, scene=scene) as world:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import pi
 
 import gymnasium
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from sim_hil.benchmark.gym_env import ENV_ID, DynaNavEnv
 from sim_hil.benchmark.outcome import Outcome
-from tests.benchmark_episodes import corridor_episode
+from tests.benchmark_episodes import block, corridor_episode, hall
 
 FORWARD = np.array((0.8, 0.0, 0.0), np.float32)
 EPISODES = (
@@ -68,6 +69,33 @@ def test_reaching_the_goal_terminates_with_the_goals_reward_and_an_outcome(env: 
     assert terminated and not truncated
     assert rewards[-1] > 400.0 and max(rewards[:-1]) < 2.0
     assert isinstance(info["outcome"], Outcome) and info["outcome"].success
+
+
+def test_a_detour_round_a_wall_is_progress_though_the_goal_grows_no_nearer() -> None:
+    """A cabinet 4 m wide stands between start and goal: sideways is the way."""
+    episode = corridor_episode(id="detour", start=(-2.0, 0.0, pi / 2), goal_xy=(4.0, 0.0), scene="hall")
+    env = DynaNavEnv([episode], camera=None, scenes={"hall": hall(block(0.0, 0.0, 0.5, 4.0))})
+    _, info = env.reset()
+    far_m = info["distance_m"]
+    total = 0.0
+    for _ in range(25):
+        _, reward, _, _, info = env.step(FORWARD)
+        total += reward
+    env.close()
+    assert info["distance_m"] > far_m and total > 2.0
+
+
+def test_an_episode_without_a_way_is_refused_at_its_reset() -> None:
+    walled = hall(block(0.0, 0.0, 0.5, 10.0))
+    env = DynaNavEnv([corridor_episode(id="walled", start=(-2.0, 0.0, 0.0))], camera=None, scenes={"corridor": walled})
+    with pytest.raises(ValueError, match="expected a way"):
+        env.reset()
+    env.close()
+
+
+def test_no_suite_is_taken_by_default_least_of_all_the_benchmarks() -> None:
+    with pytest.raises(TypeError, match="suite"):
+        gymnasium.make(ENV_ID)
 
 
 def test_the_timeout_truncates(env: DynaNavEnv) -> None:

@@ -132,6 +132,21 @@ def test_a_distance_field_falls_to_zero_at_the_goal_and_is_infinite_out_of_reach
     assert grid.field_at(field, 7.0, 0.0) == inf
 
 
+def test_a_blended_field_changes_as_much_as_one_moves() -> None:
+    grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
+    field = grid.distance_field((8.0, 0.0))
+    left = [grid.blended_at(field, -3.0 + 0.013 * step, 0.0) for step in range(100)]
+    assert np.diff(left) == pytest.approx(-0.013, abs=1e-6)
+
+
+def test_a_blended_field_counts_what_has_a_value_and_is_infinite_only_out_of_reach() -> None:
+    grid = NavGrid(hall(walls=(wall(5.0, -5.0, 5.0),)), clearance_m=CLEARANCE_M)
+    field = grid.distance_field((0.0, 0.0))
+    for x_m in np.arange(4.3, 5.0, 0.03):
+        assert grid.blended_at(field, x_m, 0.0) == pytest.approx(4.5, abs=0.3)
+    assert grid.blended_at(field, 7.0, 0.0) == inf
+
+
 @pytest.mark.parametrize(("rise", "expected"), [(0.04, True), (0.15, False)])
 def test_a_platform_too_high_to_step_on_is_kept_off(rise: float, expected: bool) -> None:
     step = Terrain("step", "platform", (0.0, 0.0, 0.0), 0.0, (4.0, 9.9), rise, "concrete")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import hypot
+from math import hypot, isfinite
 from typing import Any, Final
 
 import gymnasium
@@ -16,13 +16,17 @@ from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode, load_suite
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.reward import PAPER, RewardWeights, reward
+from sim_hil.benchmark.robots import footprint_m, max_step_m
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
+from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene
 
 ENV_ID: Final = "DynaNav-v0"
 LOW: Final = (-0.5, -0.35, -1.2)
 HIGH: Final = (1.5, 0.35, 1.2)
 """Range of the action: vx m/s, vy m/s, wz rad/s; a robot that cannot move sideways ignores the second."""
+MAX_GRIDS: Final = 8
+"""Scenes, once for each robot, whose free space is kept between episodes."""
 
 Pictures = NDArray[np.uint8]
 
@@ -32,14 +36,15 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
 
     `image` is there only with a camera. The pose is odometry's, which drifts as told. An episode ends (`terminated`)
     at the goal or in a fall and is cut off (`truncated`) by its timeout. `info` names the episode and its instruction,
-    and holds the `outcome` once it is over. The reward is the paper's equation 5 with the straight distance.
+    holds the `outcome` once it is over, and `distance_m` in a straight line. The reward is the paper's equation 5; its
+    progress is along the shortest feasible way.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium types it
 
     def __init__(
         self,
-        suite: str | Sequence[Episode] = "dynanav",
+        suite: str | Sequence[Episode],
         *,
         camera: tuple[int, int] | None = (128, 128),
         drift: str = "none",
@@ -47,7 +52,10 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         scenes: Mapping[str, Scene] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """`suite`: a name, a file, or episodes; `scenes` stand in for loading them by name. Raises SuiteError."""
+        """`suite`: a name, a file, or episodes; `scenes` stand in for loading them by name. Raises SuiteError.
+
+        There is no default: what learns must not be given "dynanav", the suite that it is measured on.
+        """
         episodes = load_suite(suite) if isinstance(suite, str) else tuple(suite)
         if not episodes:
             raise ValueError("DynaNav: expected at least one episode")
@@ -57,6 +65,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self._weights = weights
         self._scenes = scenes if scenes is not None else {}
         self._world: EpisodeWorld | None = None
+        self._grids: dict[tuple[str, str], NavGrid] = {}
         self.action_space = spaces.Box(np.array(LOW, np.float32), np.array(HIGH, np.float32))
         parts: dict[str, spaces.Space[Any]] = {
             "state": spaces.Box(-np.inf, np.inf, (3,), np.float32),
@@ -98,25 +107,48 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self._world = EpisodeWorld(episode, self._options, scene=self._scenes.get(episode.scene))
         self._instruction = episode.instructions[wording % len(episode.instructions)]
         self._collisions: frozenset[str] = frozenset()
+        self._grid = self._grid_of(self._world)
+        self._field = self._grid.distance_field(episode.goal_xy)
+        self._left_m = self._way_m(float("nan"))
+        if not isfinite(self._left_m):
+            self._close_world()
+            raise ValueError(f"DynaNav: episode {name}: expected a way from its start to its goal, found none")
         return self._observed(), self._info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive 0.1 s with (vx m/s, vy m/s, wz rad/s), clipped to the action's range."""
         world = self.world
         vx, vy, wz = (float(v) for v in np.clip(action, LOW, HIGH))
-        before = world.pose()
+        before, left_before_m = world.pose(), self._left_m
         world.step((vx, vy, wz))
         after, touching = world.pose(), world.touching
+        self._left_m = self._way_m(left_before_m)
         value = reward(
             reached=world.end == "reached",
-            distance_before_m=self._distance(before),
-            distance_after_m=self._distance(after),
+            distance_before_m=left_before_m,
+            distance_after_m=self._left_m,
             collision_began=bool(touching - self._collisions),
             speed_mps=10.0 * hypot(after.x_m - before.x_m, after.y_m - before.y_m),
             weights=self._weights,
         )
         self._collisions = touching
         return self._observed(), value, world.end in ("reached", "fell"), world.end == "timeout", self._info()
+
+    def _grid_of(self, world: EpisodeWorld) -> NavGrid:
+        """Free space for the robot in the scene; the last few are kept."""
+        robot = world.episode.robot
+        key = (world.episode.scene, robot)
+        if key not in self._grids:
+            if len(self._grids) >= MAX_GRIDS:
+                self._grids.pop(next(iter(self._grids)))
+            self._grids[key] = NavGrid(world.scene, clearance_m=footprint_m(robot), max_step_m=max_step_m(robot))
+        return self._grids[key]
+
+    def _way_m(self, where_none_m: float) -> float:
+        """Length of the way left to the goal, m; where there is none, as in an aisle too narrow, the one given."""
+        pose = self.world.pose()
+        left_m = self._grid.blended_at(self._field, pose.x_m, pose.y_m)
+        return left_m if isfinite(left_m) else where_none_m
 
     def _distance(self, pose: SE2) -> float:
         goal_x, goal_y = self.world.episode.goal_xy
@@ -139,7 +171,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
             "episode": world.episode.id,
             "instruction": self._instruction,
             "distance_m": self._distance(world.pose()),
-            "collided": world.observe().collided,
+            "collided": world.collided,
         }
         if world.done:
             info["outcome"] = world.outcome()

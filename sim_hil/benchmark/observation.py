@@ -18,7 +18,8 @@ class Observation:
 
     `image`: uint8 RGB [height, width, 3], None where no camera was asked for; `state`: body velocity (vx m/s, vy m/s,
     wz rad/s) by odometry, the mean since the last observation; `T_odom_base`: pose since the start by odometry.
-    `collided`: whether there was a collision so far; `touching`: whether there is one now.
+    `collided`: whether it has run into something so far; `touching`: whether it does now. Both are of contact that a
+    robot can feel; the benchmark also counts a collision with somebody within 0.5 m.
     """
 
     time_s: float

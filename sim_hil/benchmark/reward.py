@@ -1,8 +1,8 @@
 """The paper's reward, equation 5, as a pure function of one control step; weights and target speed from appendix D.
 
 The paper names the four terms but does not write them out. Ours: goal is 1 in the step that reaches it; progress is
-how much shorter the way to the goal became, m; collision is 1 in a step in which one begins; speed is how far the
-speed is off the target, m/s.
+how much shorter the way to the goal, round walls and things, became, m; collision is 1 in a step in which one begins;
+speed is how far the speed is off the target, m/s.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def reward(
     speed_mps: float,
     weights: RewardWeights = PAPER,
 ) -> float:
-    """Reward of one control step; distances are of the way left to the goal, before the step and after it."""
+    """Reward of one control step; distances are of the way left over free space, before and after it."""
     return (
         weights.goal * float(reached)
         + weights.progress * (distance_before_m - distance_after_m)

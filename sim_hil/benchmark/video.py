@@ -144,7 +144,7 @@ class EpisodeVideo:
         draw.text((left + 150, top + 3), driven, _INK, _font("DejaVuSansMono.ttf", 17))
         goal_m = hypot(world.pose().x_m - episode.goal_xy[0], world.pose().y_m - episode.goal_xy[1])
         draw.text((left + 480, top + 3), f"goal {goal_m:.1f} m", _GOAL, _font("DejaVuSans-Bold.ttf", 17))
-        if observation.collided:
+        if world.collided:
             draw.text((left + 620, top + 3), "has collided", _BAD, _font("DejaVuSans-Bold.ttf", 17))
         top += 36
         says = _state_line(notes)

@@ -121,6 +121,11 @@ class EpisodeWorld:
         return self._end
 
     @property
+    def collided(self) -> bool:
+        """Whether there was a collision so far, as the outcome counts them."""
+        return self._first_collision_s is not None
+
+    @property
     def touching(self) -> frozenset[str]:
         """Labels of what the robot touches now; "person" also for one within 0.5 m."""
         return self._simulation.touching
@@ -133,8 +138,8 @@ class EpisodeWorld:
                 image=None if self.options.camera is None else self.picture(*self.options.camera),
                 state=self._odometer.velocity(),
                 T_odom_base=self._odometer.pose,
-                collided=self._first_collision_s is not None,
-                touching=bool(self._simulation.touching),
+                collided=bool(self._simulation.contacts()),
+                touching=bool(self._simulation.in_contact),
             )
             self._observed = (self._frames, observation)
         return self._observed[1]
