@@ -41,6 +41,7 @@ _SQUEEZE_TOUCH_M, _SQUEEZE_CLOSE_M = 0.45, 0.55
 _BODIES_M = 0.45  # two people are never closer
 _ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
 _ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
+_ROBOT_TOUCHED_M = 0.40  # where bodies meet: who has not noticed the robot walks on until there
 _ROBOT_STANDS_MPS = 0.15
 _PUSHED: Final = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
 _WALL_M = 0.22
@@ -224,7 +225,7 @@ class People:
         y += np.bincount(me, dy[over] * push, crowd.n)
 
     def _keep_off_robot(self, x: Array, y: Array, robot: RobotSeen) -> None:
-        """Nobody walks into the robot; who is run into by it is pushed, not passed through."""
+        """Who has noticed the robot does not walk into it; who is touched by it is pushed, not passed through."""
         crowd = self._crowd
         if not (np.abs(x - robot.x) + np.abs(y - robot.y)).min() < 2.0:
             return
@@ -232,11 +233,13 @@ class People:
         close = np.flatnonzero((gap < _ROBOT_BODY_M) & (crowd.doing != Doing.SIT))
         stands = hypot(robot.vx, robot.vy) < _ROBOT_STANDS_MPS
         for k in close:
+            if gap[k] > _ROBOT_TOUCHED_M and not crowd.aware[k]:
+                continue
             nx, ny = rx[k] / (gap[k] + 1e-9), ry[k] / (gap[k] + 1e-9)
             inwards = (x[k] - crowd.x[k]) * nx + (y[k] - crowd.y[k]) * ny
             push = max(-inwards, 0.0)
-            if gap[k] <= 0.4:
-                push += min(0.4 - gap[k], 0.03)
+            if gap[k] <= _ROBOT_TOUCHED_M:
+                push += min(_ROBOT_TOUCHED_M - gap[k], 0.03)
             elif stands:
                 # Next to one that has come to a stop people move off; from one that drives they must have walked.
                 push += min(_ROBOT_BODY_M - gap[k], 0.02)
