@@ -118,7 +118,7 @@ def test_without_an_output_directory_the_result_is_only_told(suite: Path, capsys
     [
         (("--suite", "nowhere"), 2, "unknown suite 'nowhere'"),
         (("--episodes", "office-*"), 2, "--episodes 'office-*': expected a pattern of ids such as walk-1"),
-        (("--clock", "realtime"), 2, "--clock realtime: not in this version; expected lockstep"),
+        (("--clock", "realtime"), 2, "--clock realtime: expected --policy artifacts:DIR"),
         (("--jobs", "0"), 2, "--jobs: expected 1 or more"),
         (("--wording", "9"), 2, "wording 9: episode walk-1 has 4"),
         (("--resume",), 2, "expected --out DIR with them"),
