@@ -40,17 +40,19 @@ def policies(artifacts_dir: Path) -> Iterator[dict[str, ArtifactsPolicy]]:
         policy.close()
 
 
-def drive(policy: ArtifactsPolicy, ticks: int, *, step_m: float = 0.05, seed: int = 1) -> Rows:
-    """What it does and knows in each tick, while odometry reports a straight walk whatever it does."""
+def drive(policy: ArtifactsPolicy, ticks: int, *, step_m: float = 0.05, seed: int = 1, obeys: bool = False) -> Rows:
+    """What it does and knows in each tick; odometry reports a straight walk, if it `obeys` only where commanded."""
     rng = np.random.default_rng(seed)
     width, height = policy.camera
     policy.reset(fakes.episode("a"), "go down the corridor", None, seed)
     rows: Rows = []
+    x_m = 0.0
     for tick in range(ticks):
         image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
-        odometry = SE2(step_m * tick, 0.0, 0.0)
+        odometry = SE2(x_m, 0.0, 0.0)
         command = policy.act(Observation(tick / 10, image, (step_m * 10, 0.0, 0.0), odometry, False, False))
         rows.append((command, policy.notes()))
+        x_m += step_m if not obeys or any(command) else 0.0
     return rows
 
 
@@ -90,9 +92,10 @@ def test_commands_keep_the_robots_limits_and_slew(policies: dict[str, ArtifactsP
 def test_sync_drives_half_a_second_with_delay_zero_and_halts_for_the_latency(
     policies: dict[str, ArtifactsPolicy],
 ) -> None:
-    rows = drive(policies["sync"], 21)
+    rows = drive(policies["sync"], 22, obeys=True)
     moved = [command != (0.0, 0.0, 0.0) for command, _ in rows]
-    assert moved == [False] * 5 + [True] * 5 + [False] * 5 + [True] * 5 + [False]
+    # The tick in which it halts sees the last of the motion: it thinks from the next one on.
+    assert moved == [False] * 5 + [True] * 5 + [False] * 6 + [True] * 5 + [False]
     assert {notes["delay_s"] for _, notes in rows if notes["delay_s"] is not None} == {0.0}
     assert {tuple(notes["offset"]) for _, notes in rows if notes["offset"]} == {(0.0, 0.0, 0.0)}
 

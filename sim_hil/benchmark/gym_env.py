@@ -16,7 +16,7 @@ from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode, load_suite
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.reward import PAPER, RewardWeights, reward
-from sim_hil.benchmark.robots import footprint_m, max_step_m
+from sim_hil.benchmark.robots import robot_grid
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene
@@ -141,7 +141,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         if key not in self._grids:
             if len(self._grids) >= MAX_GRIDS:
                 self._grids.pop(next(iter(self._grids)))
-            self._grids[key] = NavGrid(world.scene, clearance_m=footprint_m(robot), max_step_m=max_step_m(robot))
+            self._grids[key] = robot_grid(world.scene, robot)
         return self._grids[key]
 
     def _way_m(self, where_none_m: float) -> float:
