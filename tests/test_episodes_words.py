@@ -93,6 +93,49 @@ def test_a_start_right_beside_an_opening_that_counts_is_refused() -> None:
         make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.2, 0.0), machine)
 
 
+def tee(door_x: float) -> Scene:
+    """A corridor north (x 4..6) into one along x (y 8..10.4), which has a corridor back south (x 15..17) to its right.
+
+    To its left there are two rooms: one with its door from door_x, and one with its door at x = 12.
+    """
+    edges = [0.0, door_x, door_x + 1.2, 12.0, 13.2, 18.0]
+    walls = [wall(f"north {a}", a, 10.4, b, 10.4) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    walls += [wall(f"south {a}", a, 8, b, 8) for a, b in ((0, 4), (6, 15), (17, 18))]
+    walls += [wall(f"side {x}", x, 0, x, 8) for x in (4, 6, 15, 17)]
+    walls += [wall(f"room {x}", x, 10.4, x, 14) for x in (0, 8, 18)] + [wall("top", 0, 14, 18, 14)]
+    walls += [wall("west", 0, 8, 0, 10.4), wall("east", 18, 8, 18, 10.4), wall("bottom", 4, 0, 17, 0)]
+    areas = (Area("corridor 1", "corridor", box(4, 0, 6, 8), "corridor"),
+             Area("corridor 2", "corridor", box(0, 8, 18, 10.4), "corridor"),
+             Area("corridor 3", "corridor", box(15, 0, 17, 8), "corridor"),
+             Area("room 1", "room", box(0, 10.4, 8, 14), "office"),
+             Area("room 2", "room", box(8, 10.4, 18, 14), "office"))  # fmt: skip
+    things = (SceneObject("machine", "vending_machine", (16.0, 0.6, 0.0), pi / 2, (0.8, 1.1, 1.9), (0.8, 0.1, 0.1), "",
+                          "red vending machine"),
+              SceneObject("shelf", "shelf", (17.4, 12.5, 0.0), pi, (0.35, 1.2, 1.9), (0.6, 0.4, 0.2), "",
+                          "bookshelf"))  # fmt: skip
+    return Scene("tee", (5.0, 1.0, pi / 2), (16.0, 2.0), (-0.1, -0.1), (18.1, 14.1), "floor_tiles", 2.6, tuple(walls),
+                 things, (), areas=areas)  # fmt: skip
+
+
+def told_in_tee(door_x: float, goal: str) -> Told:
+    scene = tee(door_x)
+    thing = next(thing for thing in scene.objects if thing.label == goal)
+    return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).told
+
+
+def test_a_door_straight_across_from_where_one_comes_out_is_counted_by_some_and_refused() -> None:
+    with pytest.raises(RouteError, match="room 1 opens right beside"):
+        told_in_tee(4.4, "shelf")
+
+
+def test_a_door_behind_is_not_counted() -> None:
+    assert [(step.side, step.ordinal) for step in told_in_tee(1.0, "shelf").steps] == [("right", 1), ("left", 1)]
+
+
+def test_what_one_has_come_out_of_is_not_counted() -> None:
+    assert [(step.side, step.ordinal) for step in told_in_tee(4.4, "machine").steps] == [("right", 1), ("right", 1)]
+
+
 def test_a_goal_of_which_there_are_two_by_the_way_is_refused() -> None:
     scene = comb()
     twin = replace(scene.objects[0], label="twin", position_m=(2.5, 0.5, 0.0), heading_rad=pi / 2)

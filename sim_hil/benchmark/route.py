@@ -96,9 +96,7 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
     """The way along a path to a landmark; `grid` is any of the scene. Raises RouteError when it cannot be told."""
     runs = _runs(scene, path)
     legs = _legs(runs)
-    steps: list[Step] = []
-    for index in range(1, len(legs)):
-        steps.append(_step(scene, grid, legs[index - 1], legs[index], first=index == 1))
+    steps = [_step(scene, grid, legs[i - 2] if i > 1 else None, legs[i - 1], legs[i]) for i in range(1, len(legs))]
     last = legs[-1]
     walked = [area for leg in legs for area in (*leg.followed, *leg.crossed)]
     _check_goal(scene, walked, goal)
@@ -214,25 +212,27 @@ def _leg_of_room(runs: list[_Run], index: int) -> _Leg:
     box = bounds_of(run.area)
     if index == 0 and len(runs) == 1:
         raise RouteError("start and goal lie in one room")
-    inward = index > 0
-    point = run.points[0] if inward else run.points[-1]
+    point = run.points[0] if index > 0 else run.points[-1]
     gaps = {
         (1.0, 0.0): point[0] - box.x0, (-1.0, 0.0): box.x1 - point[0],
         (0.0, 1.0): point[1] - box.y0, (0.0, -1.0): box.y1 - point[1],
     }  # fmt: skip
     inwards = min(gaps, key=lambda key: abs(gaps[key]))
-    direction = inwards if inward else (-inwards[0], -inwards[1])
+    direction = inwards if index > 0 else (-inwards[0], -inwards[1])
     return _Leg(Frame(direction), [run.area], [], run.points[0], run.points[-1], run.area.kind)
 
 
-def _step(scene: Scene, grid: NavGrid, before: _Leg, after: _Leg, first: bool) -> Step:
-    target = (after.followed or after.crossed)[0]
+def _turn(before: _Leg, after: _Leg) -> str:
     d0, d1 = before.frame.direction, after.frame.direction
     turn = d0[0] * d1[1] - d0[1] * d1[0]
-    ahead = d0[0] * d1[0] + d0[1] * d1[1]
-    if ahead < -0.5:
+    if d0[0] * d1[0] + d0[1] * d1[1] < -0.5:
         raise RouteError("the way turns back")
-    side = "left" if turn > 0.5 else "right" if turn < -0.5 else "straight"
+    return "left" if turn > 0.5 else "right" if turn < -0.5 else "straight"
+
+
+def _step(scene: Scene, grid: NavGrid, earlier: _Leg | None, before: _Leg, after: _Leg) -> Step:
+    target = (after.followed or after.crossed)[0]
+    side = _turn(before, after)
     ordinal, at_end = 0, False
     near: tuple[Passed, ...] = ()
     passed: tuple[Passed, ...] = ()
@@ -243,9 +243,9 @@ def _step(scene: Scene, grid: NavGrid, before: _Leg, after: _Leg, first: bool) -
             crossed = [*before.crossed, *([target] if _lies_across(before, target) else [])]
             openings = side_openings(scene, grid, before.frame, before.followed, crossed, side)
             taken = _taken(openings, target, before.frame.along(after.start))
-            ordinal = _ordinal(openings, taken, start, first)
+            ordinal = _ordinal(openings, taken, start, _turn(earlier, before) if earlier else "")
             limit = taken.low_m
-            near = _near(scene, before, after, openings, taken)
+            near = _near(scene, before, openings, taken)
         at_end = _ends(scene, grid, before, target)
         passed = _passed(scene, before, limit - 0.4)
     return Step(
@@ -270,22 +270,27 @@ def _taken(openings: list[Opening], target: Area, along: float) -> Opening:
 
 
 def opening_class(kind: str) -> str:
-    """What is counted together: corridors with aisles, rooms (doors), and each other kind by itself."""
+    """What is counted together: corridors with aisles, rooms (doors), each other kind."""
     return "passage" if kind in ("corridor", "aisle") else kind
 
 
-def _ordinal(openings: list[Opening], taken: Opening, start: float, first: bool) -> int:
-    """Which of its kind, counted from the start of the leg. Raises RouteError where one cannot tell."""
+def _ordinal(openings: list[Opening], taken: Opening, start: float, from_side: str) -> int:
+    """Which of its kind, counted from the leg's start. Raises RouteError where one cannot tell.
+
+    Who turned left comes `from_side` left: what opens there at the leg's start was just left behind. A passage straight
+    across belongs to the junction that one turned at; as in streets, nobody counts it. A door there is another matter.
+    """
     count = 0
     for opening in openings:
         if opening_class(opening.area.kind) != opening_class(taken.area.kind):
             continue
-        if first and opening.low_m - _AT_START_M < start < opening.high_m + _AT_START_M:
-            raise RouteError(f"{opening.area.label} opens right beside the start")
-        if not first and opening.low_m < start - 0.3 < opening.high_m - 0.3:
-            if opening is taken:
-                raise RouteError("the turn is taken before its leg has begun")
-            continue
+        if from_side and (opening.side == from_side or opening.area.kind != "room"):
+            if opening.low_m < start - 0.3 < opening.high_m - 0.3:
+                if opening is taken:
+                    raise RouteError("the turn is taken before its leg has begun")
+                continue
+        elif opening.low_m - _AT_START_M < start < opening.high_m + _AT_START_M:
+            raise RouteError(f"{opening.area.label} opens right beside the start of the way, or of a leg")
         if opening.middle_m > start and opening.middle_m <= taken.middle_m + 1e-6:
             count += 1
     return count
@@ -293,19 +298,16 @@ def _ordinal(openings: list[Opening], taken: Opening, start: float, first: bool)
 
 def _ends(scene: Scene, grid: NavGrid, leg: _Leg, target: Area | None = None) -> bool:
     """Whether what a leg follows goes on for no more than a few steps beyond the leg."""
-    box = bounds_of(leg.followed[-1])
-    (_, high), (right, left) = leg.frame.span(box)
-    end = leg.frame.along(leg.end)
+    (_, high), (right, left) = leg.frame.span(bounds_of(leg.followed[-1]))
     if target is not None and _lies_across(leg, target):
         (_, high), _ = leg.frame.span(bounds_of(target))
-        middle = (right + left) / 2
-        a, b = leg.frame.point(high - 0.6, middle), leg.frame.point(high + 0.6, middle)
-        return not _inside(scene, b) or not is_open(grid, a, b)
-    if target is not None:
-        (_, t_high), _ = leg.frame.span(bounds_of(target))
-        end = max(end, min(t_high, high))
-    if high - end > (_END_M if target is not None else _GOAL_END_M):
-        return False
+    else:
+        end = leg.frame.along(leg.end)
+        if target is not None:
+            (_, t_high), _ = leg.frame.span(bounds_of(target))
+            end = max(end, min(t_high, high))
+        if high - end > (_END_M if target is not None else _GOAL_END_M):
+            return False
     middle = (right + left) / 2
     a, b = leg.frame.point(high - 0.6, middle), leg.frame.point(high + 0.6, middle)
     return not _inside(scene, b) or not is_open(grid, a, b)
@@ -348,9 +350,7 @@ def _passed(scene: Scene, leg: _Leg, until: float) -> tuple[Passed, ...]:
     return tuple(found)
 
 
-def _near(
-    scene: Scene, before: _Leg, after: _Leg, openings: list[Opening], taken: Opening
-) -> tuple[Passed, ...]:  # fmt: skip
+def _near(scene: Scene, before: _Leg, openings: list[Opening], taken: Opening) -> tuple[Passed, ...]:
     """Landmarks that mark a turn: close to it, one of a kind on the leg, and nearer to it than to any other opening."""
     beside = _beside(scene, before)
     names = [thing.landmark for _, _, thing in beside]
