@@ -9,6 +9,7 @@ from math import hypot, inf, pi, sqrt
 import numpy as np
 import pytest
 
+from sim_hil.benchmark.robots import robot_grid
 from sim_hil.nav_grid import NavGrid, length_m
 from sim_hil.scene import Scene, SceneObject, Wall, load_scene
 from sim_hil.scene_terrain import Terrain
@@ -153,6 +154,13 @@ def test_a_platform_too_high_to_step_on_is_kept_off(rise: float, expected: bool)
     grid = NavGrid(replace(hall(), terrain=(step,)), clearance_m=CLEARANCE_M)
     assert (grid.path((-6.0, 0.0), (6.0, 0.0)) is not None) == expected
     assert grid.is_free(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("robot", "expected"), [("go2", True), ("carter", False)])
+def test_a_bump_of_5_cm_is_in_the_way_of_the_carter_only(robot: str, expected: bool) -> None:
+    bump = Terrain("bump", "platform", (0.0, 0.0, 0.0), 0.0, (4.0, 9.9), 0.05, "concrete")
+    grid = robot_grid(replace(hall(), terrain=(bump,)), robot)
+    assert (grid.path((-6.0, 0.0), (6.0, 0.0)) is not None) == expected
 
 
 def test_a_platform_is_reached_by_its_ramp() -> None:

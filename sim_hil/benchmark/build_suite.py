@@ -16,7 +16,7 @@ import numpy as np
 from sim_hil.benchmark.episode import ROBOTS, SUITES, Episode, suite_to_toml
 from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import WordingError, wordings
-from sim_hil.benchmark.robots import footprint_m
+from sim_hil.benchmark.robots import robot_grid, telling_grid
 from sim_hil.benchmark.route import RouteError
 from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.tasks import Task, goals, sample_task
@@ -25,7 +25,6 @@ from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene, load_scene
 
 NAME, VERSION = "dynanav", 2
-TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, whatever robot then drives
 WORDINGS = 6
 INDOOR_CROWDS = (0, 10, 20, 40, 60)
 _DRAWS = 400
@@ -117,7 +116,7 @@ def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
 def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) -> list[Episode]:
     """One scene's episodes; raises ValueError when a task that is wanted is not found."""
     scene = load_scene(part.scene)
-    grids = {robot: NavGrid(scene, clearance_m=footprint_m(robot)) for robot in ROBOTS}
+    grids = {robot: robot_grid(scene, robot) for robot in ROBOTS}
     episodes: list[Episode] = []
     for index, (wanted, task) in enumerate(_tasks(part, scene)):
         name = f"{part.scene}-{wanted.task}"
@@ -160,7 +159,7 @@ def _wordings(task: Task, seed: int) -> list[str]:
 def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
     """For each, the first drawn task that is what is wanted and sound; no goal comes twice."""
     rng = np.random.default_rng((part.seed, 17))
-    grid = NavGrid(scene, clearance_m=TELLING_CLEARANCE_M)
+    grid = telling_grid(scene)
     lines = Sightlines(scene)
     found: list[tuple[Wanted, Task]] = []
     for index, wanted in enumerate(part.wanted):

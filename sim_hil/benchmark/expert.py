@@ -7,7 +7,6 @@ pushing, and it is the teacher of policies that see only pictures.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import cos, hypot, sin
 from types import MappingProxyType
 from typing import Final
@@ -21,6 +20,7 @@ from sim_hil.benchmark.expert_motion import CONTROL_S, Choice, Driving, Motion
 from sim_hil.benchmark.expert_route import SPACING_M, RoutePlanner
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.policy import Velocity
+from sim_hil.benchmark.robots import max_step_m
 from sim_hil.benchmark.world import EpisodeWorld
 
 Array = NDArray[np.float64]
@@ -38,19 +38,9 @@ _STUCK_S: Final = 6.0
 _STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
 
 
-@dataclass(frozen=True)
-class Build:
-    """What the expert must know of a robot that the robot itself does not tell."""
-
-    driving: Driving
-    max_step_m: float
-
-
-BUILDS: Final[Mapping[str, Build]] = MappingProxyType(
-    {
-        "go2": Build(Driving(), 0.06),
-        "carter": Build(Driving(body_radius_m=0.31, body_reach_m=0.12, margin_m=0.17), 0.03),
-    }
+# What the expert must know of a robot that the robot itself does not tell.
+_DRIVINGS: Final[Mapping[str, Driving]] = MappingProxyType(
+    {"go2": Driving(), "carter": Driving(body_radius_m=0.31, body_reach_m=0.12, margin_m=0.17)}
 )
 
 
@@ -69,15 +59,14 @@ class ExpertPolicy:
         """Plan the episode. Raises ValueError without a world, or where the goal cannot be reached."""
         if world is None:
             raise ValueError("expert: expected the episode's world, which only a privileged policy is given")
-        build = BUILDS[episode.robot]
         planner = RoutePlanner(
-            world.scene, episode.goal_xy, world.robot.radius_m, build.max_step_m, _NEAR * episode.threshold_m
+            world.scene, episode.goal_xy, world.robot.radius_m, max_step_m(episode.robot), _NEAR * episode.threshold_m
         )
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
-        self._world, self._planner, self._build = world, planner, build
-        self._motion = Motion(planner.grid, build.driving)
+        self._world, self._planner, self._driving = world, planner, _DRIVINGS[episode.robot]
+        self._motion = Motion(planner.grid, self._driving)
         self._route = np.array([(pose.x_m, pose.y_m)])
         self._ticks = 0
         self._choice = None
@@ -140,7 +129,7 @@ class ExpertPolicy:
 
         Until the end of the future it has chosen, that; then the way ahead at the comfortable speed.
         """
-        world, driving = self._running(), self._build.driving
+        world, driving = self._running(), self._driving
         pose = world.pose()
         line = self._route
         along = np.arange(len(line)) * SPACING_M

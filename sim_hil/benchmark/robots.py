@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from sim_hil import carter_urdf, go2
+from sim_hil.nav_grid import NavGrid
+from sim_hil.scene import Scene
 
 _RADII_M = {"go2": go2.RADIUS_M, "carter": carter_urdf.RADIUS_M}
+# Steps of the ground that are no obstacle: the Go2 takes the scenes' bumps of 5 cm, the base's casters do not.
+_STEPS_M = {"go2": 0.06, "carter": 0.03}
+
+
+TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, which stops at any step, whatever robot drives
 
 
 def footprint_m(robot: str) -> float:
@@ -12,6 +19,28 @@ def footprint_m(robot: str) -> float:
 
     Raises ValueError for an unknown robot.
     """
-    if robot not in _RADII_M:
-        raise ValueError(f"unknown robot {robot!r}, expected one of {', '.join(_RADII_M)}")
-    return _RADII_M[robot]
+    return _of(robot, _RADII_M)
+
+
+def max_step_m(robot: str) -> float:
+    """Height of a step that the robot gets over, m: higher ones are edges to its shortest feasible path.
+
+    Raises ValueError for an unknown robot.
+    """
+    return _of(robot, _STEPS_M)
+
+
+def robot_grid(scene: Scene, robot: str) -> NavGrid:
+    """The floor that is free for a robot; raises ValueError for an unknown one."""
+    return NavGrid(scene, clearance_m=footprint_m(robot), max_step_m=max_step_m(robot))
+
+
+def telling_grid(scene: Scene) -> NavGrid:
+    """The floor by which ways are told: free for every robot."""
+    return NavGrid(scene, clearance_m=TELLING_CLEARANCE_M, max_step_m=min(_STEPS_M.values()))
+
+
+def _of(robot: str, values: dict[str, float]) -> float:
+    if robot not in values:
+        raise ValueError(f"unknown robot {robot!r}, expected one of {', '.join(values)}")
+    return values[robot]

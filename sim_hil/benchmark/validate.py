@@ -1,6 +1,7 @@
 """`python -m sim_hil.benchmark.validate`: is every episode of a suite feasible, and is every word of it true?
 
-Everything is computed anew from scene, start and goal: nothing of how the suite was built is trusted.
+Everything is computed anew from scene, start and goal; what the suite's file says counts for nothing. The rules by
+which a way is told (route.tell) are the builder's own: a mistake in them is found by neither, but by tests and by eye.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from sim_hil.benchmark.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
 from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import is_held_out
-from sim_hil.benchmark.robots import footprint_m
+from sim_hil.benchmark.robots import TELLING_CLEARANCE_M, robot_grid, telling_grid
 from sim_hil.benchmark.route import RouteError, tell
 from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.tasks import outline_gap_m
@@ -24,7 +25,6 @@ from sim_hil.benchmark.visibility import Sightlines
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Scene, SceneError, SceneObject, Vec2, load_scene
 
-TELLING_CLEARANCE_M = 0.4
 # An episode must be feasible at these mean speeds. Indoors that is below what the Go2 comes to when it halts for 2 s of
 # thought before each 0.5 s of driving (0.146 m/s), and leaves it some detours.
 INDOOR_SPEED_MPS, OUTDOOR_SPEED_MPS = 0.12, 0.2
@@ -42,13 +42,17 @@ class _Place:
     """One scene with what is worked out on it, as it is needed."""
 
     scene: Scene
-    grids: dict[float, NavGrid] = field(default_factory=dict)
+    grids: dict[str, NavGrid] = field(default_factory=dict)
     lengths: dict[tuple[str, Vec2, Vec2], float] = field(default_factory=dict)
 
-    def grid(self, clearance_m: float) -> NavGrid:
-        if clearance_m not in self.grids:
-            self.grids[clearance_m] = NavGrid(self.scene, clearance_m=clearance_m)
-        return self.grids[clearance_m]
+    def grid(self, robot: str) -> NavGrid:
+        if robot not in self.grids:
+            self.grids[robot] = robot_grid(self.scene, robot)
+        return self.grids[robot]
+
+    @cached_property
+    def telling(self) -> NavGrid:
+        return telling_grid(self.scene)
 
     @cached_property
     def lines(self) -> Sightlines:
@@ -84,7 +88,7 @@ class Validator:
 
 
 def _feasible(episode: Episode, place: _Place) -> list[str]:
-    grid = place.grid(footprint_m(episode.robot))
+    grid = place.grid(episode.robot)
     found = []
     if not grid.is_free(*episode.start[:2]):
         found.append(f"the start is not free for a {episode.robot}")
@@ -105,7 +109,7 @@ def _feasible(episode: Episode, place: _Place) -> list[str]:
 
 
 def _truthful(episode: Episode, place: _Place) -> list[str]:
-    scene, grid = place.scene, place.grid(TELLING_CLEARANCE_M)
+    scene, grid = place.scene, place.telling
     goal = place.thing(episode.goal_landmark)
     if goal is None or not goal.landmark:
         return [f"goal_landmark {episode.goal_landmark!r} is no landmark of the scene"]
