@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 NEAR_M: Final = 0.03  # the nose may touch a wall, which must still be seen
-FAR_M: Final = 90.0
+# Far away: the rasteriser interpolates textures by depth-buffer values, which bends them where the far plane is near.
+FAR_M: Final = 10_000.0
 _SUN: Final = np.array((-3.0, 2.0, 6.0)) / 7.0  # where light comes from
 _AMBIENT, _DIFFUSE = 0.72, 0.36
 _MAX_TEXTURE_PX: Final = 512

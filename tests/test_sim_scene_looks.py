@@ -170,11 +170,10 @@ def test_no_sky_shines_through_where_walls_meet_floor_and_ceiling() -> None:
     st.lists(st.tuples(st.floats(-6, 6), st.floats(-6, 6)), min_size=3, max_size=7),
 )
 def test_cutting_a_polygon_keeps_its_area(first: Corners, second: Corners) -> None:
-    subject, cutter = (
-        [tuple(map(float, p)) for p in cv2.convexHull(np.array(points, np.float32))[:, 0]] for points in (first, second)
-    )
-    if min(len(subject), len(cutter)) < 3:
+    hulls = [cv2.convexHull(np.array(points, np.float32)) for points in (first, second)]
+    if any(hull is None or len(hull) < 3 for hull in hulls):
         return
+    subject, cutter = ([tuple(map(float, p)) for p in hull[:, 0]] for hull in hulls)
     subject, cutter = counter_clockwise(subject), counter_clockwise(cutter)
     areas = [cv2.contourArea(np.array(part, np.float32)) for part in (subject, cutter)]
     if min(areas) < 0.05:
