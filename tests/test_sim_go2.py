@@ -171,15 +171,17 @@ def test_a_walking_robot_comes_to_rest_before_it_lies_down(simulation: Simulatio
     _stand(simulation)
     _run(simulation, 2.0, (1.0, 0.0, 0.0))
     assert simulation.sport(SportAction.STAND_DOWN) == 0
-    speeds = []
+    sinking = []
     for _ in range(125):
         _run(simulation, 0.04, (1.0, 0.0, 0.0))  # no longer heeded
         truth = simulation.truth()
         assert truth.commanded == (0.0, 0.0, 0.0)
         if 0.12 < truth.body_height_m < 0.28:
-            speeds.append(np.linalg.norm(truth.velocity_world_mps[:2]))
+            sinking.append(truth)
     assert not simulation.fell
-    assert speeds and max(speeds) < 0.1
+    # The trunk sways by millimetres, at up to 0.12 m/s, over feet that grip; it goes nowhere.
+    assert sinking and max(np.linalg.norm(truth.velocity_world_mps[:2]) for truth in sinking) < 0.15
+    assert max(np.linalg.norm(truth.position_m[:2] - sinking[0].position_m[:2]) for truth in sinking) < 0.03
     assert simulation.truth().mode == 5
 
 
