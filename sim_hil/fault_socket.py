@@ -1,0 +1,66 @@
+"""A datagram socket that faults of a running front end are switched by: one JSON object in, one out."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Final
+
+CLEAR: Final = "clear"
+_MAX_BYTES: Final = 2000
+_MAX_A_POLL: Final = 16
+
+
+class FaultSocket(ABC):
+    """Binds PATH for its user alone; `poll` takes in what has come. Raises OSError."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        umask = os.umask(0o177)
+        try:
+            self._socket.bind(str(path))
+        except OSError as error:
+            self._socket.close()
+            raise OSError(f"--faults {path}: expected a free path for a socket, {error.strerror}") from error
+        finally:
+            os.umask(umask)
+        self._socket.setblocking(False)
+
+    def poll(self) -> None:
+        """Take in the commands that have come; never waits."""
+        for _ in range(_MAX_A_POLL):
+            try:
+                data, sender = self._socket.recvfrom(_MAX_BYTES + 1)
+            except BlockingIOError:
+                return
+            try:
+                answer = self._switch(_table(data))
+            except ValueError as error:
+                answer = {"error": str(error)}
+            if sender:  # an unbound socket has no address to answer to
+                with contextlib.suppress(OSError):  # it has gone or does not read
+                    self._socket.sendto(json.dumps(answer).encode(), sender)
+
+    @abstractmethod
+    def _switch(self, table: dict[str, object]) -> dict[str, object]:
+        """Do what one command says; the answer. Raises ValueError."""
+
+    def close(self) -> None:
+        """Close and remove the socket."""
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+
+def _table(data: bytes) -> dict[str, object]:
+    try:
+        table = json.loads(data) if len(data) <= _MAX_BYTES else None
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict):
+        raise ValueError(f"expected a JSON object of at most {_MAX_BYTES} bytes, found {data[:60]!r}")
+    return table
