@@ -9,12 +9,16 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import can
+import msgpack
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_hil.can.buses import BusAddress, BusError, BusLink, SerialFrames, open_bus
 from sim_hil.can.e2e import Frame
+from sim_hil.can.multicast import unpacked
 from sim_hil.can.pty_line import PtyLine
 
 FRAME = Frame(0x123, b"\x01\xaa\xbb\x04")
@@ -165,30 +169,115 @@ def test_a_serial_line_that_is_none_is_refused_in_one_line(channel: str) -> None
 
 
 _MULTICAST = """
-import time
+import socket, time
+import can
+from can.interfaces.udp_multicast.utils import pack_message
 from sim_hil.can.buses import BusAddress, BusLink, open_bus
 from sim_hil.can.e2e import Frame
-a, b = (BusLink(open_bus(BusAddress("udp_multicast", "239.74.163.2"))) for _ in range(2))
-deadline, heard = time.monotonic() + 10, []
-while not heard and time.monotonic() < deadline:
-    a.send(Frame(0x123, b"abc"))
-    b.wait(100_000_000)
-    heard += [frame for _, frame in b.receive()]
+GROUP = "239.74.163.2"
+a, b = (BusLink(open_bus(BusAddress("udp_multicast", GROUP))) for _ in range(2))
+def heard(wanted, send):
+    deadline, found = time.monotonic() + 10, []
+    while wanted not in found and time.monotonic() < deadline:
+        send()
+        b.wait(100_000_000)
+        found += [frame for _, frame in b.receive()]
+    return wanted in found
+{act}
 a.close(); b.close()
-raise SystemExit(0 if Frame(0x123, b"abc") in heard else 1)
 """
 
 
-def test_multicast_carries_frames_inside_a_network_namespace_of_its_own() -> None:
+def in_a_namespace(act: str) -> None:
+    """Run `act` with two links `a` and `b`, beside an interface `out0` whose other end `far0` is a network outside."""
     namespace = ["unshare", "--user", "--map-root-user", "--net"]
     if subprocess.run([*namespace, "true"], capture_output=True, check=False).returncode:
         pytest.skip("no right to make a network namespace")
-    setup = 'ip link set lo up && ip link set lo multicast on && ip route add 239.0.0.0/8 dev lo && exec "$0" -c "$1"'
+    setup = (
+        "ip link set lo up && ip link add out0 address 02:00:00:00:00:01 type veth peer name far0"
+        ' && ip addr add 10.0.0.1/24 dev out0 && ip link set out0 up && ip link set far0 up && ip route add default dev out0 && exec "$0" -c "$1"'
+    )
+    program = _MULTICAST.replace("{act}", act)
     done = subprocess.run(
-        [*namespace, "sh", "-c", setup, sys.executable, _MULTICAST],
+        [*namespace, "sh", "-c", setup, sys.executable, program],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_multicast_survives_and_counts_what_is_no_frame() -> None:
+    act = """
+stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+stranger.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+for junk in (b"", b"junk", bytes([0x93, 1, 2, 3]), bytes([7]), bytes([0xC1])):
+    stranger.sendto(junk, (GROUP, 43113))
+assert heard(Frame(0x123, b"abc"), lambda: a.send(Frame(0x123, b"abc")))
+assert b.line_errors == 5, b.line_errors
+"""
+    in_a_namespace(act)
+
+
+@given(st.binary(max_size=40))
+def test_no_datagram_is_more_than_no_frame(datagram: bytes) -> None:
+    assert unpacked(datagram) is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"data": 2**32}, {"data": "abc"}, {"data": bytes(9)}, {"arbitration_id": 1.5}, {"arbitration_id": 2**32},
+     {"is_error_frame": "no"}],
+)  # fmt: skip
+def test_a_datagram_with_a_frame_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
+    table = msgpack.unpackb(pack_message(can.Message(arbitration_id=0x123, data=b"abc", is_extended_id=False)))
+    message = unpacked(msgpack.packb(table))
+    assert message is not None and (message.arbitration_id, message.data) == (0x123, b"abc")
+    assert unpacked(msgpack.packb({**table, **wrong})) is None
+
+
+def test_multicast_neither_listens_nor_speaks_outside_of_the_machine() -> None:
+    act = """
+frame = pack_message(can.Message(arbitration_id=0x321, data=b"out", is_extended_id=False))
+raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+raw.bind(("far0", 3))
+raw.settimeout(0.2)
+payload = 28 + len(frame)
+def packet(to):
+    head = bytes([0x45, 0]) + payload.to_bytes(2, "big") + bytes([0, 1, 0, 0, 1, 17, 0, 0])
+    head += socket.inet_aton("10.0.0.2") + socket.inet_aton(to)
+    total = sum(int.from_bytes(head[i:i + 2], "big") for i in range(0, 20, 2))
+    total = (total & 0xFFFF) + (total >> 16)
+    head = head[:10] + (0xFFFF - total).to_bytes(2, "big") + head[12:]
+    udp = (4000).to_bytes(2, "big") + (43113).to_bytes(2, "big") + (payload - 20).to_bytes(2, "big") + bytes(2)
+    return head + udp + frame
+other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+other.bind(("", 43113))
+other.setsockopt(0, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(GROUP) + socket.inet_aton("10.0.0.1"))
+other.settimeout(5)
+raw.send(bytes.fromhex("01005e4aa302") + bytes(6) + bytes([8, 0]) + packet(GROUP))
+assert other.recv(2000) == frame  # the packet is one that a bus on all interfaces would have taken
+raw.send(bytes.fromhex("020000000001") + bytes(6) + bytes([8, 0]) + packet("10.0.0.1"))
+assert heard(Frame(0x123, b"abc"), lambda: a.send(Frame(0x123, b"abc")))
+assert b._bus.recv(0) is None
+assert Frame(0x321, b"out") not in [frame for link in (a, b) for _, frame in link.receive()]
+left = []
+try:
+    while True:
+        left.append(raw.recv(2000))
+except TimeoutError:
+    pass
+assert not any(b"arbitration_id" in each and b"abc" in each for each in left)
+"""
+    in_a_namespace(act)
+
+
+@pytest.mark.parametrize("channel", ["example.invalid", "127.0.0.1", "ff02::1", "239.74.163.2:5"])
+def test_a_multicast_address_that_is_none_is_refused_in_one_line(channel: str) -> None:
+    with pytest.raises(
+        BusError, match=r"^CAN bus udp_multicast:.+: cannot be opened: expected an IPv4 multicast address .+$"
+    ):
+        open_bus(BusAddress("udp_multicast", channel))

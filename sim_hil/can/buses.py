@@ -1,7 +1,7 @@
 """A bus of python-can that nobody waits for: a thread that listens and one that sends.
 
 Which interfaces: "serial" (a serial line or a pty), "socketcan" (the real thing), "virtual" (inside one process) and
-"udp_multicast" (several processes of one machine: its frames get a hop limit of 0 and do not leave it).
+"udp_multicast" (several processes of one machine, on its loopback interface alone).
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import can
 from can.interfaces.serial.serial_can import SerialBus
 
 from sim_hil.can.e2e import Frame
+from sim_hil.can.multicast import LoopbackMulticastBus
 
 INTERFACES: Final = ("serial", "socketcan", "virtual", "udp_multicast")
 _LISTEN_S: Final = 0.1
@@ -128,11 +129,12 @@ class _SerialBus(SerialBus):
 
 def open_bus(address: BusAddress) -> can.BusABC:
     """Open the bus. Raises BusError with one clear line."""
-    options: dict[str, Any] = {"hop_limit": 0} if address.interface == "udp_multicast" else {}
     try:
         if address.interface == "serial":
             return _SerialBus(address.channel)
-        return can.Bus(channel=address.channel, interface=address.interface, **options)
+        if address.interface == "udp_multicast":
+            return LoopbackMulticastBus(address.channel)
+        return can.Bus(channel=address.channel, interface=address.interface)
     except (can.CanError, OSError, ValueError, ImportError) as error:  # pyserial's SerialException is an OSError
         raise BusError(f"CAN bus {address}: cannot be opened: {error}") from error
 
@@ -158,7 +160,7 @@ class BusLink:
 
     @property
     def line_errors(self) -> int:
-        """Broken frames of a serial line."""
+        """Broken frames of a serial line, datagrams that are none of multicast."""
         return int(getattr(self._bus, "line_errors", 0))
 
     @property
