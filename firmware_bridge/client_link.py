@@ -54,12 +54,15 @@ def listen(path: Path) -> socket.socket:
     return listener
 
 
-def check_is_ours(folder: Path) -> None:
-    """Raise ConfigError unless `folder` is a directory of this user that nobody else can enter."""
+def check_is_ours(folder: Path, option: str = "--socket") -> None:
+    """Raise ConfigError unless `folder` is a directory of this user that nobody else can enter.
+
+    `option`: what gives another place, for the message.
+    """
     found = folder.lstat()
     if found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o077:
         what = f"expected a folder of this user's alone, found {stat.filemode(found.st_mode)} of user {found.st_uid}"
-        raise ConfigError(f"{folder}: {what}; remove it or give another --socket")
+        raise ConfigError(f"{folder}: {what}; remove it or give another {option}")
 
 
 class ClientLink:

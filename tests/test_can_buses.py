@@ -195,7 +195,8 @@ def in_a_namespace(act: str) -> None:
         pytest.skip("no right to make a network namespace")
     setup = (
         "ip link set lo up && ip link add out0 address 02:00:00:00:00:01 type veth peer name far0"
-        ' && ip addr add 10.0.0.1/24 dev out0 && ip link set out0 up && ip link set far0 up && ip route add default dev out0 && exec "$0" -c "$1"'
+        " && ip addr add 10.0.0.1/24 dev out0 && ip link set out0 up && ip link set far0 up"
+        ' && ip route add default dev out0 && exec "$0" -c "$1"'
     )
     program = _MULTICAST.replace("{act}", act)
     done = subprocess.run(

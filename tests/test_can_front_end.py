@@ -303,6 +303,33 @@ def test_a_link_that_makes_no_sense_is_refused_in_one_line(link: str) -> None:
     assert "\n" not in str(caught.value) and "expected" in str(caught.value)
 
 
+def test_without_a_link_the_line_is_in_a_folder_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = tmp_path / "tic-vla-edge"
+    assert LinkOptions.parse(None).address == BusAddress("serial", str(folder / "carter-can"))
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("kind", ["open", "link", "file"])
+def test_a_folder_that_somebody_else_may_have_made_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder, elsewhere = tmp_path / "tic-vla-edge", tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    if kind == "open":
+        folder.mkdir()
+        folder.chmod(0o777)
+    elif kind == "link":
+        folder.symlink_to(elsewhere)
+    else:
+        folder.write_text("")
+    with pytest.raises(FrontEndError, match=r"^[^\n]+; (remove it or )?give another --link$"):
+        LinkOptions.parse(None)
+
+
 def test_a_bus_that_is_not_there_is_refused_in_one_line() -> None:
     asked = options("carter", link="socketcan:no-such-bus")
     simulation = Simulation(asked.scene, people=0, seed=0, robot="carter")

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.config import runtime_dir
+from firmware_bridge.client_link import check_is_ours
+from firmware_bridge.config import ConfigError, runtime_dir
 from sim_hil.camera_stream import CameraStream
 from sim_hil.can import frames
 from sim_hil.can.buses import BusAddress, BusError, BusLink, open_bus
@@ -55,8 +56,7 @@ class LinkOptions:
     def parse(text: str | None) -> LinkOptions:
         """From the command line; None: a pty in the user's runtime directory. Raises FrontEndError."""
         if text is None:
-            runtime_dir().mkdir(mode=0o700, parents=True, exist_ok=True)
-            text = f"serial:{runtime_dir() / 'carter-can'}"
+            text = f"serial:{_own_folder() / 'carter-can'}"
         where, *settings = text.split(",")
         try:
             given: dict[str, Any] = {}
@@ -69,6 +69,19 @@ class LinkOptions:
             return LinkOptions(BusAddress.parse(where), **given)
         except ValueError as error:
             raise FrontEndError(f"--link {text}: {error}") from error
+
+
+def _own_folder() -> Path:
+    """The user's runtime directory, made if there is none, and nobody else's: under /tmp anybody could have made it."""
+    folder = runtime_dir()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        check_is_ours(folder, "--link")
+    except OSError as error:
+        raise FrontEndError(f"{folder}: cannot be used: {error.strerror}; give another --link") from error
+    except ConfigError as error:
+        raise FrontEndError(str(error)) from error
+    return folder
 
 
 def _port(text: str) -> int:
