@@ -26,7 +26,7 @@ class Services:
         self.free_m = RANGE_M
         self.pilot = Pilot(behaviour.request_move, lambda _direction: self.free_m)
         self.sport = SportService(behaviour, self.pilot)
-        self.switcher = MotionSwitcher(behaviour)
+        self.switcher = MotionSwitcher(behaviour, self.pilot)
         self.avoid = ObstaclesAvoid(self.pilot, self.pose)
         self.robot_state = RobotState(self.switcher, self.avoid.switch)
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from edge.geometry import SE2
 from sim_hil.scene import Box
+from sim_hil.sport import SportAction
 from sim_hil.unitree.avoidance import RANGE_M, STOP_M, RangeFinder, allowed_mps, slowed, towards
 from tests.go2_services import Desk, Stage
 
@@ -116,6 +117,32 @@ class TestAvoidance:
         where = stage.pose()
         stage.run(1.0)
         assert abs(stage.pose().x_m - where.x_m) < 0.05
+
+    @pytest.mark.parametrize(
+        ("api_id", "parameter"),
+        [(1001, {}), (1005, {}), (1009, {}), (1010, {}), (1016, {}), (1028, {"data": True}), (1028, {"data": False}),
+         (1007, {"x": 0.2, "y": 0.0, "z": 0.0})],
+    )  # fmt: skip
+    def test_a_posture_ends_the_way_to_a_place(self, desk: Desk, api_id: int, parameter: dict[str, object]) -> None:
+        desk.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
+        desk.avoid.handle(1003, '{"x": 3, "y": 0, "yaw": 0, "mode": 1}')
+        desk.run(0.5)
+        assert desk.behaviour.commanded[0] > 0
+        assert desk.ask(api_id, **parameter) == (0, "")
+        desk.run(10.0)  # a show is over by then
+        desk.behaviour.request(SportAction.RECOVERY_STAND)
+        desk.run(4.0)
+        assert desk.behaviour.ready and desk.behaviour.commanded == (0.0, 0.0, 0.0)
+
+    def test_taking_the_joints_ends_the_way_to_a_place(self, desk: Desk) -> None:
+        desk.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
+        desk.avoid.handle(1003, '{"x": 3, "y": 0, "yaw": 0, "mode": 1}')
+        desk.switcher.release()
+        desk.run(2.1)
+        assert desk.switcher.select("normal") == 0
+        desk.behaviour.request(SportAction.RECOVERY_STAND)
+        desk.run(4.0)
+        assert desk.behaviour.ready and desk.behaviour.commanded == (0.0, 0.0, 0.0)
 
     def test_there_is_no_way_to_where_one_is(self) -> None:
         assert towards(SE2(1, 2, 3), SE2(1, 2, 3)) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ from firmware_bridge.unitree.idl import SportModeState_
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 from firmware_bridge.unitree.state import robot_state
 from sim_hil.simulation import Simulation
+from sim_hil.unitree import front_end
 from sim_hil.unitree.front_end import UnitreeFrontEnd, open_front_end
 from tests.front_end_contract import FrontEndContract, Report, Rig, options
 from tests.processes import wait_for
@@ -67,3 +69,29 @@ class TestUnitree(FrontEndContract):
         rig = Rig(simulation, front_end, UnitreeClient(front_end.bus))
         yield rig
         rig.close()
+
+
+def test_what_was_opened_is_closed_in_reverse_when_a_later_step_fails(
+    dds_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[str] = []
+
+    class Camera:
+        def __init__(self, *_args: object, **_more: object) -> None: ...
+
+        def close(self) -> None:
+            closed.append("camera")
+
+    def fails(*_args: object, **_more: object) -> None:
+        raise ValueError("no publishers")
+
+    close_bus = front_end.Bus.close
+    monkeypatch.setattr(front_end.Bus, "close", lambda bus: (closed.append("bus"), close_bus(bus)))
+    monkeypatch.setattr(front_end, "CameraProcess", Camera)
+    monkeypatch.setattr(front_end, "StatePublishers", fails)
+    asked = options("go2", domain=dds_domain, camera_size=(64, 48), faults=tmp_path / "faults")
+    simulation = Simulation(asked.scene, people=0, seed=0)
+    with pytest.raises(ValueError, match="no publishers"):
+        open_front_end(simulation, asked)
+    simulation.close()
+    assert closed == ["camera", "bus"] and not (tmp_path / "faults").exists()

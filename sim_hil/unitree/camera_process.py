@@ -49,9 +49,13 @@ class CameraProcess:
             command += ["--peer", peer]
         if faults:
             command += ["--faults"]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(self._pose.fd,)
-        )
+        try:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(self._pose.fd,)
+            )
+        except OSError:
+            self._pose.close()
+            raise
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         self._partial = b""

@@ -53,7 +53,16 @@ class UnitreeFrontEnd:
         self._closed = False
         self.bus = Bus(dds)
         """The participant: DDS allows a process one in a domain."""
-        self._camera = None if options.camera_size is None else _camera(simulation, options, options.camera_size, dds)
+        self._camera: CameraProcess | None = None
+        try:
+            self._open(simulation, options)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, simulation: Simulation, options: FrontEndOptions) -> None:
+        if options.camera_size is not None:
+            self._camera = _camera(simulation, options, options.camera_size, self._dds)
         self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
         self._robot.sport = self._behaviour  # type: ignore[assignment]
         self._odometry = _odometry(options)
@@ -81,7 +90,7 @@ class UnitreeFrontEnd:
         self._sport = ServiceServer(self.bus, ids.SPORT_SERVICE, lease=lease, unleased=UNLEASED)
         self._leases = LeaseServer(self.bus, ids.SPORT_SERVICE, lease)
         self._sport_service = SportService(self._behaviour, self._pilot)
-        switcher = MotionSwitcher(self._behaviour)
+        switcher = MotionSwitcher(self._behaviour, self._pilot)
         avoid = ObstaclesAvoid(self._pilot, self._reported_pose)
         self._others: tuple[tuple[ServiceServer, Callable[[int, str], Answer]], ...] = (
             (ServiceServer(self.bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
@@ -109,11 +118,7 @@ class UnitreeFrontEnd:
         # Imported here: without --faults the code that makes anything go wrong is not even loaded.
         from sim_hil.faults.injector import FaultInjector
 
-        try:
-            return FaultInjector(path, remote=remote, camera=self._tell_camera)
-        except OSError:
-            self.close()
-            raise
+        return FaultInjector(path, remote=remote, camera=self._tell_camera)
 
     def _tell_camera(self, line: bytes) -> None:
         if self._camera is not None:
@@ -221,8 +226,6 @@ class UnitreeFrontEnd:
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeFrontEnd:
     """The front end of `--protocol unitree`. Raises FrontEndError, ConfigError, DdsError or OSError."""
-    if options.link is not None:
-        raise FrontEndError("--link: unitree is reached by --domain and --interface; leave it out")
     if options.faults is not None and options.camera_size is None:
         raise FrontEndError("--faults: expected a camera to inject them into, found --camera none; leave one out")
     peers = ("127.0.0.1",) if options.interface == "lo" else ()

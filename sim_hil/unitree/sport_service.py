@@ -15,7 +15,7 @@ from firmware_bridge.unitree import ids
 from sim_hil.sport import ERROR_NOT_STANDING, SportAction
 from sim_hil.unitree.behaviour import GAITS, SPEED_SHARE, Go2Behaviour
 from sim_hil.unitree.parameters import parse_flag, parse_numbers
-from sim_hil.unitree.postures import MODE_POSE, POSE, SHOWS, SIT
+from sim_hil.unitree.postures import MODE_POSE, POSE, SHOWS, SIT, Script
 from sim_hil.unitree.service import Answer
 from sim_hil.unitree.sport import handle_sport
 
@@ -48,15 +48,14 @@ class Mover(Protocol):
 
 
 class SportService:
-    """Handles one request after the other; `remote_enabled` is what SwitchJoystick has last said."""
+    """Handles one request after the other. SwitchJoystick is taken and changes nothing: no stick moves this robot."""
 
     def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
-        self.remote_enabled = True
         self._behaviour = behaviour
         self._mover = mover
         self._handlers: dict[int, Callable[[str], Answer]] = {
             1007: self._euler,
-            1009: lambda _: (behaviour.show(SIT), ""),
+            1009: lambda _: self._show(SIT),
             1010: self._rise,
             1015: self._speed_level,
             1027: self._joystick,
@@ -72,7 +71,7 @@ class SportService:
         if self._behaviour.released:
             return ERROR_NOT_STANDING, ""
         if api_id in _SHOWS:
-            return self._behaviour.show(SHOWS[_SHOWS[api_id]]), ""
+            return self._show(SHOWS[_SHOWS[api_id]])
         if api_id in _GAITS:
             return self._choose_gait(api_id, parameter)
         handler = self._handlers.get(api_id)
@@ -89,9 +88,17 @@ class SportService:
 
     def _euler(self, parameter: str) -> Answer:
         angles = parse_numbers(parameter, "x", "y", "z")
-        return _BAD if angles is None else (self._behaviour.turn_body(*angles), "")
+        if angles is None:
+            return _BAD
+        self._mover.stop()
+        return self._behaviour.turn_body(*angles), ""
+
+    def _show(self, script: Script) -> Answer:
+        self._mover.stop()
+        return self._behaviour.show(script), ""
 
     def _rise(self, _parameter: str) -> Answer:
+        self._mover.stop()
         self._behaviour.stand_again()
         return _DONE
 
@@ -103,18 +110,15 @@ class SportService:
         return _DONE
 
     def _joystick(self, parameter: str) -> Answer:
-        enabled = parse_flag(parameter, "data")
-        if enabled is None:
-            return _BAD
-        self.remote_enabled = enabled
-        return _DONE
+        return _BAD if parse_flag(parameter, "data") is None else _DONE
 
     def _pose(self, parameter: str) -> Answer:
         enabled = parse_flag(parameter, "data")
         if enabled is None:
             return _BAD
         if enabled:
-            return self._behaviour.show(POSE), ""
+            return self._show(POSE)
+        self._mover.stop()
         if self._behaviour.mode == MODE_POSE:
             self._behaviour.stand_again()
         return _DONE

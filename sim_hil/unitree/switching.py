@@ -15,6 +15,7 @@ from firmware_bridge.unitree import ids
 from sim_hil.unitree.behaviour import Go2Behaviour
 from sim_hil.unitree.parameters import parse_flag, parse_numbers, parse_text
 from sim_hil.unitree.service import Answer
+from sim_hil.unitree.sport_service import Mover
 
 ERROR_SWITCH_PARAMETER: Final = 7001
 ERROR_SWITCH_BUSY: Final = 7002
@@ -32,8 +33,10 @@ _SERVICE_SWITCH, _REPORT_FREQ, _SERVICE_LIST = 1001, 1002, 1003
 class MotionSwitcher:
     """Which controller has the joints: one of MODES, or none, which leaves them to low commands."""
 
-    def __init__(self, behaviour: Go2Behaviour) -> None:
+    def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
+        """`mover` is stopped when the joints are taken."""
         self._behaviour = behaviour
+        self._mover = mover
         self._name = MODES[0]
         self._silent = False
         self._released_s = -math.inf
@@ -78,6 +81,7 @@ class MotionSwitcher:
     def release(self) -> None:
         """Take the joints from their controller."""
         if self.engaged:
+            self._mover.stop()
             self._behaviour.release()
             self._name, self._released_s = "", self._behaviour.time_s
 
@@ -85,13 +89,11 @@ class MotionSwitcher:
 class RobotState:
     """Which services there are; the sport controller and the avoidance can be switched off, the others are protected.
 
-    SetReportFreq is taken and kept: what it reports on another topic is not among the published facts.
+    SetReportFreq is taken and changes nothing: what it reports on another topic is not among the published facts.
     """
 
     def __init__(self, switcher: MotionSwitcher, avoidance: Callable[[bool | None], bool]) -> None:
         """`avoidance`: switches obstacles_avoid on or off, None leaves it; returns what it is then."""
-        self.report_s: tuple[float, float] | None = None
-        """(interval, duration) that was asked for."""
         self._switcher = switcher
         self._avoidance = avoidance
 
@@ -105,7 +107,6 @@ class RobotState:
             times = parse_numbers(parameter, "interval", "duration")
             if times is None or min(times) < 0:
                 return ids.ERROR_PARAMETER, ""
-            self.report_s = (times[0], times[1])
             return ids.OK, ""
         return ids.ERROR_NOT_IMPLEMENTED, ""
 
