@@ -115,6 +115,11 @@ _SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",)}
 )
 
+FLAGS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {"--domain": ("unitree",), "--interface": ("unitree",), "--link": ("mavlink", "can")}
+)
+"""Options of the command line that only some protocols have."""
+
 
 def protocols() -> tuple[str, ...]:
     """The protocols that are there."""
@@ -133,6 +138,15 @@ def check_combination(robot: str, protocol: str) -> None:
         raise FrontEndError(
             f"--robot {robot} --protocol {protocol}: expected a protocol that this robot speaks, {' or '.join(spoken)}"
         )
+
+
+def check_flags(protocol: str, given: Sequence[str]) -> None:
+    """Raises FrontEndError for the first of the `given` FLAGS that `protocol` does not have."""
+    for flag in given:
+        if protocol not in FLAGS[flag]:
+            own = " and ".join(name for name, speakers in FLAGS.items() if protocol in speakers)
+            others = " or ".join(FLAGS[flag])
+            raise FrontEndError(f"{flag}: is for --protocol {others}, {protocol} is reached by {own}; leave it out")
 
 
 def open_front_end(protocol: str, simulation: Simulation, options: FrontEndOptions) -> FrontEnd:

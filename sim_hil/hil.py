@@ -20,15 +20,18 @@ import pybullet
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
 from firmware_bridge.config import ConfigError
 from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
+from sim_hil.display import check_display
 from sim_hil.front_end import (
+    FLAGS,
     FrontEndError,
     FrontEndOptions,
     check_combination,
+    check_flags,
     open_front_end,
     protocols,
     robots,
 )
-from sim_hil.hil_loop import HilLoop
+from sim_hil.hil_loop import POSE_HZ, STEPS_PER_S, HilLoop
 from sim_hil.odometry_noise import LEVELS
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names
 from sim_hil.simulation import Simulation
@@ -42,8 +45,23 @@ EPILOG: Final = """examples:
   edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
   edge-hil --robot go2 --scene my_scene.toml --protocol unitree --start 2.5,-1,90
   edge-hil --robot carter --scene warehouse --protocol can --link serial:carter.can
+  edge-hil --robot carter --scene warehouse --protocol can --link serial:carter.can,camera=8091,drop=0.05,corrupt=0.01
+  edge-hil --robot carter --scene office --protocol can --link socketcan:can0
+  edge-hil --robot carter --scene office --protocol mavlink --link udp:127.0.0.1:14580,to=127.0.0.1:14550
+  edge-hil --robot carter --scene office --protocol mavlink --link udp:0.0.0.0:14580,camera=8091,system=2
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
   edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
+--link of can: INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...]
+  INTERFACE  serial (a serial line; a path that does not exist becomes the client's end of a pty),
+             socketcan (a real bus), udp_multicast (between processes of this machine: udp_multicast:239.74.163.2)
+  FAULT      drop, corrupt, duplicate, delay: probability per frame; delay_s (0.05); bus_off_every_s (0: never) and
+             bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that talks without end
+  default    serial:RUNTIME/carter-can in the user's runtime directory; the ready line names it
+--link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE]
+  to         is called without having been heard; key: the file of a signing key, then only signed packets are obeyed
+  default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
+camera: the TCP port that pictures are served at over HTTP, 8090 if not given
+
 with --faults, one JSON object a datagram switches a fault on or off, such as {"fault": "camera-stop", "on": true}; the
 answer says when it took effect, and an unknown name is answered with all that there are
 exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
@@ -107,15 +125,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--people", type=int, default=0, metavar="N", help="walking people (default 0)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of people and odometry noise (default 0)")
     parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
-    parser.add_argument("--domain", type=int, default=0, metavar="N", help="unitree: DDS domain (default 0)")
-    parser.add_argument("--interface", default="lo", help="unitree: network interface (default lo)")
-    parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: where; default and form are the protocol's")
+    parser.add_argument("--domain", type=int, metavar="N", help="unitree: DDS domain (default 0)")
+    parser.add_argument("--interface", metavar="NAME", help="unitree: network interface (default lo)")
+    parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: where it is reached; forms and defaults below")
     parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="default 320x180")
     parser.add_argument(
         "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
     )
     parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults at this local datagram socket")
     parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
+    parser.add_argument(
+        "--pose-hz", type=int, default=POSE_HZ, metavar="N", help=f"poses a second in the trace (default {POSE_HZ})"
+    )
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     parser.add_argument("--gui", action="store_true", help="show the physics in a window")
     return parser
@@ -143,15 +164,18 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse bad arguments before anything is started or overwritten; raises ConfigError, FrontEndError or OSError."""
+    """Refuse bad arguments before anything is started or overwritten; raises ValueError or OSError with one line."""
     check_combination(args.robot, args.protocol)
-    if args.gui and not os.environ.get("DISPLAY"):
-        raise ConfigError("--gui: expected a display, DISPLAY is not set; run without --gui or on a desktop")
+    check_flags(args.protocol, [flag for flag in FLAGS if getattr(args, flag.removeprefix("--")) is not None])
+    if args.gui:
+        check_display(os.environ.get("DISPLAY"))
     if args.duration is not None and not 0 < args.duration < math.inf:
         raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
     for flag, value in (("--people", args.people), ("--seed", args.seed)):
         if value < 0:
             raise ConfigError(f"{flag}: expected 0 or more, found {value}")
+    if not 1 <= args.pose_hz <= STEPS_PER_S:
+        raise ConfigError(f"--pose-hz: expected 1..{STEPS_PER_S}, found {args.pose_hz}")
     check_result_target(args.json)
 
 
@@ -168,8 +192,8 @@ def _open(args: argparse.Namespace) -> tuple[HilLoop, str]:
         odometry_noise=args.odometry_noise,
         faults=args.faults,
         link=args.link,
-        domain=args.domain,
-        interface=args.interface,
+        domain=0 if args.domain is None else args.domain,
+        interface="lo" if args.interface is None else args.interface,
     )
     simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui, robot=args.robot)
     try:
@@ -177,7 +201,7 @@ def _open(args: argparse.Namespace) -> tuple[HilLoop, str]:
     except BaseException:
         simulation.close()
         raise
-    return HilLoop(simulation, front_end, options), front_end.where()
+    return HilLoop(simulation, front_end, options, pose_hz=args.pose_hz), front_end.where()
 
 
 def _scene(args: argparse.Namespace) -> Scene:

@@ -26,8 +26,11 @@ _STEP_NS: Final = 1_000_000_000 // STEPS_PER_S
 class HilLoop:
     """One simulated robot on one wire, until it is told to stop."""
 
-    def __init__(self, simulation: Simulation, front_end: FrontEnd, options: FrontEndOptions) -> None:
-        """Takes over `simulation` and `front_end`: `close` closes them."""
+    def __init__(
+        self, simulation: Simulation, front_end: FrontEnd, options: FrontEndOptions, *, pose_hz: int = POSE_HZ
+    ) -> None:
+        """Takes over `simulation` and `front_end`: `close` closes them. `pose_hz`: poses a second in the trace."""
+        self._pose_hz = pose_hz
         self._simulation = simulation
         self._front_end = front_end
         self._options = options
@@ -104,7 +107,7 @@ class HilLoop:
         self._front_end.publish(step, step * Simulation.DT_S + self._slipped_s)
         if self._options.faults is not None:
             self._note_command()
-        if step % (STEPS_PER_S // POSE_HZ) == 0:
+        if step * self._pose_hz // STEPS_PER_S != (step - 1) * self._pose_hz // STEPS_PER_S:
             self._note_pose()
         if step % (STEPS_PER_S // PEOPLE_HZ) == 0:
             self._note("people", poses=[[float(v) for v in row] for row in self._simulation.people()])
