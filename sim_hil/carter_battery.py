@@ -15,6 +15,7 @@ CELL_FULL_V: Final = 4.15
 PACK_OHM: Final = 0.06
 ELECTRONICS_W: Final = 90.0
 MOTOR_EFFICIENCY: Final = 0.75
+MEAN_S: Final = 0.1  # of the reported current
 
 
 def load_w(left_nm: float, left_radps: float, right_nm: float, right_radps: float) -> float:
@@ -35,16 +36,19 @@ class CarterBattery:
         self._load_w = ELECTRONICS_W
 
     def draw(self, power_w: float, dt_s: float) -> None:
-        """Take `power_w` for `dt_s`."""
+        """Take `power_w` for `dt_s`; an empty battery stays empty."""
+        self._charge_c = max(self._charge_c - power_w * dt_s / self._open_v(), 0.0)
         self._used_j += power_w * dt_s
         self._used_s += dt_s
+        if self._used_s >= MEAN_S - dt_s / 2:  # half a step: sums of steps are not exact
+            self._load_w = self._used_j / self._used_s
+            self._used_j = self._used_s = 0.0
+
+    def _open_v(self) -> float:
+        return CELLS * (CELL_EMPTY_V + self._charge_c / _CAPACITY_C * (CELL_FULL_V - CELL_EMPTY_V))
 
     def read(self) -> BatteryReading:
-        """The state now; the current is the mean one since the last reading. An empty battery stays empty."""
-        open_v = CELLS * (CELL_EMPTY_V + self._charge_c / _CAPACITY_C * (CELL_FULL_V - CELL_EMPTY_V))
-        if self._used_s > 0:
-            self._load_w = self._used_j / self._used_s
-            self._charge_c = max(self._charge_c - self._used_j / open_v, 0.0)
-            self._used_j = self._used_s = 0.0
+        """The state now; the current is the mean one of the last whole MEAN_S."""
+        open_v = self._open_v()
         current_a = self._load_w / open_v
         return BatteryReading(100.0 * self._charge_c / _CAPACITY_C, open_v - current_a * PACK_OHM, current_a)

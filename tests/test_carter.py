@@ -221,6 +221,19 @@ def test_the_bumper_that_is_pushed_says_so_and_lets_go(make: Make, side: str, ce
     assert not world.run(1.5, -0.3 * sign).bumpers
 
 
+def test_whoever_asks_for_the_truth_changes_nothing(make: Make) -> None:
+    watched, alone = make().go(), make().go()
+    for _ in range(10):
+        watched.run(0.05, 1.0)
+        alone.robot.command(1.0, 0.0, 0.0)
+        for _ in range(12):
+            alone.robot.drive()
+            pybullet.stepSimulation(physicsClientId=alone.client)
+            alone.robot.observe()
+        assert watched.truth().battery == watched.truth().battery
+    assert watched.truth().battery == alone.truth().battery
+
+
 def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None:
     standing, driving = make().go(), make()
     driving.ramp(0.5, 8.0, 30.0)

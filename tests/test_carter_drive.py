@@ -199,6 +199,18 @@ def test_a_battery_under_load_has_less_voltage() -> None:
     assert busy.read().voltage_v < idle.read().voltage_v
 
 
+def test_the_current_is_a_mean_over_time_however_often_it_is_asked_for() -> None:
+    asked, silent = CarterBattery(), CarterBattery()
+    for step in range(48):  # 0.1 s of nothing, then 0.1 s of 400 W in every second step
+        power_w = 400.0 if step >= 24 and step % 2 else 0.0
+        for battery in (asked, silent):
+            battery.draw(power_w, 1 / 240)
+        assert asked.read() == asked.read()
+    found = silent.read()
+    assert asked.read() == found
+    assert found.current_a == pytest.approx(200.0 / 41.5, rel=1e-3)
+
+
 @pytest.mark.parametrize("soc", [-0.1, 1.1, math.nan])
 def test_a_charge_that_cannot_be_is_refused(soc: float) -> None:
     with pytest.raises(ValueError, match="0 to 1"):
