@@ -392,6 +392,24 @@ class TestCable:
 
 
 class TestWhatMayNotEndTheRelay:
+    def test_packets_under_way_are_bounded_in_bytes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("sim_hil.network.relay._MAX_WAITING_BYTES", 1000)
+        link = LinkConfig("l", "udp", "127.0.0.1:0", "127.0.0.1:9", Impairment(delay_ms=600_000))
+        relay = Relay(NetworkConfig((link,), 1))
+        ends, (there, _) = relay.links["l"].ends, relay.links["l"].directions
+        assert isinstance(ends, UdpEnds)
+        with contextlib.closing(relay), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            for _ in range(5):
+                client.sendto(bytes(400), ends.address)
+            while there.tally.packets < 5:
+                relay.turn(0.01)
+            assert there.tally.queue_full == 3
+            relay._deliver(time.monotonic_ns() + 10**15)
+            client.sendto(bytes(1000), ends.address)
+            while there.tally.packets < 6:
+                relay.turn(0.01)
+            assert there.tally.queue_full == 3, "what has been handed out makes room again"
+
     @pytest.mark.parametrize("value", [10**400, 1e308, float("inf"), float("nan"), -1])
     def test_a_number_that_no_clock_can_count_is_refused(self, value: float) -> None:
         with pytest.raises(ValueError, match="delay_ms: expected"):

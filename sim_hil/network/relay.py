@@ -20,7 +20,9 @@ from sim_hil.network.impairment import Direction
 from sim_hil.network.ports import LEFT, Ends, Packet, open_ends
 
 _NS: Final = 1_000_000_000
-_MAX_WAITING: Final = 100_000  # packets under way on all links; beyond it new ones are lost
+# Under way on all links; beyond either new packets are lost. The bytes are a gigabit a second for half a second.
+_MAX_WAITING: Final = 100_000
+_MAX_WAITING_BYTES: Final = 64 * 2**20
 _MAX_LINE_BYTES: Final = 4000
 _LONGEST_SLEEP_S: Final = 0.1
 
@@ -41,6 +43,7 @@ class Relay:
         """`control`: take changes at this local datagram socket, one JSON object each (see `change`)."""
         self.links: dict[str, Link] = {}
         self._waiting: list[tuple[int, int, Link, Packet]] = []
+        self._waiting_bytes = 0
         self._order = 0
         self._begin_ns = time.monotonic_ns()
         self._control: socket.socket | None = None
@@ -92,16 +95,19 @@ class Relay:
     def _accept(self, link: Link, packet: Packet) -> None:
         now_ns = time.monotonic_ns()
         direction = link.directions[0 if packet[0] == LEFT else 1]
-        for due_s in direction.offer(len(packet[1]), (now_ns - self._begin_ns) / _NS):
-            if len(self._waiting) >= _MAX_WAITING:
+        size_bytes = len(packet[1])
+        for due_s in direction.offer(size_bytes, (now_ns - self._begin_ns) / _NS):
+            if len(self._waiting) >= _MAX_WAITING or self._waiting_bytes + size_bytes > _MAX_WAITING_BYTES:
                 direction.tally.queue_full += 1
                 return
+            self._waiting_bytes += size_bytes
             self._order += 1
             heapq.heappush(self._waiting, (self._begin_ns + round(due_s * _NS), self._order, link, packet))
 
     def _deliver(self, now_ns: int) -> None:
         while self._waiting and self._waiting[0][0] <= now_ns:
             _, _, link, packet = heapq.heappop(self._waiting)
+            self._waiting_bytes -= len(packet[1])
             link.ends.give(packet)
 
     def _listen_to_changes(self) -> None:
