@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from sim_hil.benchmark.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.episode import Episode, load_suite
 from sim_hil.benchmark.latency import LatencyProfile
+from sim_hil.benchmark.metrics import FRAME_HZ
+from sim_hil.benchmark.task import EpisodeTask
+from sim_hil.hil_loop import STEPS_PER_S, HilLoop
 from sim_hil.realtime import episode as realtime
+from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.episode import check_realtime, drivable
 from sim_hil.realtime.stack import StackOptions, slow_robot
 from sim_hil.realtime.truth import TruePose
+from tests.front_end_contract import options
 
 POLICY = PolicySpec("artifacts", "out/nano")
 GOOD = Conditions(POLICY, clock="realtime", mode="async")
@@ -78,6 +86,35 @@ def test_the_first_contact_is_remembered() -> None:
     touches = [(), ("wall 1",), (), ("person",)]
     drive = followed(*(TruePose(t * S, -50, 0, 0, touching) for t, touching in enumerate(touches)))
     assert drive.collisions == {"wall 1", "person"} and drive.first_collision_s == 1.0
+
+
+def test_the_true_path_is_sampled_as_in_lockstep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def start(_children: Children, step: str, command: Sequence[str]) -> Child:
+        asked.extend(command)
+        raise StepError(step)
+
+    monkeypatch.setattr(Children, "start", start)
+    task = EpisodeTask(episode(), GOOD, tmp_path)
+    with pytest.raises(StepError, match="edge-hil"):
+        realtime.run_realtime(task, lambda _seconds: None)
+    assert asked[asked.index("--pose-hz") + 1] == str(FRAME_HZ)
+
+
+@pytest.mark.parametrize("rate", [10, 30])
+def test_the_trace_has_as_many_poses_as_asked_evenly_in_the_robots_time(rate: int) -> None:
+    steps: list[int] = []
+    truth = SimpleNamespace(position_m=(0, 0, 0), rpy_rad=(0, 0, 0), velocity_world_mps=(0, 0, 0), gyro_radps=(0, 0, 0))
+    world = SimpleNamespace(step=lambda: None, truth=lambda: truth, touching=(), people=list)
+    protocol = SimpleNamespace(publish=lambda step, _stamp_s: None)
+    trace = SimpleNamespace(put=lambda _t_ns, kind, **_fields: steps.append(loop._steps) if kind == "pose" else None)
+    loop = HilLoop(world, protocol, options("go2"), pose_hz=rate)  # type: ignore[arg-type]
+    loop._trace = trace  # type: ignore[assignment]
+    for _ in range(2 * STEPS_PER_S):
+        loop._step()
+    assert len(steps) == 2 * rate
+    assert {b - a for a, b in itertools.pairwise(steps)} <= {STEPS_PER_S // rate, STEPS_PER_S // rate + 1}
 
 
 def test_a_slow_robot_differs_in_its_speed_limit_alone(tmp_path: Path) -> None:

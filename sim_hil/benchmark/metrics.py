@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from math import hypot
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
+
+FRAME_HZ: Final = 30
+"""The paper's simulation rate: trajectories, collisions and ends are looked at so often."""
 
 
 def navigation_error_m(position_xy: Vec2, goal_xy: Vec2) -> float:
@@ -22,7 +26,7 @@ def is_success(position_xy: Vec2, goal_xy: Vec2, threshold_m: float) -> bool:
 
 
 def path_length_m(positions_xy: Array) -> float:
-    """PL, equation 8: summed planar distance between successive positions [n, 2], m; recorded at 30 Hz."""
+    """PL, equation 8: summed planar distance between successive positions [n, 2], m; recorded at FRAME_HZ."""
     if len(positions_xy) < 2:
         return 0.0
     steps = np.diff(positions_xy, axis=0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode
-from sim_hil.benchmark.metrics import is_success
+from sim_hil.benchmark.metrics import FRAME_HZ, is_success
 from sim_hil.benchmark.observation import Observation, Odometer
 from sim_hil.benchmark.outcome import Outcome, measure
 from sim_hil.odometry_noise import LEVELS
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FRAME_HZ: Final = 30  # the paper's simulation rate: trajectories, collisions and ends are looked at so often
 FRAMES_PER_STEP: Final = 3  # control at 10 Hz, the action held in between (paper appendix D)
 CAMERA_ASPECT: Final = 16 / 9  # the robot's picture is this wide, however it is squeezed for a policy
 MAX_PIXELS: Final = 2048

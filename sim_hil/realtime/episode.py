@@ -1,7 +1,7 @@
 """One episode of the benchmark in real time: edge-hil, edge-bridge and edge-run drive it, ground truth judges it.
 
-The record is that of lockstep. What differs: delays are this machine's own, the path is summed over 10 Hz poses
-(lockstep: 30 Hz), and nothing is the same twice.
+The record is that of lockstep, the path summed over 30 Hz poses like there. What differs: delays are this machine's
+own, and nothing is the same twice.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from edge.recording import RecordingError, read_messages
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.episode_log import EpisodeLog
-from sim_hil.benchmark.metrics import is_success
+from sim_hil.benchmark.metrics import FRAME_HZ, is_success
 from sim_hil.benchmark.outcome import measure
 from sim_hil.benchmark.results import EpisodeResult
 from sim_hil.benchmark.task import EpisodeTask
@@ -95,6 +95,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         domain=free_domain(),
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
+        pose_hz=FRAME_HZ,
     )
     with _asked_to_end(), Stack(options) as stack:
         drive = _run(stack, task, tell)

@@ -55,6 +55,8 @@ class StackOptions:
     faults: bool = False
     instructions: bool = False
     """Whether the runner takes further instructions while it drives."""
+    pose_hz: int | None = None
+    """Poses a second in the trace, in place of edge-hil's default."""
 
     def __post_init__(self) -> None:
         if self.speed_limit_mps is not None and not 0.01 <= self.speed_limit_mps <= 5.0:
@@ -127,6 +129,8 @@ class Stack:
             *("--odometry-noise", options.odometry_noise),
             *("--trace", str(self.trace), "--json", str(self.result("edge-hil"))),
         ]
+        if options.pose_hz is not None:
+            command += ["--pose-hz", str(options.pose_hz)]
         faults = self._sockets / "faults"
         if options.faults:
             command += ["--faults", str(faults)]
