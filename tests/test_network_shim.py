@@ -22,8 +22,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.network.__main__ import main
-from sim_hil.network.config import LinkConfig, NetworkConfig, NetworkError, load_network, parse_network
+from sim_hil.network.config import LinkConfig, NetworkConfig, NetworkError
 from sim_hil.network.impairment import Direction, Impairment
 from sim_hil.network.ports import UdpEnds, can_frames
 from sim_hil.network.relay import Relay
@@ -108,49 +107,6 @@ class TestImpairment:
     def test_what_cannot_be_is_refused(self, wrong: dict[str, object]) -> None:
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Impairment(**wrong)  # type: ignore[arg-type]
-
-
-class TestConfig:
-    def test_a_direction_of_its_own_adds_to_what_both_have(self) -> None:
-        link = {
-            "name": "a", "kind": "udp", "left": "127.0.0.1:1", "right": "127.0.0.1:2",
-            "impairment": {"delay_ms": 10}, "back": {"loss_percent": 5, "partitions": [[1, 2]]},
-        }  # fmt: skip
-        (parsed,) = parse_network({"seed": 3, "links": [link]}).links
-        assert parsed.there == Impairment(delay_ms=10)
-        assert parsed.back == Impairment(delay_ms=10, loss_percent=5, partitions=((1.0, 2.0),))
-
-    @pytest.mark.parametrize(
-        ("text", "complaint"),
-        [
-            ("seed = 1", "at least one"),
-            ("[[links]]", "name"),
-            ('[[links]]\nname = "a"\nkind = "smoke"\nleft = "x"\nright = "y"', "kind"),
-            ('[[links]]\nname = "a"\nkind = "udp"\nleft = "x"\nright = "y:1"', "HOST:PORT"),
-            ('[[links]]\nname = "a"\nkind = "frames"\nleft = "x"', "right"),
-            ('[[links]]\nname = "a"\nkind = "frames"\nleft = "x"\nright = "y"\ncolour = 1', "colour"),
-            ('[[links]]\nname = "a"\nkind = "frames"\nleft = "x"\nright = "y"\nthere = { lag_ms = 1 }', "lag_ms"),
-            (
-                '[[links]]\nname = "a"\nkind = "frames"\nleft = "x"\nright = "y"\nback = { partitions = [1] }',
-                "pairs|from",
-            ),
-            ("seed = ", "TOML"),
-        ],
-    )
-    def test_a_file_that_is_wrong_is_one_line(self, tmp_path: Path, text: str, complaint: str) -> None:
-        path = tmp_path / "links.toml"
-        path.write_text(text)
-        with pytest.raises(NetworkError, match=complaint) as error:
-            load_network(path)
-        assert "\n" not in str(error.value) and str(path) in str(error.value)
-
-    def test_the_command_refuses_it_with_exit_status_2(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        path = tmp_path / "links.toml"
-        path.write_text("links = 3")
-        assert main(["run", str(path)]) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @contextlib.contextmanager
@@ -279,28 +235,6 @@ class TestDatagrams:
             assert b"now" in received(rig.server)
 
 
-def test_the_command_is_told_changes_over_its_socket_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    (tmp_path / "l.toml").write_text(
-        '[[links]]\nname = "l"\nkind = "udp"\nleft = "127.0.0.1:0"\nright = "127.0.0.1:9"\n'
-    )
-    control, mine = tmp_path / "c.sock", tmp_path / "me.sock"
-    command = [sys.executable, "-m", "sim_hil.network", "run", str(tmp_path / "l.toml"), "--control", str(control)]
-    with subprocess.Popen([*command, "--json", str(tmp_path / "r.json")], cwd=REPOSITORY, stderr=subprocess.PIPE) as it:
-        assert it.stderr is not None and b"ready" in it.stderr.readline()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asker:
-            asker.bind(str(mine))
-            asker.settimeout(10)
-            answers = []
-            for line in (b'{"link": "l", "cut": true}', b"nonsense"):
-                asker.sendto(line, str(control))
-                answers.append(json.loads(asker.recv(1000)))
-        it.terminate()
-        assert it.wait(10) == 0
-    assert answers[0]["links"] == ["l"] and "expected" in answers[1]["error"]
-    assert not control.exists()
-    assert json.loads((tmp_path / "r.json").read_text())["links"]["l"]["there"]["packets"] == 0
-
-
 class TestSerial:
     frames = st.lists(
         st.builds(
@@ -381,6 +315,10 @@ class TestCable:
         assert seen["rtt_min_ms"] >= 30
         assert seen["calls"] > 3
         assert tally["there"]["lost"] > 0 and tally["there"]["delivered"] > 50
+
+    def test_a_signal_that_ends_the_right_command_is_its_exit_status(self, tmp_path: Path) -> None:
+        done, _ = self.between(tmp_path, "delay_ms = 1", "sleep 60", "sh -c 'kill -9 $$'")
+        assert done.returncode == 137, done.stderr
 
     def test_the_machines_own_network_is_left_alone(self, tmp_path: Path) -> None:
         before = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout

@@ -10,13 +10,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_target,
+    write_result,
+)
 from sim_hil.network.config import KINDS, NetworkConfig, NetworkError, load_network
-from sim_hil.network.namespaces import Sides, cable
+from sim_hil.network.namespaces import Sides, cable, check_rights
 from sim_hil.network.relay import Relay
 
 _INSIDE: Final = "SIM_HIL_NETWORK_INSIDE"
@@ -41,7 +48,9 @@ with --control, one JSON object a datagram changes a link: {{"link": "telemetry"
 "there": {{"loss_percent": 30}}}}; the answer says when it took effect
 between: left is 192.168.123.161, right is .99, both on eth0 in network namespaces of their own (needs root); it ends
 with the right command and ends the left one
-exit codes: 0 done, of `between` the right command's own; 1 the result could not be written; 2 bad input"""
+exit codes: 0 done (also after SIGTERM), of `between` the right command's own (128 + N if signal N ended it); 1 the
+relay failed or the result could not be written; 2 bad input, or no right to the addresses, interfaces or namespaces;
+130 interrupted (SIGINT), the result is written all the same"""
 
 
 @contextlib.contextmanager
@@ -94,14 +103,17 @@ def main(argv: list[str] | None = None) -> int:
             sys.stderr.write(f"network: ready, {', '.join(link.name for link in config.links)}\n")
             sys.stderr.flush()
             with contextlib.closing(relay):
-                relay.run(lambda: bool(stop), args.duration)
-    except (NetworkError, OSError, subprocess.CalledProcessError) as error:
+                return _written(args, relay, _carried(relay, stop, lambda: None, args.duration))
+    except KeyboardInterrupt:  # before the signals are ours
+        return EXIT_INTERRUPTED
+    except (ValueError, OSError, subprocess.SubprocessError) as error:  # ValueError: names that no address can have
         return _complain(error, EXIT_BAD_INPUT)
-    return _written(args, relay, EXIT_DONE)
 
 
 def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | None) -> int:
+    commands = (_command("--left", args.left), _command("--right", args.right))
     if os.environ.get(_INSIDE) is None:
+        check_rights()
         # Again, in a namespace of its own: the cable's ends must not appear on the machine's network.
         command = [sys.executable, "-m", "sim_hil.network", *(sys.argv[1:] if argv is None else argv)]
         with _stop_signals() as stop:
@@ -110,10 +122,7 @@ def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | 
                 time.sleep(0.05)
                 if stop:
                     inside.send_signal(stop.pop())
-        return inside.returncode
-    commands = (shlex.split(args.left), shlex.split(args.right))
-    if not all(commands):
-        raise NetworkError("--left, --right: expected a command each, found an empty text")
+        return _code(inside.returncode)
     environment = os.environ.pop(_INSIDE)
     assert environment
     with _stop_signals() as stop:
@@ -122,9 +131,35 @@ def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | 
             ends.callback(sides.end)
             relay = ends.enter_context(contextlib.closing(Relay(config, control=args.control)))
             sides.connect()
-            relay.run(lambda: bool(stop) or sides.right_code() is not None, args.duration)
-            code = sides.right_code()
-    return _written(args, relay, EXIT_DONE if code is None else code)
+            code = _carried(relay, stop, sides.right_code, args.duration)
+    return _written(args, relay, code)
+
+
+def _command(option: str, text: str) -> list[str]:
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise NetworkError(f"{option}: expected a command as a shell would take it, {error}: {text!r}") from error
+    if not words:
+        raise NetworkError(f"{option}: expected a command, found an empty text")
+    return words
+
+
+def _carried(relay: Relay, stop: list[int], ended: Callable[[], int | None], duration_s: float | None) -> int:
+    """Carry packets until a signal, `duration_s` or `ended()`; the exit code: what that says, if it says anything."""
+    try:
+        relay.run(lambda: bool(stop) or ended() is not None, duration_s)
+    except OSError as error:
+        return _complain(f"the relay has failed: {error}", EXIT_CHECK_FAILED)
+    if signal.SIGINT in stop:
+        return EXIT_INTERRUPTED
+    code = ended()
+    return EXIT_DONE if code is None else _code(code)
+
+
+def _code(status: int) -> int:
+    """Exit status of a process as a shell reports it."""
+    return 128 - status if status < 0 else status
 
 
 def _written(args: argparse.Namespace, relay: Relay, code: int) -> int:

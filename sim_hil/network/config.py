@@ -39,7 +39,7 @@ class LinkConfig:
     back: Impairment = PERFECT
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
+        if not isinstance(self.kind, str) or self.kind not in KINDS:
             raise NetworkError(f"link {self.name!r}: kind: expected one of {', '.join(KINDS)}, found {self.kind!r}")
         for side in ("left", "right"):
             if not getattr(self, side) or not isinstance(getattr(self, side), str):
@@ -72,10 +72,12 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 def load_network(path: Path) -> NetworkConfig:
-    """Raises NetworkError or OSError."""
+    """Raises NetworkError."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise NetworkError(f"{path}: expected a file of links, {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise NetworkError(f"{path}: expected TOML: {error}") from error
     try:
         return parse_network(table)

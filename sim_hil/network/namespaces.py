@@ -7,6 +7,7 @@ namespace of its own.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import time
@@ -27,7 +28,7 @@ class Sides:
     """The two commands, waiting for their cable until `connect`."""
 
     def __init__(self, commands: tuple[list[str], list[str]]) -> None:
-        """`commands`: left and right. Raises OSError or subprocess.CalledProcessError without the rights to."""
+        """`commands`: left and right. Raises OSError without the rights to."""
         self._processes: list[subprocess.Popen[bytes]] = []
         try:
             for address, ours, command in zip(ADDRESSES, _OURS, commands, strict=True):
@@ -52,7 +53,9 @@ class Sides:
             ["link", "add", ours, "type", "veth", "peer", "name", INTERFACE, "netns", str(pid)],
             ["link", "set", ours, "up"],
         ):
-            subprocess.run(["ip", *arguments], check=True)
+            done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise OSError(f"ip {' '.join(arguments)}: {' '.join(done.stderr.split())}")
 
     def connect(self) -> None:
         """Let the commands begin; the cable must be carried by now."""
@@ -76,6 +79,18 @@ class Sides:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+def check_rights() -> None:
+    """Raise OSError with one clear line unless namespaces can be made and cables laid."""
+    for program, package in (("unshare", "util-linux"), ("ip", "iproute2")):
+        if shutil.which(program) is None:
+            raise OSError(f"between: expected the program {program} on the PATH; install {package}")
+    probe = subprocess.run(["unshare", "--net", "--", "true"], capture_output=True, text=True, check=False)
+    if probe.returncode:
+        raise OSError(
+            f"between: expected the right to make network namespaces (root): {' '.join(probe.stderr.split())}"
+        )
 
 
 def cable(config: NetworkConfig) -> NetworkConfig:

@@ -181,7 +181,7 @@ def _listen(path: Path) -> socket.socket:
         listener.bind(str(path))
     except OSError as error:
         listener.close()
-        raise OSError(f"--control {path}: expected a free path for a socket, {error.strerror}") from error
+        raise OSError(f"--control {path}: expected a free path for a socket, {error.strerror or error}") from error
     finally:
         os.umask(umask)
     listener.setblocking(False)
