@@ -1,0 +1,105 @@
+"""AdamW with warm-up, cosine decay and clipped gradients (paper Table 8), and bf16 where it is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import torch
+
+from tools.train import checkpoint
+from tools.train.distributed import SINGLE, Ranks
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Numbers of an optimiser; the defaults are the paper's for the action expert (Table 8)."""
+
+    lr: float = 2e-4
+    final_lr_share: float = 0.0
+    """What of `lr` the cosine ends at."""
+    weight_decay: float = 1e-2
+    warmup_steps: int = 1000
+    clip: float = 1.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+    bf16: bool = False
+    """Compute forward passes in bfloat16; weights and moments stay float32."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.lr < 1 and 0 <= self.final_lr_share <= 1 and 0 <= self.weight_decay < 1 and self.clip > 0):
+            raise ValueError("expected lr and weight_decay below 1, final_lr_share from 0 to 1 and clip above 0")
+        if not (self.warmup_steps >= 0 and 0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
+            raise ValueError("expected warmup_steps from 0 on and betas from 0 to below 1")
+
+
+class Optimiser:
+    """AdamW over parameters for a known number of steps; what it needs to go on exactly is `tensors` and `step`."""
+
+    def __init__(
+        self, parameters: Iterable[torch.nn.Parameter], config: OptimConfig, total_steps: int, ranks: Ranks = SINGLE
+    ) -> None:
+        self.config = config
+        self.total_steps = total_steps
+        self.step_count = 0
+        self._ranks = ranks
+        self.parameters = [each for each in parameters if each.requires_grad]
+        # Gains and biases are not weights: decay would pull them off their meaning.
+        decayed = [each for each in self.parameters if each.ndim >= 2]
+        others = [each for each in self.parameters if each.ndim < 2]
+        groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+        self._adam = torch.optim.AdamW(
+            [group for group in groups if group["params"]], lr=config.lr, betas=(config.beta1, config.beta2)
+        )
+
+    @property
+    def lr(self) -> float:
+        """Learning rate of the next step."""
+        return learning_rate(self.config, self.step_count, self.total_steps)
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        self._adam.zero_grad(set_to_none=True)
+
+    def step(self, weight: float = 1.0) -> float:
+        """One update from the gradients of this rank's mean loss over `weight` samples; returns their norm.
+
+        Gradients are averaged over ranks and clipped first; a norm that is not finite skips the update.
+        """
+        self._ranks.average_gradients(self.parameters, weight)
+        norm = float(torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip))
+        for group in self._adam.param_groups:
+            group["lr"] = self.lr
+        if math.isfinite(norm):
+            self._adam.step()
+        self.step_count += 1
+        self.zero_grad()
+        return norm
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Moments and the step, for a checkpoint."""
+        count = torch.tensor(self.step_count, dtype=torch.int64)
+        return {**checkpoint.with_prefix("adam", checkpoint.optimiser_tensors(self._adam)), "step_count": count}
+
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Go on from what `tensors` gave."""
+        self.step_count = int(tensors["step_count"])
+        checkpoint.restore_optimiser(self._adam, checkpoint.under("adam", tensors))
+
+
+def learning_rate(config: OptimConfig, step: int, total_steps: int) -> float:
+    """Linear warm-up over at most a tenth of the run, then half a cosine down to `final_lr_share`."""
+    warmup = min(config.warmup_steps, total_steps // 10)
+    if step < warmup:
+        return config.lr * (step + 1) / warmup
+    share = min((step - warmup) / max(total_steps - warmup, 1), 1.0)
+    low = config.lr * config.final_lr_share
+    return low + (config.lr - low) * (1 + math.cos(math.pi * share)) / 2
+
+
+def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
+    """bfloat16 where `bf16` says so; float32 otherwise."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, dtype=torch.bfloat16) if bf16 else nullcontext()

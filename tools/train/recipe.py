@@ -1,0 +1,200 @@
+"""What a training run is made of: a network, a seed and one table of numbers a stage, read strictly from TOML."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from calib.toml_text import toml_text
+from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config_file import config_for, with_overrides
+from export.settings import MODEL_PREFIX, model_settings
+from export.typed import FieldError, build, field_types, from_text, near, plain
+
+if TYPE_CHECKING:
+    from tools.train.collect import CollectConfig
+    from tools.train.encoder import EncoderConfig
+    from tools.train.evaluate import EvaluateConfig
+    from tools.train.imitate import ImitateConfig
+    from tools.train.rl import RlConfig
+    from tools.train.sft import SftConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SCHEMA: Final = 1
+FOLDER: Final = Path(__file__).parent / "recipes"
+STAGES: Final[Mapping[str, tuple[str, str]]] = {
+    "collect": ("tools.train.collect", "CollectConfig"),
+    "encoder": ("tools.train.encoder", "EncoderConfig"),
+    "sft": ("tools.train.sft", "SftConfig"),
+    "imitate": ("tools.train.imitate", "ImitateConfig"),
+    "rl": ("tools.train.rl", "RlConfig"),
+    "evaluate": ("tools.train.evaluate", "EvaluateConfig"),
+}
+"""Name of a stage, the module whose `run(job)` does it, and the dataclass of its numbers there."""
+MAX_RECIPE_BYTES: Final = 1 << 20
+
+
+class RecipeError(ValueError):
+    """A recipe that cannot be used; one line: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class DaggerConfig:
+    """Rounds in which the expert relabels the policy's own drives, after which imitation goes on."""
+
+    rounds: int = 2
+    episodes: int = 150
+    """Drives of one round."""
+    latency_mean_s: float = 2.0
+    """Mean generation time in those drives; each drive draws its own between 0 and twice this."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.rounds <= 100 and 1 <= self.episodes <= 100_000 and 0 <= self.latency_mean_s <= 10):
+            raise RecipeError("expected 0 to 100 rounds of 1 to 100000 episodes and a mean latency of 0 to 10 s")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One training run. A stage's numbers are None where a caller that runs other stages alone leaves them out."""
+
+    name: str
+    seed: int
+    model: TicVlaConfig
+    collect: CollectConfig | None = None
+    encoder: EncoderConfig | None = None
+    sft: SftConfig | None = None
+    imitate: ImitateConfig | None = None
+    rl: RlConfig | None = None
+    evaluate: EvaluateConfig | None = None
+    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+
+    def __post_init__(self) -> None:
+        if not self.name or not 0 <= self.seed < 2**31:
+            raise RecipeError(f"expected a name and a seed from 0 to 2^31 - 1, found {self.name!r} and {self.seed}")
+
+    def to_tables(self) -> dict[str, Any]:
+        """Every number of the run, defaults included, as plain tables."""
+        stages = {name: plain(getattr(self, name)) for name in STAGES if getattr(self, name) is not None}
+        dagger = plain(self.dagger)
+        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed}
+        return {**head, "model": self.model.to_dict(), **stages, "dagger": dagger}
+
+    def to_toml(self) -> str:
+        """The same for people; `resolved` reads it back."""
+        return toml_text(self.to_tables())
+
+
+def recipe_names() -> list[str]:
+    """The shipped recipes."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
+    """A shipped recipe or a `.toml` file, with `--set KEY=VALUE` applied; raises RecipeError.
+
+    KEY is `seed`, `STAGE.field` or `model.SECTION.field`. A file names a preset and what it changes of it
+    (`[model] preset`, `[model.set] "action.layers"`), or is what `Recipe.to_toml` wrote.
+    """
+    path = FOLDER / f"{name_or_path}.toml" if name_or_path in recipe_names() else Path(name_or_path)
+    if path.suffix != ".toml":
+        raise RecipeError(f"recipe {name_or_path!r}: expected one of {', '.join(recipe_names())}, or a .toml file")
+    try:
+        if path.stat().st_size > MAX_RECIPE_BYTES:
+            raise RecipeError(f"recipe {path}: more than {MAX_RECIPE_BYTES} bytes, which is no recipe")
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecipeError(f"recipe {path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, RecipeError):
+            raise
+        raise RecipeError(f"recipe {path}: {error}") from error
+    try:
+        return recipe_of(tables, overrides)
+    except (FieldError, ModelConfigError, RecipeError) as error:
+        raise RecipeError(f"recipe {path}: {error}") from error
+
+
+def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+    """A recipe from its tables; raises RecipeError, FieldError, ModelConfigError."""
+    known = ("schema", "name", "seed", "model", "dagger", *STAGES)
+    for key in tables:
+        if key not in known:
+            raise RecipeError(f"unknown key {key!r}; {near(key, known)}")
+    if tables.get("schema") != SCHEMA:
+        raise RecipeError(f"expected schema = {SCHEMA}, found {tables.get('schema')!r}")
+    content: dict[str, Any] = {
+        key: dict(value) if isinstance(value, Mapping) else value for key, value in tables.items()
+    }
+    kinds = {name: stage_config(name) for name in STAGES} | {"dagger": DaggerConfig}
+    for setting in overrides:
+        _set(content, kinds, setting)
+    stages = {name: build(kind, content.get(name, {}), f"[{name}]") for name, kind in kinds.items()}
+    model = with_overrides(_model(content.get("model")), model_settings(overrides))
+    name, seed = content.get("name"), content.get("seed")
+    if not isinstance(name, str) or type(seed) is not int:
+        raise RecipeError(f"expected name, a text, and seed, a whole number; found {name!r} and {seed!r}")
+    return Recipe(name, seed, model, **stages)
+
+
+def stage_config(name: str) -> type:
+    """The dataclass of a stage's numbers, from the stage's own module."""
+    module, kind = STAGES[name]
+    return getattr(importlib.import_module(module), kind)  # type: ignore[no-any-return]
+
+
+def _model(table: object) -> TicVlaConfig:
+    """A preset with changes, or every number of a network."""
+    from export.model.config_file import config_from_dict
+
+    if not isinstance(table, Mapping):
+        raise RecipeError("expected a table [model] with preset")
+    if "preset" not in table:
+        return config_from_dict(dict(table))
+    if extra := sorted(set(table) - {"preset", "set"}):
+        raise RecipeError(f"[model]: unknown key {extra[0]!r}; expected preset and set")
+    changes = table.get("set", {})
+    if not isinstance(table["preset"], str) or not isinstance(changes, Mapping):
+        raise RecipeError('[model]: expected preset = "NAME" and a table [model.set]')
+    texts = {str(key): _as_text(value) for key, value in changes.items()}
+    return with_overrides(config_for(table["preset"]), texts)
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> None:
+    """Put one `KEY=VALUE` into the tables as a value of its field's type."""
+    key, equals, text = (part.strip() for part in setting.partition("="))
+    where = f"--set {setting}"
+    if not equals:
+        raise RecipeError(f"{where}: expected KEY=VALUE")
+    if key.startswith(MODEL_PREFIX):
+        return
+    if key in ("seed", "name"):
+        content[key] = from_text(int if key == "seed" else str, text, where)
+        return
+    section, *path = key.split(".")
+    if section not in kinds or not path:
+        raise RecipeError(f"{where}: unknown key; {near(section, [*kinds, 'seed', 'model'])} as STAGE.field")
+    kind: Any = kinds[section]
+    table = content.setdefault(section, {})
+    for name in path[:-1]:
+        kind = field_types(kind).get(name) if dataclasses.is_dataclass(kind) else None
+        table[name] = dict(table.get(name, {}))
+        table = table[name]
+    if not dataclasses.is_dataclass(kind) or path[-1] not in field_types(kind):
+        known = field_types(kind) if dataclasses.is_dataclass(kind) else ()
+        raise RecipeError(f"{where}: unknown key {path[-1]!r}; {near(path[-1], known)}")
+    table[path[-1]] = from_text(field_types(kind)[path[-1]], text, where)
