@@ -19,10 +19,22 @@ def until(condition, seconds):
     return condition()
 
 
+def rests(robot):
+    """Whether 10 samples in a row feel gravity and nothing else, with still joints."""
+    for _ in range(10):
+        low = robot.read_low_state()
+        felt = sum(v * v for v in low.imu.accel) ** 0.5
+        if abs(felt - 9.81) > 0.3 or max(map(abs, low.motor.dq[:12])) > 0.1:
+            return False
+        time.sleep(0.02)
+    return True
+
+
 def main():
     robot = unitree_interface.UnitreeInterface.create_go2(sys.argv[1])
     result = {"robot": robot.get_robot_name(), "motors": robot.get_num_motors()}
     result["low_state"] = until(lambda: any(robot.read_low_state().motor.q), 20)
+    result["rests"] = until(lambda: rests(robot), 20)  # released joints let it drop the last bit
     low = robot.read_low_state()
     result["lying_q"] = [round(q, 2) for q in low.motor.q[:12]]
     result["accel_z"] = round(low.imu.accel[2], 1)

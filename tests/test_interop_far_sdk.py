@@ -53,7 +53,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 def test_the_binding_reads_the_joints_and_the_imu(session: dict) -> None:
-    assert session["low_state"] and session["motors"] == 12
+    assert session["low_state"] and session["rests"] and session["motors"] == 12
     assert session["lying_q"][1] == pytest.approx(1.3, abs=0.3) and session["accel_z"] == pytest.approx(9.8, abs=0.5)
 
 
