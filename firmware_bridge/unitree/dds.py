@@ -20,6 +20,10 @@ from firmware_bridge.config import DdsConfig
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
 DECODE_ERRORS: Final = (struct.error, ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)
 MAX_SAMPLE_BYTES: Final = 10 * 1024 * 1024  # more than a camera frame
+# What Cyclone receives into. Discovery fills a buffer from end to end, a few hundred bytes a second, before the next
+# takes its place: Cyclone's own 1 MiB looks like a leak for half an hour, these are full within minutes.
+_RECEIVE_BUFFER_KIB: Final = 96
+_RECEIVE_CHUNK_KIB: Final = 66  # of one packet: more than UDP has
 # What a call into DDS itself can raise.
 DDS_ERRORS: Final = (DDSException,)
 _FRESH: Final = ViewState.Any | InstanceState.Alive | SampleState.NotRead
@@ -42,7 +46,9 @@ def domain_xml(config: DdsConfig, max_sample_bytes: int = MAX_SAMPLE_BYTES) -> s
         f'<NetworkInterface name="{config.interface}" priority="default" multicast="default"/>'
         "</Interfaces></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex><Peers>{peers}</Peers>"
-        f"</Discovery><Internal><MaxSampleSize>{max_sample_bytes} B</MaxSampleSize></Internal>"
+        f"</Discovery><Sizing><ReceiveBufferSize>{_RECEIVE_BUFFER_KIB} KiB</ReceiveBufferSize>"
+        f"<ReceiveBufferChunkSize>{_RECEIVE_CHUNK_KIB} KiB</ReceiveBufferChunkSize></Sizing>"
+        f"<Internal><MaxSampleSize>{max_sample_bytes} B</MaxSampleSize></Internal>"
         "</Domain></CycloneDDS>"
     )
 
