@@ -10,7 +10,8 @@ import re
 from dataclasses import dataclass
 
 from sim_hil.benchmark.instruction_words import AREAS, NAME, ORDINALS
-from sim_hil.benchmark.route import Step, Told, opening_class
+from sim_hil.benchmark.openings import opening_class
+from sim_hil.benchmark.route import Step, Told
 
 _TURN = "(?:turn|go|head|bear)"
 _CORRIDOR = "(?:(?:main|cross|back) aisle|corridor|hallway|hall|passage|aisle|row|sidewalk|pavement)"

@@ -79,6 +79,11 @@ class Frame:
         return (ahead[0], ahead[1]), (left[0], left[1])
 
 
+def opening_class(kind: str) -> str:
+    """What is counted together: corridors with aisles, rooms (doors), each other kind."""
+    return "passage" if kind in ("corridor", "aisle") else kind
+
+
 def is_open(grid: NavGrid, a: Vec2, b: Vec2) -> bool:
     """Whether a small body gets straight from one point to the other."""
     count = max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 0.1) + 1)

@@ -10,7 +10,7 @@ import itertools
 from dataclasses import dataclass, replace
 from math import cos, hypot, sin
 
-from sim_hil.benchmark.openings import LINEAR, Bounds, Frame, Opening, bounds_of, is_open, side_openings
+from sim_hil.benchmark.openings import LINEAR, Bounds, Frame, Opening, bounds_of, is_open, opening_class, side_openings
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Area, Scene, SceneObject, Vec2
 
@@ -42,7 +42,8 @@ class Step:
 
     `side` is left, right or straight. `ordinal` counts the openings of that kind on that side since the last step (0:
     not to be counted); `at_end`: the way followed ends there; `near`: landmarks that mark the place; `passed`: what is
-    passed on the way to it; `before_kind` is what is followed before it, for `before_m`.
+    passed on the way to it; `before_kind` is what is followed before it, for `before_m`, in direction `ahead`.
+    `counted`: all openings of that kind on that side, in the frame of `ahead`; the taken one is the `ordinal`-th.
     """
 
     side: str
@@ -56,6 +57,8 @@ class Step:
     before_name: str
     before_m: float
     at: Vec2
+    ahead: Vec2 = (1.0, 0.0)
+    counted: tuple[Opening, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -234,6 +237,7 @@ def _step(scene: Scene, grid: NavGrid, earlier: _Leg | None, before: _Leg, after
     target = (after.followed or after.crossed)[0]
     side = _turn(before, after)
     ordinal, at_end = 0, False
+    counted: tuple[Opening, ...] = ()
     near: tuple[Passed, ...] = ()
     passed: tuple[Passed, ...] = ()
     start = before.frame.along(before.start)
@@ -243,7 +247,8 @@ def _step(scene: Scene, grid: NavGrid, earlier: _Leg | None, before: _Leg, after
             crossed = [*before.crossed, *([target] if _lies_across(before, target) else [])]
             openings = side_openings(scene, grid, before.frame, before.followed, crossed, side)
             taken = _taken(openings, target, before.frame.along(after.start))
-            ordinal = _ordinal(openings, taken, start, _turn(earlier, before) if earlier else "")
+            counted = _counted(openings, taken, start, _turn(earlier, before) if earlier else "")
+            ordinal = sum(opening.middle_m <= taken.middle_m + 1e-6 for opening in counted)
             limit = taken.low_m
             near = _near(scene, before, openings, taken)
         at_end = _ends(scene, grid, before, target)
@@ -252,6 +257,7 @@ def _step(scene: Scene, grid: NavGrid, earlier: _Leg | None, before: _Leg, after
         side=side, kind=target.kind, name=target.name, ordinal=ordinal, at_end=at_end, near=near, passed=passed,
         before_kind=before.kind, before_name=(before.followed or before.crossed)[-1].name,
         before_m=abs(before.frame.along(after.start) - start), at=after.start,
+        ahead=before.frame.direction, counted=counted,
     )  # fmt: skip
 
 
@@ -269,18 +275,13 @@ def _taken(openings: list[Opening], target: Area, along: float) -> Opening:
     return min(mine, key=lambda opening: max(opening.low_m - along, along - opening.high_m, 0.0))
 
 
-def opening_class(kind: str) -> str:
-    """What is counted together: corridors with aisles, rooms (doors), each other kind."""
-    return "passage" if kind in ("corridor", "aisle") else kind
-
-
-def _ordinal(openings: list[Opening], taken: Opening, start: float, from_side: str) -> int:
-    """Which of its kind, counted from the leg's start. Raises RouteError where one cannot tell.
+def _counted(openings: list[Opening], taken: Opening, start: float, from_side: str) -> tuple[Opening, ...]:
+    """Those of the taken one's kind from the leg's start on, in order. Raises RouteError where one cannot tell.
 
     Who turned left comes `from_side` left: what opens there at the leg's start was just left behind. A passage straight
     across belongs to the junction that one turned at; as in streets, nobody counts it. A door there is another matter.
     """
-    count = 0
+    counted = []
     for opening in openings:
         if opening_class(opening.area.kind) != opening_class(taken.area.kind):
             continue
@@ -291,9 +292,9 @@ def _ordinal(openings: list[Opening], taken: Opening, start: float, from_side: s
                 continue
         elif opening.low_m - _AT_START_M < start < opening.high_m + _AT_START_M:
             raise RouteError(f"{opening.area.label} opens right beside the start of the way, or of a leg")
-        if opening.middle_m > start and opening.middle_m <= taken.middle_m + 1e-6:
-            count += 1
-    return count
+        if opening.middle_m > start:
+            counted.append(opening)
+    return tuple(counted)
 
 
 def _ends(scene: Scene, grid: NavGrid, leg: _Leg, target: Area | None = None) -> bool:
