@@ -7,6 +7,7 @@ pushing, and it is the teacher of policies that see only pictures.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import cos, hypot, sin
 from types import MappingProxyType
 from typing import Final
@@ -51,7 +52,9 @@ class ExpertPolicy:
     privileged = True
     needs_image = False
 
-    def __init__(self) -> None:
+    def __init__(self, margin_m: float = 0.0) -> None:
+        """`margin_m`: kept to people beyond what it keeps in the benchmark, for a teacher."""
+        self._margin_m = margin_m
         self._world: EpisodeWorld | None = None
         self._choice: Choice | None = None
 
@@ -65,7 +68,9 @@ class ExpertPolicy:
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
-        self._world, self._planner, self._driving = world, planner, _DRIVINGS[episode.robot]
+        driving = _DRIVINGS[episode.robot]
+        self._world, self._planner = world, planner
+        self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m)
         self._motion = Motion(planner.grid, self._driving)
         self._route = np.array([(pose.x_m, pose.y_m)])
         self._ticks = 0
@@ -143,6 +148,11 @@ class ExpertPolicy:
             there = pose.inverse() @ SE2(x, y, 0.0)
             points.append((there.x_m, there.y_m))
         return points
+
+    @property
+    def choice(self) -> Choice | None:
+        """What the last `act` chose."""
+        return self._choice
 
     def route(self) -> Array:
         """[n, 2]: the way ahead, m in the world, points 0.1 m apart."""

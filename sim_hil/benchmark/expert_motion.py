@@ -51,11 +51,15 @@ class Driving:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen: the velocity to command, and the future that it begins, [STEPS, 2] m in the world."""
+    """What was chosen: the velocity to command, and the future that it begins.
+
+    `future` [STEPS, 2] m in the world and `headings_rad` [STEPS], at STEP_S, 2 STEP_S, … from now.
+    """
 
     vx_mps: float
     wz_radps: float
     future: Array
+    headings_rad: Array
     shift_m: float
     cost: float
     """Below zero: it comes ahead; much above: something is in the way."""
@@ -113,7 +117,7 @@ class Motion:
         self._turn = _slew(self._turn, float(wanted_w[best]), turn_step, turn_step)
         self._shift = float(self._side[best])
         future = np.stack((x[:, best], y[:, best]), axis=1)
-        return Choice(self._speed, self._turn, future, self._shift, float(cost[best]))
+        return Choice(self._speed, self._turn, future, turned[:, best].copy(), self._shift, float(cost[best]))
 
     def _drive(self, pose: tuple[float, float, float], route: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
         """All futures at once: x, y, v, heading [STEPS, futures], and what each wants first, v and w."""

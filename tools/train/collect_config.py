@@ -1,0 +1,54 @@
+"""The numbers of a collection of drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+KINDS = ("hospital", "office", "warehouse", "sidewalk", "corridor")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """How many drives of the expert, where, and how varied. The same numbers and seed give the same drives.
+
+    A kind that is named twice is driven in twice as often. What is called a share is the chance of each drive.
+    """
+
+    episodes: int = 700
+    kinds: tuple[str, ...] = (
+        "hospital",
+        "office",
+        "warehouse",
+        "hospital",
+        "office",
+        "warehouse",
+        "sidewalk",
+        "corridor",
+    )
+    jobs: int = 0
+    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
+    noise_share: float = 0.3
+    """Drives in which the steering is disturbed now and then."""
+    sharp_share: float = 0.3
+    """Drives whose pictures are rendered twice as large and shrunk, as a real camera's are."""
+    jpeg_quality_min: int = 80
+    jpeg_quality_max: int = 95
+    typical_drift_share: float = 0.5
+    severe_drift_share: float = 0.1
+    margin_m: float = 0.1
+    """Kept to people beyond what the benchmark's expert keeps."""
+    arrive_share: float = 0.7
+    """Of the distance that counts as arrived: so near the goal a drive goes, that the last metres are learned too."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:
+            raise ValueError(f"expected 1 to 1000000 episodes and 0 to 1024 jobs, found {self.episodes}, {self.jobs}")
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {', '.join(self.kinds) or 'none'}")
+        shares = (self.noise_share, self.sharp_share, self.typical_drift_share, self.severe_drift_share)
+        if not all(0 <= share <= 1 for share in shares) or self.typical_drift_share + self.severe_drift_share > 1:
+            raise ValueError(f"expected shares of 0 to 1, those of the drifts 1 together at most, found {shares}")
+        if not 30 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100:
+            raise ValueError("jpeg_quality: expected 30 <= min <= max <= 100")
+        if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:
+            raise ValueError("expected margin_m from 0 to 0.5 and arrive_share from 0.3 to 1")
