@@ -28,6 +28,7 @@ from sim_hil.soak.task_run import TaskRun
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
 ARM_TIMEOUT_S: Final = 90.0
+TELL_AGAIN_NS: Final = 1_000_000_000
 FAULT_AFTER_NS: Final = 3_000_000_000
 """A stop so soon after a fault's end, or after a contact, is put down to it."""
 STUCK_LIVES: Final = 3
@@ -149,6 +150,8 @@ class Leg:
         """Until the runner or the bridge ends (None) or the leg does (why)."""
         runner, bridge = self._stack.runner, self._stack.bridge
         assert runner is not None and bridge is not None
+        untold: SoakTask | None = None
+        tell_ns = 0
         while runner.running and bridge.running:
             self._wait()
             end = self._look()
@@ -159,11 +162,14 @@ class Leg:
                 return "duration"
             if end is not None:
                 self._end_task(end)
-                task = self._next_task()
-                if task is None:
+                untold, tell_ns = self._next_task(), now_ns
+                if untold is None:
                     return "no-task"
-                if self._hand_over(task):
-                    self._begin_task(task)
+            if untold is not None and now_ns >= tell_ns:
+                if self._hand_over(untold):
+                    self._begin_task(untold)
+                    untold = None
+                tell_ns = time.monotonic_ns() + TELL_AGAIN_NS  # one that is too busy to answer drives on
             time.sleep(POLL_S)
         return None
 
@@ -171,7 +177,7 @@ class Leg:
         try:
             say(self._stack.instructions, task.instruction)
         except (SayError, OSError) as error:
-            # It is ending: what it ended by is found by whoever looks at its process.
+            # If it is ending: what it ended by is found by whoever looks at its process.
             self._note("not_told", why=str(error))
             return False
         return True
