@@ -52,9 +52,10 @@ class ExpertPolicy:
     privileged = True
     needs_image = False
 
-    def __init__(self, margin_m: float = 0.0) -> None:
-        """`margin_m`: kept to people beyond what it keeps in the benchmark, for a teacher."""
+    def __init__(self, *, margin_m: float = 0.0, speed_mps: float | None = None) -> None:
+        """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place."""
         self._margin_m = margin_m
+        self._speed_mps = speed_mps
         self._world: EpisodeWorld | None = None
         self._choice: Choice | None = None
 
@@ -70,7 +71,8 @@ class ExpertPolicy:
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
         driving = _DRIVINGS[episode.robot]
         self._world, self._planner = world, planner
-        self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m)
+        speed_mps = driving.speed_mps if self._speed_mps is None else self._speed_mps
+        self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m, speed_mps=speed_mps)
         self._motion = Motion(planner.grid, self._driving)
         self._route = np.array([(pose.x_m, pose.y_m)])
         self._ticks = 0

@@ -35,6 +35,8 @@ class CollectConfig:
     jpeg_quality_max: int = 95
     typical_drift_share: float = 0.5
     severe_drift_share: float = 0.1
+    speed_mps: float = 0.8
+    """The expert's, which is what a policy may drive on board: it could not follow a faster one."""
     margin_m: float = 0.1
     """Kept to people beyond what the benchmark's expert keeps."""
     arrive_share: float = 0.7
@@ -50,5 +52,7 @@ class CollectConfig:
             raise ValueError(f"expected shares of 0 to 1, those of the drifts 1 together at most, found {shares}")
         if not 30 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100:
             raise ValueError("jpeg_quality: expected 30 <= min <= max <= 100")
+        if not 0.2 <= self.speed_mps <= 1.5:
+            raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:
             raise ValueError("expected margin_m from 0 to 0.5 and arrive_share from 0.3 to 1")
