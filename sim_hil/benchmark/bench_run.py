@@ -171,6 +171,7 @@ def latency_result(directory: Path, conditions: Conditions, results: Sequence[Ep
         "profile": None if profile is None else profile.name,
         "profile_mean_s": None if profile is None else round(profile.mean_s, 4),
         "profile_source": None if profile is None else profile.source,
+        "profile_tagged": None if profile is None else profile.tagged,
     }
 
 
