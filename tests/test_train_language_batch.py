@@ -1,0 +1,113 @@
+"""A padded batch gives every row what `LanguageModel.forward` gives it alone, and learns from answers only."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from export.model.config import PRESETS, TicVlaConfig
+from export.model.language import LanguageModel
+from export.model.network import build
+from tools.train.language_batch import IGNORED, Row, buckets, collate, row_losses, run
+
+IMAGE = 5
+DEVICE = torch.device("cpu")
+
+
+def tiny() -> TicVlaConfig:
+    """`nano` with narrow layers: 4 visual tokens a frame, merged to 1."""
+    nano = PRESETS["nano"]
+    vision = dataclasses.replace(nano.vision, image_px=32, hidden=24, layers=1, mlp=32, token_dim=32)
+    language = dataclasses.replace(nano.language, hidden=32, layers=3, head_dim=8, mlp=48, vocab=64)
+    action = dataclasses.replace(nano.action, hidden=32, layers=1, ffn=32)
+    return dataclasses.replace(nano, vision=vision, language=language, action=action)
+
+
+@pytest.fixture(scope="module")
+def language() -> LanguageModel:
+    return build(tiny(), 3).language
+
+
+def row(seed: int, frames: int, text: int, answer: int) -> Row:
+    rng = np.random.default_rng(seed)
+    prompt: list[int] = []
+    for _ in range(frames):
+        prompt += [*rng.integers(6, 64, text), IMAGE]
+    pictures = rng.standard_normal((frames, 4, 32)).astype(np.float16)
+    return Row((*prompt, 7), tuple(rng.integers(6, 64, answer)), tuple(pictures))
+
+
+ROWS = [row(1, 4, 5, 9), row(2, 1, 3, 4), row(3, 2, 1, 1), row(4, 3, 2, 0)]
+
+
+def alone(language: LanguageModel, one: Row, upto: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Logits after `upto` tokens and K‖V [upto, kv_dim] of one row through `LanguageModel.forward`."""
+    past = [torch.zeros(1, 2, 0, 8)] * (2 * language.config.layers)
+    pictures = torch.from_numpy(np.stack(one.frames)).float()
+    with torch.no_grad():
+        _, logits, kv, *_ = language(torch.tensor([one.fed[:upto]]), pictures, past)
+    return logits[0], kv[0]
+
+
+def test_keys_and_values_of_every_row_are_those_of_the_row_alone(language: LanguageModel) -> None:
+    batch = collate(ROWS, img_context_id=IMAGE, device=DEVICE)
+    with torch.no_grad():
+        kv = run(language, batch.input_ids, batch.visual_tokens, None).last_layer_kv
+    for i, one in enumerate(ROWS):
+        torch.testing.assert_close(kv[i, : batch.lengths[i]], alone(language, one, len(one.fed))[1], atol=1e-5, rtol=0)
+
+
+def test_scores_of_every_answer_token_are_those_of_the_row_alone(language: LanguageModel) -> None:
+    batch = collate(ROWS, img_context_id=IMAGE, device=DEVICE)
+    with torch.no_grad():
+        hidden = run(language, batch.input_ids, batch.visual_tokens, batch.query_at).hidden
+        logits = language.lm_head(hidden)
+    for i, one in enumerate(ROWS):
+        for j in range(max(1, len(one.answer))):
+            expected = alone(language, one, len(one.prompt) + j)[0]
+            torch.testing.assert_close(logits[i, j], expected, atol=1e-5, rtol=0)
+
+
+def test_the_loss_of_a_row_is_the_mean_over_its_answer_whatever_stands_beside_it(language: LanguageModel) -> None:
+    with torch.no_grad():
+        together = row_losses(language, collate(ROWS, img_context_id=IMAGE, device=DEVICE))
+    for i, one in enumerate(ROWS[:3]):
+        terms = [
+            torch.log_softmax(alone(language, one, len(one.prompt) + j)[0], -1)[token]
+            for j, token in enumerate(one.answer)
+        ]
+        assert together[i].item() == pytest.approx(-float(torch.stack(terms).mean()), abs=1e-5)
+    assert together[3].item() == 0.0
+
+
+def test_gradients_reach_the_merge_layer_through_the_answers_alone(language: LanguageModel) -> None:
+    silent = [dataclasses.replace(one, answer=()) for one in ROWS]
+    for rows, learns in ((ROWS, True), (silent, False)):
+        language.zero_grad()
+        row_losses(language, collate(rows, img_context_id=IMAGE, device=DEVICE)).sum().backward()
+        moved = [bool(p.grad is not None and p.grad.abs().sum() > 0) for p in language.merge.parameters()]
+        assert any(moved) is learns
+    language.zero_grad()
+
+
+def test_an_answers_last_token_is_not_fed_and_padding_is_no_target() -> None:
+    batch = collate(ROWS, img_context_id=IMAGE, device=DEVICE)
+    assert batch.lengths.tolist() == [len(one.prompt) + max(0, len(one.answer) - 1) for one in ROWS]
+    assert [int((batch.targets[i] != IGNORED).sum()) for i in range(4)] == [9, 4, 1, 0]
+
+
+def test_a_prompt_with_more_image_places_than_frames_is_refused() -> None:
+    with pytest.raises(ValueError, match="image places"):
+        collate([ROWS[0], Row((IMAGE, 7, IMAGE, IMAGE), (8,), ROWS[2].frames)], img_context_id=IMAGE, device=DEVICE)
+
+
+def test_buckets_hold_every_index_once_and_rows_of_about_one_length() -> None:
+    lengths = np.random.default_rng(0).integers(10, 300, 1000).tolist()
+    batches = buckets(lengths, 8, np.random.default_rng(1))
+    assert sorted(i for batch in batches for i in batch) == list(range(1000))
+    padded = sum(len(batch) * max(lengths[i] for i in batch) for batch in batches)
+    assert padded < 1.1 * sum(lengths)
+    assert batches != buckets(lengths, 8, np.random.default_rng(2))

@@ -1,0 +1,196 @@
+"""The language model over rows of different lengths at once: `LanguageModel.forward`'s numbers, at training speed.
+
+Rows are padded on the right, where causal attention never looks. Only what is asked for is computed: the last layer's
+queries and the vocabulary's scores at the positions whose next token matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+
+from export.model.language import DecoderLayer, LanguageModel, rotate
+from export.model.vision import fold_tokens
+
+IGNORED = -100
+"""Target where there is nothing to be said (torch's own value)."""
+POOL = 32
+"""Batches that are sorted by length together: alike enough to waste little, mixed enough to be random."""
+
+Halves = npt.NDArray[np.float16]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One prompt, its answer (with the end token; empty: nothing is said), and its frames' tokens [N, D], in order."""
+
+    prompt: tuple[int, ...]
+    answer: tuple[int, ...]
+    frames: tuple[Halves, ...]
+
+    def __post_init__(self) -> None:
+        if not self.prompt or not self.frames:
+            raise ValueError("a row needs a prompt and at least one frame")
+
+    @property
+    def fed(self) -> tuple[int, ...]:
+        """What goes in: all but the answer's last token, after which there is nothing to predict."""
+        return (*self.prompt, *self.answer[:-1])
+
+
+@dataclass(frozen=True)
+class LanguageBatch:
+    """Rows on a device. `A`: the longest answer; a row without one asks for the token after its prompt."""
+
+    input_ids: Tensor
+    """[B, T] int64, zeros on the right."""
+    lengths: Tensor
+    """[B] int64: tokens of each row that are real."""
+    visual_tokens: Tensor
+    """[F, N, D] float: the frames of all rows, in their order."""
+    query_at: Tensor
+    """[B, A] int64: positions whose next token is wanted; the last one repeated."""
+    targets: Tensor
+    """[B, A] int64: that token, IGNORED behind a row's answer."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What one forward pass gives."""
+
+    hidden: Tensor | None
+    """[B, A, hidden] after the final norm, at `query_at`; None where that was not asked for."""
+    last_layer_kv: Tensor
+    """[B, T, kv_dim], in the layout of `LanguageModel`'s own; rows are real up to their length."""
+    caches: tuple[tuple[Tensor, Tensor], ...]
+    """(keys, values) of every layer, [B, kv_heads, T, head_dim]."""
+
+
+def collate(rows: Sequence[Row], *, img_context_id: int, device: torch.device) -> LanguageBatch:
+    """Pad rows; raises ValueError when a row's image places are not as many as its frames'."""
+    length = max(len(row.fed) for row in rows)
+    wanted = max(1, max(len(row.answer) for row in rows))
+    ids = np.zeros((len(rows), length), dtype=np.int64)
+    query_at = np.zeros((len(rows), wanted), dtype=np.int64)
+    targets = np.full((len(rows), wanted), IGNORED, dtype=np.int64)
+    check_places(rows, img_context_id)
+    for i, row in enumerate(rows):
+        fed = row.fed
+        ids[i, : len(fed)] = fed
+        query_at[i] = np.minimum(len(row.prompt) - 1 + np.arange(wanted), len(fed) - 1)
+        targets[i, : len(row.answer)] = row.answer
+    frames = np.stack([frame for row in rows for frame in row.frames])
+    return LanguageBatch(
+        input_ids=torch.from_numpy(ids).to(device),
+        lengths=torch.tensor([len(row.fed) for row in rows], device=device),
+        visual_tokens=torch.from_numpy(frames).to(device).float(),
+        query_at=torch.from_numpy(query_at).to(device),
+        targets=torch.from_numpy(targets).to(device),
+    )
+
+
+def check_places(rows: Sequence[Row], img_context_id: int) -> None:
+    """Raise ValueError unless every frame has as many image places as all others, and at least one."""
+    found = {divmod(row.prompt.count(img_context_id), len(row.frames)) for row in rows}
+    if len(found) != 1 or any(left or not places for places, left in found):
+        raise ValueError(f"expected as many image places for every frame, found (places, left over) {sorted(found)}")
+
+
+def embed(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor) -> Tensor:
+    """[B, T, hidden]: token embeddings, with the frames' merged tokens in the places that are for them."""
+    images = language.merge(fold_tokens(visual_tokens, language.config.token_merge))
+    x = language.embed(input_ids)
+    is_image = input_ids == language.config.img_context_id
+    return x.masked_scatter(is_image[..., None], images.reshape(-1, x.shape[-1]).to(x.dtype))
+
+
+def angles(language: LanguageModel, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotary cosines and sines [..., head_dim] of positions [...]."""
+    angle = positions.float()[..., None] * language.inv_freq
+    angle = torch.cat([angle, angle], dim=-1)
+    return angle.cos(), angle.sin()
+
+
+def heads_of(x: Tensor, heads: int) -> Tensor:
+    """[B, T, heads·d] → [B, heads, T, d]."""
+    return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+
+
+def keys_values(layer: DecoderLayer, h: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+    """Keys, rotated, and values [B, kv_heads, T, d] of normed inputs [B, T, hidden]."""
+    v = heads_of(layer.v(h), layer.config.kv_heads)
+    return rotate(heads_of(layer.k(h), layer.config.kv_heads), cos, sin).to(v.dtype), v
+
+
+def finish_layer(
+    layer: DecoderLayer, x: Tensor, h: Tensor, cos: Tensor, sin: Tensor, k: Tensor, v: Tensor, mask: Tensor | None
+) -> Tensor:
+    """The layer's output at queries x [B, Q, hidden] (h: normed). Without a mask they are all positions, causally."""
+    q = rotate(heads_of(layer.q(h), layer.config.heads), cos, sin).to(v.dtype)
+    groups = layer.config.heads // layer.config.kv_heads
+    attended = F.scaled_dot_product_attention(
+        q,
+        k.repeat_interleave(groups, dim=1),
+        v.repeat_interleave(groups, dim=1),
+        attn_mask=mask,
+        is_causal=mask is None,
+    )
+    x = x + layer.o(attended.transpose(1, 2).flatten(2))
+    h = layer.mlp_norm(x)
+    return x + layer.down(F.silu(layer.gate(h)) * layer.up(h))
+
+
+def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query_at: Tensor | None) -> Pass:
+    """All rows through all layers; the last one only at `query_at` [B, A] (None: its keys and values alone)."""
+    x = embed(language, input_ids, visual_tokens)
+    position = torch.arange(input_ids.shape[1], device=input_ids.device)
+    cos, sin = angles(language, position)
+    caches: list[tuple[Tensor, Tensor]] = []
+    *earlier, last = language.layers
+    for layer in earlier:
+        h = layer.input_norm(x)
+        k, v = keys_values(layer, h, cos, sin)
+        caches.append((k, v))
+        x = finish_layer(layer, x, h, cos, sin, k, v, None)
+    h = last.input_norm(x)
+    k, v = keys_values(last, h, cos, sin)
+    caches.append((k, v))
+    kv = torch.cat([k.transpose(1, 2).flatten(2), v.transpose(1, 2).flatten(2)], dim=-1)
+    if query_at is None:
+        return Pass(None, kv, tuple(caches))
+    chosen = query_at[..., None].expand(-1, -1, x.shape[-1])
+    x, h = x.gather(1, chosen), h.gather(1, chosen)
+    cos, sin = angles(language, query_at)
+    mask = (position <= query_at[..., None])[:, None]
+    x = finish_layer(last, x, h, cos[:, None], sin[:, None], k, v, mask)
+    return Pass(language.norm(x), kv, tuple(caches))
+
+
+def token_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
+    """-log p of every answer token [B, A], zero behind a row's answer (the terms of the paper's equation 3)."""
+    hidden = run(language, batch.input_ids, batch.visual_tokens, batch.query_at).hidden
+    assert hidden is not None
+    logits = language.lm_head(hidden).float()
+    return F.cross_entropy(logits.flatten(0, 1), batch.targets.flatten(), reduction="none").view_as(batch.targets)
+
+
+def row_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
+    """Equation 3 for each row [B]: the mean over its answer's tokens."""
+    said = (batch.targets != IGNORED).sum(1).clamp(min=1)
+    return token_losses(language, batch).sum(1) / said
+
+
+def buckets(lengths: Sequence[int], size: int, rng: np.random.Generator) -> list[list[int]]:
+    """Shuffled batches of at most `size` indices of about equal length; every index once."""
+    order = rng.permutation(len(lengths))
+    batches: list[list[int]] = []
+    for start in range(0, len(order), size * POOL):
+        pool = sorted((int(i) for i in order[start : start + size * POOL]), key=lambda i: (lengths[i], i))
+        batches += [pool[at : at + size] for at in range(0, len(pool), size)]
+    return [batches[int(i)] for i in rng.permutation(len(batches))]
