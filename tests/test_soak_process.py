@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 
+from edge.say import say
 from sim_hil.realtime.truth import read_lines
 from sim_hil.scene import Vec3
-from sim_hil.soak import cli
-from sim_hil.soak.analysis import ANALYSIS
+from sim_hil.soak import cli, leg
+from sim_hil.soak.analysis import ANALYSIS, TRACE, faults_of, read_life, read_trace
 from sim_hil.soak.journey import Journey, SoakTask
-from sim_hil.soak.leg import EVENTS, SAMPLES
+from sim_hil.soak.leg import EVENTS, SAMPLES, Leg
 from sim_hil.soak.measures import measures
 from sim_hil.soak.soak_run import SoakFolder
+from tests.processes import wait_for
 
 DURATION_S = 20
+# On a machine with many others on it all is slow. These only bound how long a test waits for what it looks for.
+LONGER_S = 240
+ANSWER_S = 30.0
+END_S = 300.0
+LOOK_NS = 2_000_000_000
 FAULTS = """
 format = 1
 gap_s = [2.0, 3.0]
@@ -69,6 +78,51 @@ def hurried(draw: Callable[[Journey, Vec3], SoakTask | None]) -> Callable[[Journ
     return hurry
 
 
+def followed(events: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Two tasks, one right after the other, that the same runner was told."""
+    begun = [event for event in events if event["kind"] == "task_begin"]
+    return [(a, b) for a, b in itertools.pairwise(begun) if a["run"] == b["run"]]
+
+
+def driven(samples: Path) -> list[dict[str, Any]]:
+    """The samples taken while a runner drove."""
+    return [sample for sample in read_lines(samples) if sample["armed"]]
+
+
+def is_enough(leg: Path) -> bool:
+    """Whether a leg that still runs has recorded what the tests look for."""
+    events = list(read_lines(leg / EVENTS))
+    runs = [event["run"] for event in events if event["kind"] == "armed"]
+    read = (read_life(leg / f"flight-{run}.mcap", leg / f"edge-run-{run}.json", run) for run in runs)
+    lives = [life for life in read if life is not None]
+    trace = read_trace(leg / TRACE)
+    return (
+        bool(followed(events))
+        and any(event["kind"] == "fault_effect" for event in events)
+        and any(fault["raised_ns"] is not None for fault in faults_of(events, lives, trace))
+        and any(delay_s is not None for life in lives for delay_s in life.delay_s)
+        and sum(life.ticks for life in lives) > 100
+        and len(trace.command_gap_ms) > 500
+        and "edge-run" in (driven(leg / SAMPLES) or [{"processes": ()}])[-1]["processes"]
+    )
+
+
+def patient(left_s: Callable[[Leg, int], float]) -> Callable[[Leg, int], float]:
+    """A leg's time that stands still at its end until there is enough to look at, for LONGER_S at most."""
+    looked_ns, enough = 0, False
+
+    def left(leg: Leg, now_ns: int) -> float:
+        nonlocal looked_ns, enough
+        seconds = left_s(leg, now_ns)
+        if not -LONGER_S < seconds <= 0:
+            return seconds
+        if not enough and now_ns - looked_ns >= LOOK_NS:
+            looked_ns, enough = now_ns, is_enough(leg._options.stack.folder)
+        return seconds if enough else 1.0
+
+    return left
+
+
 @pytest.fixture(scope="module")
 def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soaked:
     folder = tmp_path_factory.mktemp("soak")
@@ -78,6 +132,8 @@ def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soa
     arguments += ["--people", "2", "--faults", str(faults), "--out", str(folder / "out"), "--json", "-"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Journey, "next", hurried(Journey.next))
+        patch.setattr(Leg, "_left_s", patient(Leg._left_s))
+        patch.setattr(leg, "say", partial(say, timeout_s=ANSWER_S))
         code = cli.main(arguments)
     return Soaked(arguments, folder / "out", code)
 
@@ -89,15 +145,18 @@ def test_it_ends_by_itself_and_leaves_no_process(soaked: Soaked) -> None:
 
 
 def test_tasks_follow_each_other_without_a_new_runner(soaked: Soaked) -> None:
-    begun = [(event["run"], event["task"]["instruction"]) for event in soaked.events("task_begin")]
-    assert len(begun) >= 2 and begun[0][0] == begun[1][0] and begun[0][1] != begun[1][1]
+    pairs = followed(list(read_lines(soaked.leg / EVENTS)))
+    assert pairs and all(a["task"]["instruction"] != b["task"]["instruction"] for a, b in pairs)
 
 
 def test_the_runner_has_taken_every_instruction(soaked: Soaked) -> None:
-    assert soaked.events("not_told") == []
-    log = (soaked.leg / "edge-run-1.log").read_text(encoding="utf-8")
-    for event in soaked.events("task_begin")[1:2]:
+    events = list(read_lines(soaked.leg / EVENTS))
+    for _, event in followed(events):
+        log = (soaked.leg / f"edge-run-{event['run']}.log").read_text(encoding="utf-8")
         assert f"new instruction: {event['task']['instruction']}" in log
+    # A runner that a busy machine has just stopped takes none: then its end comes before another task.
+    kinds = [event["kind"] for event in events if event["kind"] in ("not_told", "task_begin", "life_end")]
+    assert all(after != "task_begin" for kind, after in itertools.pairwise(kinds) if kind == "not_told")
 
 
 def test_a_fault_takes_effect_and_the_runner_answers_it(soaked: Soaked) -> None:
@@ -110,14 +169,19 @@ def test_a_fault_takes_effect_and_the_runner_answers_it(soaked: Soaked) -> None:
 def test_every_second_has_its_sample(soaked: Soaked) -> None:
     samples = list(read_lines(soaked.leg / SAMPLES))
     assert len(samples) >= 0.5 * DURATION_S  # a busy machine may skip some
-    assert {"edge-hil", "edge-bridge", "edge-run"} <= set(samples[-1]["processes"])
-    assert samples[-1]["processes"]["edge-run"]["rss_bytes"] > 50e6 and samples[-1]["pose"] is not None
+    last = driven(soaked.leg / SAMPLES)[-1]
+    assert {"edge-hil", "edge-bridge", "edge-run"} <= set(last["processes"])
+    assert last["processes"]["edge-run"]["rss_bytes"] > 50e6 and last["pose"] is not None
 
 
 def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
     found = soaked.result["measures"]
     assert found["tick_ms.p999"]["count"] > 50 and found["delay_s.p50"]["value"] > 0
-    assert found["bridge_jitter_ms.p50"]["count"] > 250 and found["bridge_jitter_ms.p50"]["value"] < 20
+    sent = [line for line in read_lines(soaked.leg / TRACE) if line["kind"] == "wire" and line["service"] == "sport"]
+    stamps = [line["request_id"] / 1e6 for line in sent if line["name"] in ("Move", "StopMove")]
+    off_ms = [abs(b - a - 20.0) for a, b in itertools.pairwise(stamps) if 5.0 < b - a < 500.0]
+    assert found["bridge_jitter_ms.p50"]["count"] == len(off_ms) > 250
+    assert found["bridge_jitter_ms.p50"]["value"] == pytest.approx(statistics.median(off_ms), abs=0.01)
 
 
 def test_slopes_of_so_short_a_life_are_undecided(soaked: Soaked) -> None:
@@ -204,9 +268,15 @@ def test_ctrl_c_writes_the_report_of_what_there_is(artifacts_dir: Path, tmp_path
     command = [sys.executable, "-m", "sim_hil.soak.cli", "--artifacts", str(artifacts_dir), "--duration", "1h"]
     samples = out / "legs" / "001" / SAMPLES
     with subprocess.Popen([*command, "--scene", "office", "--people", "0", "--out", str(out)]) as process:
-        while process.poll() is None and not (samples.exists() and samples.stat().st_size > 0):
-            time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
+        try:
+            wait_for(
+                lambda: process.poll() is not None or (samples.exists() and samples.read_bytes()),
+                END_S,
+                "the first sample",
+            )
+            process.send_signal(signal.SIGINT)
+            assert process.wait(END_S) == 130
+        finally:
+            process.kill()
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     assert not result["finished"] and (out / "report.html").exists()
