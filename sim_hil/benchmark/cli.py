@@ -33,6 +33,7 @@ from sim_hil.benchmark.conditions import (
     DEFAULT_LATENCY_S,
     DRIFTS,
     MODES,
+    WORDINGS,
     Conditions,
     ConditionsError,
     PolicySpec,
@@ -44,6 +45,7 @@ from sim_hil.benchmark.latency import LatencyError, LatencyProfile, parse_latenc
 from sim_hil.benchmark.local_jobs import LocalJobs
 from sim_hil.benchmark.progress import BenchProgress
 from sim_hil.benchmark.report import write_report
+from sim_hil.benchmark.rewording import reworded
 from sim_hil.benchmark.store import ResultStore, StoreError
 from sim_hil.benchmark.task import VIDEO_CHOICES
 from sim_hil.realtime.episode import check_realtime, drivable
@@ -98,6 +100,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--drift", choices=DRIFTS, default="none", help="of odometry (paper, table 14)")
     p.add_argument("--variant", metavar="NAME", help="of the model: DIR/NAME, checked against its manifest")
     p.add_argument("--wording", type=int, default=0, metavar="N", help="which of the instructions, from 0 (default 0)")
+    p.add_argument(
+        "--wordings", choices=WORDINGS, default="benchmark",
+        help="the same ways in the sentence patterns of training instead of the benchmark's own",
+    )  # fmt: skip
+    p.add_argument(
+        "--swap-instructions", type=int, metavar="SEED", help="tell every task the way of another one of its scene"
+    )
     p.add_argument("--camera", default="auto", metavar="WxH", help="render this picture though no policy looks at it")
     p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for an answer (default 60)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="episodes at a time, a process each (default 1)")
@@ -150,6 +159,8 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         drift=args.drift,
         variant=args.variant,
         wording=args.wording,
+        wordings=args.wordings,
+        swap_instructions=args.swap_instructions,
         camera=args.camera,
         external_timeout_s=args.external_timeout,
     )
@@ -168,6 +179,7 @@ def _run(args: argparse.Namespace) -> int:
             _complain(f"{len(skipped)} episodes skipped: edge-bridge drives no other robot than the go2", EXIT_DONE)
         if not episodes:
             raise ConditionsError("--clock realtime: expected an episode of the go2 among --episodes, found none")
+    episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
     started_ns = time.monotonic_ns()
     with _directory(args.out) as folder, stop_flag() as stop:

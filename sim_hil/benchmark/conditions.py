@@ -19,6 +19,8 @@ POLICIES = ("artifacts", "external", *BASELINES)
 CLOCKS = ("lockstep", "realtime")
 MODES = ("async", "sync", "no-reasoning")
 DRIFTS = tuple(LEVELS)
+WORDINGS = ("benchmark", "training")
+"""Whose sentence patterns: the benchmark's own, which training never has, or training's, of the same ways."""
 DEFAULT_LATENCY_S = {"async": 2.0, "sync": 2.0, "no-reasoning": 0.25}
 """Of a policy from artifacts: about 2 s (paper, appendix D), and without reasoning 4 Hz (section 4.4).
 
@@ -71,6 +73,9 @@ class Conditions:
     variant: str | None = None
     wording: int = 0
     """Which of an episode's instructions the robot is given."""
+    wordings: str = "benchmark"
+    swap_instructions: int | None = None
+    """Seed by which every task is given the instruction of another one of its scene; None: its own."""
     camera: str = "auto"
     """`WxH`: render such a picture in every control period; `auto`: what the policy looks at, if it does."""
     external_timeout_s: float = 60.0
@@ -79,6 +84,9 @@ class Conditions:
     def __post_init__(self) -> None:
         _one_of("clock", self.clock, CLOCKS)
         _one_of("drift", self.drift, DRIFTS)
+        _one_of("wordings", self.wordings, WORDINGS)
+        if self.swap_instructions is not None and not 0 <= self.swap_instructions < 2**31:
+            raise ConditionsError(f"swapped instructions: expected a seed from 0, found {self.swap_instructions}")
         kind = self.policy.kind
         if self.mode is not None:
             _one_of("mode", self.mode, MODES)
@@ -119,9 +127,12 @@ class Conditions:
 
     @staticmethod
     def of_json(content: Mapping[str, Any]) -> Conditions:
-        """Conditions that `as_json` has written; raises ConditionsError."""
+        """Conditions that `as_json` has written, also of a version that did not know all of them yet.
+
+        Raises ConditionsError.
+        """
         known = {each.name for each in fields(Conditions)}
-        if set(content) != known:
+        if not {"policy", "clock", "latency"} <= set(content) <= known:
             raise ConditionsError(f"conditions: expected the keys {sorted(known)}, found {sorted(content)}")
         try:
             latency = None if content["latency"] is None else LatencyProfile.of_json(content["latency"])
@@ -135,6 +146,10 @@ class Conditions:
         parts += [part for part in (self.mode, self.variant) if part is not None]
         if self.latency is not None:
             parts.append(f"latency {self.latency.name}")
+        if self.wordings != "benchmark":
+            parts.append(f"{self.wordings} wordings")
+        if self.swap_instructions is not None:
+            parts.append(f"instructions swapped by {self.swap_instructions}")
         return ", ".join([*parts, f"drift {self.drift}"])
 
 
