@@ -15,7 +15,7 @@ from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
 from edge.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.manifest import Artifacts
-from edge.prompt import InstructionError, PromptBuilder, PromptIds, Segment
+from edge.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_TEXT_CHARS
 from edge.ring import EncodedFrame
 from edge.scheduling import Schedule, run_as
@@ -158,12 +158,13 @@ class LanguageModel:
         self._took_ns: dict[int, int] = {}
 
     def check_instruction(self, instruction: str, frames: int) -> None:
-        """Raise InstructionError unless a prompt with `frames` frames and a full answer fit the model's context."""
-        past = SE2(-99.9, -99.9, 0.0)  # the longest numbers that past motion is told in
-        filler = [
-            EncodedFrame(i, past if i + 1 < frames else SE2(0.0, 0.0, 0.0), self._no_frame) for i in range(frames)
-        ]
-        needed = sum(len(segment.ids) for segment in self.prompt.build(filler, instruction))
+        """Raise InstructionError unless a prompt with `frames` frames and a full answer fit the model's context.
+
+        The prompt is taken at its longest: with all points of a way that leads far off, and a long progress.
+        """
+        filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in range(frames)]
+        prompt = self.prompt.build(filler, instruction, LONGEST_WAY, LONGEST_BEFORE)
+        needed = sum(len(segment.ids) for segment in prompt)
         room = self.runtime.max_context - self.runtime.max_new_tokens
         if needed > room:
             raise InstructionError(

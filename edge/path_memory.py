@@ -17,7 +17,7 @@ from edge.geometry import SE2
 
 Point: TypeAlias = tuple[float, float]
 Way: TypeAlias = tuple[Point, ...]
-"""(x m, y m) with one decimal, in the newest robot frame, oldest first; the robot itself, at (0, 0), is not among them."""
+"""(x m, y m) with one decimal in the newest robot frame, oldest first; without the robot itself, which is at (0, 0)."""
 
 MAX_POINTS = 8
 TOLERANCE_M = 0.5

@@ -9,10 +9,15 @@ import numpy as np
 import numpy.typing as npt
 from tokenizers import Tokenizer
 
+from edge.path_memory import FARTHEST_M, MAX_POINTS, Way
+from edge.reasoning_text import MAX_COUNT, Progress, format_progress
 from edge.ring import EncodedFrame
 
-SYSTEM = "You drive a robot through people. Describe the situation, then give waypoints."
+SYSTEM = "Drive through people. Describe the situation, then waypoints."
 MAX_INSTRUCTION_CHARS = 400
+LONGEST_WAY: Way = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
+LONGEST_BEFORE = Progress(MAX_COUNT, MAX_COUNT, MAX_COUNT)
+"""With these a prompt is as long as it can become while an instruction is followed."""
 
 
 class InstructionError(ValueError):
@@ -51,7 +56,7 @@ def check_instruction(text: str) -> str:
 
 
 class PromptBuilder:
-    """ChatML prompt of the paper's frames, instruction and past motion (appendix A and B)."""
+    """ChatML prompt of the paper's frames, instruction, past motion and task progress (appendix A and B)."""
 
     def __init__(self, tokenizer: Tokenizer, ids: PromptIds, frame_tokens: int) -> None:
         self._tokenizer = tokenizer
@@ -63,9 +68,12 @@ class PromptBuilder:
     def _text(self, text: str) -> list[int]:
         return list(self._tokenizer.encode(text, add_special_tokens=False).ids)
 
-    def build(self, frames: Sequence[EncodedFrame], instruction: str) -> list[Segment]:
-        """One segment a frame, oldest first, then what depends on the newest frame."""
-        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(frames)]
+    def build(
+        self, frames: Sequence[EncodedFrame], instruction: str, way: Way = (), before: Progress | None = None
+    ) -> list[Segment]:
+        """One segment a frame, oldest first, then what depends on the newest frame; without a way: an instruction's
+        first prompt."""
+        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(way, before)]
 
     def frame(self, number: int, frame: EncodedFrame, instruction: str) -> Segment:
         """Frame `number` (from 1, oldest first); the first one carries the prompt's start with the instruction.
@@ -78,19 +86,21 @@ class PromptBuilder:
             head += [ids.im_start, *self._text("system\n" + SYSTEM), ids.im_end, *self._text("\n")]
             head += [ids.im_start, *self._text(f"user\nInstruction: {check_instruction(instruction)}\n")]
         image = [ids.img_start, *[ids.img_context] * self._frame_tokens, ids.img_end]
-        return Segment((*head, *self._text(f"Frame {number}: "), *image, *self._text("\n")), frame.tokens)
+        return Segment((*head, *self._text(f"Frame {number}:"), *image, *self._text("\n")), frame.tokens)
 
-    def tail(self, frames: Sequence[EncodedFrame]) -> Segment:
-        """What follows the frames: the robot's past motion, told from the newest of them, and the assistant's turn."""
+    def tail(self, way: Way, before: Progress | None) -> Segment:
+        """What follows the frames: the way since the instruction began as told at the newest of them, the progress that
+        the generation before said (None: none has), and the assistant's turn."""
         ids = self._ids
-        text = [*self._text(f"Past motion: {past_motion(frames)}"), ids.im_end, *self._text("\n")]
-        return Segment((*text, ids.im_start, *self._text("assistant\n")), None)
+        text = [*self._text(f"Past motion: {past_motion(way)}\nBefore: {told_before(before)}"), ids.im_end]
+        return Segment((*text, *self._text("\n"), ids.im_start, *self._text("assistant\n")), None)
 
 
-def past_motion(frames: Sequence[EncodedFrame]) -> str:
-    """Where the robot was at the older frames, in the robot frame of the newest: "(-1.4, 0.0) …" in m."""
-    if len(frames) < 2:
-        return "none"
-    T_now_odom = frames[-1].T_odom_base.inverse()
-    poses = [T_now_odom @ frame.T_odom_base for frame in frames[:-1]]
-    return " ".join(f"({p.x_m:.1f}, {p.y_m:.1f})" for p in poses)
+def past_motion(way: Way) -> str:
+    """Where the robot has been, in its own frame now: "(-1.4, 0.0) (0.0, 2.1)" in m, oldest first."""
+    return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in way) or "none"
+
+
+def told_before(before: Progress | None) -> str:
+    """What the generation before said of progress, in the canonical words alone: its text is untrusted."""
+    return "none." if before is None else format_progress(before)

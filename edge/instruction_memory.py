@@ -1,0 +1,57 @@
+"""What is remembered for as long as one instruction is followed: the way since it began, the progress last said.
+
+Shared by the reasoning thread and by the benchmark's virtual time, so that both tell the model the same. It is fed from
+the token ring, where every frame has the pose that it was captured at: what is remembered does not depend on how often
+a generation runs.
+"""
+
+from __future__ import annotations
+
+from edge.geometry import SE2
+from edge.path_memory import PERIOD_NS, PathMemory, Way
+from edge.reasoning_text import Progress, parse_progress
+from edge.ring import EncodedFrame, TokenRing
+
+MOST_FRAMES = 1 << 16
+"""More than a ring holds."""
+
+
+class InstructionMemory:
+    """Way and progress of one instruction; a new instruction gets a new one. For one thread."""
+
+    def __init__(self, from_ns: int | None) -> None:
+        """`from_ns`: the newest frame's stamp when the instruction was given; None: it counts from the first frame."""
+        self._from_ns = from_ns
+        self._path = PathMemory()
+        self._before: Progress | None = None
+
+    @property
+    def before(self) -> Progress | None:
+        """What the last generation said that said any progress."""
+        return self._before
+
+    def watch(self, ring: TokenRing) -> None:
+        """Take what has come into the ring, at most about once a second: call it more often than the ring is long."""
+        newest_ns, seen_ns = ring.newest_ns, self._path.newest_ns
+        if newest_ns is not None and (seen_ns is None or newest_ns >= seen_ns + PERIOD_NS):
+            self._take(ring, newest_ns)
+
+    def way(self, ring: TokenRing, anchor: EncodedFrame) -> Way:
+        """The way until a generation's newest frame, told there; the frames after it are left for the next time."""
+        self._take(ring, anchor.stamp_ns)
+        # The ring may have forgotten it while it was waited for.
+        self._put(anchor.stamp_ns, anchor.T_odom_base)
+        return self._path.way(anchor.T_odom_base)
+
+    def heard(self, text: str) -> None:
+        """Remember the progress that a published generation's text says; one that says none changes nothing."""
+        self._before = parse_progress(text) or self._before
+
+    def _take(self, ring: TokenRing, until_ns: int) -> None:
+        for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):
+            if stamp_ns <= until_ns:
+                self._put(stamp_ns, T_odom_base)
+
+    def _put(self, stamp_ns: int, T_odom_base: SE2) -> None:
+        if self._from_ns is None or stamp_ns >= self._from_ns:
+            self._path.put(stamp_ns, T_odom_base)
