@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-KINDS = ("hospital", "office", "warehouse", "sidewalk", "corridor")
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
 class CollectConfig:
     """How many drives of the expert, where, and how varied. The same numbers and seed give the same drives.
 
-    A kind that is named twice is driven in twice as often. What is called a share is the chance of each drive.
+    What is called a share is the chance of each drive.
     """
 
     episodes: int = 700
-    kinds: tuple[str, ...] = (
-        "hospital",
-        "office",
-        "warehouse",
-        "hospital",
-        "office",
-        "warehouse",
-        "sidewalk",
-        "corridor",
-    )
+    kinds: Mapping[str, float] = field(default_factory=dict)
+    """Shares of the kinds of scenes; empty: those of `tools.train.scenarios`."""
     jobs: int = 0
     """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
     noise_share: float = 0.3
@@ -45,8 +36,6 @@ class CollectConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:
             raise ValueError(f"expected 1 to 1000000 episodes and 0 to 1024 jobs, found {self.episodes}, {self.jobs}")
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {', '.join(self.kinds) or 'none'}")
         shares = (self.noise_share, self.sharp_share, self.typical_drift_share, self.severe_drift_share)
         if not all(0 <= share <= 1 for share in shares) or self.typical_drift_share + self.severe_drift_share > 1:
             raise ValueError(f"expected shares of 0 to 1, those of the drifts 1 together at most, found {shares}")

@@ -1,0 +1,203 @@
+"""One drive recorded: the world, who drives in it, and what is kept of every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import hypot
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.geometry import SE2
+from sim_hil.benchmark.episode import Episode
+from sim_hil.benchmark.expert import ExpertPolicy
+from sim_hil.benchmark.observation import Observation
+from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
+from sim_hil.scene import Scene
+from tools.train.drive import PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
+from tools.train.futures import chosen_future, label_futures
+from tools.train.steering import Velocity
+
+Steer = Callable[[Observation, Velocity], tuple[Velocity, int]]
+"""From what is observed and what the expert wants to what is commanded, and whose that is (EXPERT, NOISE, POLICY)."""
+Tell = Callable[[EpisodeWorld], Mapping[str, Any]]
+"""The trace of this instant; asked once a second, in order."""
+
+LEAST_FRAMES: Final = 30  # a shorter drive teaches nothing
+_BEFORE_CRASH: Final = 20  # frames: what led to a collision or a fall is not to be learned
+_STUCK_FRAMES: Final = 150
+_STUCK_M: Final = 0.5
+_OFF_M: Final = 6.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the pictures of a drive are made: rendered at `render_px` (square), shrunk to 128, kept as JPEG."""
+
+    render_px: int = PICTURE_PX
+    jpeg_quality: int = 90
+
+    def __post_init__(self) -> None:
+        if not PICTURE_PX <= self.render_px <= 1024 or not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"expected pictures of {PICTURE_PX} to 1024 px and a quality of 1 to 100, found {self}")
+
+
+@dataclass
+class Recorded:
+    """Frames of a drive that has ended; what `finish` keeps of them goes into a Drive."""
+
+    outcome: str
+    collided: bool
+    arrays: Mapping[str, NDArray[Any]]
+    traces: tuple[Mapping[str, Any], ...]
+
+
+@dataclass
+class _Frames:
+    jpegs: list[NDArray[np.uint8]] = field(default_factory=list)
+    pose: list[tuple[float, float, float]] = field(default_factory=list)
+    pose_odom: list[tuple[float, float, float]] = field(default_factory=list)
+    state: list[tuple[float, float, float]] = field(default_factory=list)
+    chosen: list[NDArray[np.float64]] = field(default_factory=list)
+    plan_xy: list[list[tuple[float, float]]] = field(default_factory=list)
+    by: list[int] = field(default_factory=list)
+    traces: list[Mapping[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class DrivePlan:
+    """What is driven: the episode in its scene, and how it is looked at.
+
+    `path` [n, 2]: the told way, m; with `hopeless`, a drive is cut that strays 6 m from it, or that stays where it is
+    for 15 s. `keep_trouble`: a drive that collides is kept as it is, and not only up to there.
+    """
+
+    episode: Episode
+    scene: Scene
+    path: NDArray[np.float64]
+    look: Look
+    drift: str
+    hopeless: bool = False
+    keep_trouble: bool = False
+
+
+def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded | None:
+    """Drive and record; None where there is less than 3 s that can be learned from. Raises ValueError, SceneError."""
+    frames = _Frames()
+    options = WorldOptions(camera=(plan.look.render_px,) * 2, drift=plan.drift)
+    first_collision: int | None = None
+    with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
+        expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
+        try:
+            while not world.done:
+                observation = _shrunk(world.observe())
+                wanted = expert.act(observation)
+                command, by = steer(observation, wanted)
+                _keep(frames, plan, world, observation, expert, by)
+                if len(frames.traces) * TRACE_EVERY < len(frames.pose):
+                    frames.traces.append(tell(world))
+                world.step(command)
+                if first_collision is None and world.collided:
+                    first_collision = len(frames.pose)
+                if plan.hopeless and not world.done and is_hopeless(np.array(frames.pose), plan.path):
+                    world.stop()
+        finally:
+            expert.close()
+        end, collided = world.end, world.collided
+    outcome = {"stopped": "cut"}.get(end or "", end or "")
+    return _finish(frames, plan, outcome, collided, first_collision)
+
+
+def _shrunk(observation: Observation) -> Observation:
+    image = observation.image
+    if image is None or image.shape[0] == PICTURE_PX:
+        return observation
+    small = cv2.resize(image, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
+    return replace(observation, image=np.asarray(small, np.uint8))
+
+
+def _keep(
+    frames: _Frames, plan: DrivePlan, world: EpisodeWorld, observation: Observation, expert: ExpertPolicy, by: int
+) -> None:
+    pose, choice = world.pose(), expert.choice
+    if observation.image is None or choice is None:
+        raise ValueError("recording: expected a picture and a choice in every frame")
+    done, jpeg = cv2.imencode(".jpg", observation.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, plan.look.jpeg_quality])
+    if not done:
+        raise ValueError("recording: a picture could not be compressed")
+    frames.jpegs.append(np.asarray(jpeg, np.uint8).ravel())
+    frames.pose.append(pose.as_tuple())
+    frames.pose_odom.append(observation.T_odom_base.as_tuple())
+    frames.state.append(observation.state)
+    frames.chosen.append(chosen_future(pose, choice, expert.route()))
+    frames.plan_xy.append(expert.plan(PLAN_TIMES_S))
+    frames.by.append(by)
+
+
+def is_hopeless(pose: NDArray[np.float64], path: NDArray[np.float64]) -> bool:
+    """Whether it has gone 6 m from the way ([n, 2] m), or has stayed within 0.5 m for 15 s; `pose` [N, 3] so far."""
+    if off_way_m(pose[-1, :2], path) > _OFF_M:
+        return True
+    if len(pose) <= _STUCK_FRAMES:
+        return False
+    lately = pose[-_STUCK_FRAMES:, :2]
+    return float(np.max(np.hypot(*(lately - lately[0]).T))) < _STUCK_M
+
+
+def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
+    """Distance from a point to a polyline [n, 2], m."""
+    if len(path) < 2:
+        return float(hypot(*(point - path[0])))
+    a, way = path[:-1], np.diff(path, axis=0)
+    share = np.sum((point - a) * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-12)
+    nearest = a + np.clip(share, 0.0, 1.0)[:, None] * way
+    return float(np.min(np.hypot(*(point - nearest).T)))
+
+
+def _finish(
+    frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None
+) -> Recorded | None:
+    count = kept_frames(np.array(frames.pose), outcome, None if plan.keep_trouble else first_collision)
+    if count < LEAST_FRAMES:
+        return None
+    pose, by = np.array(frames.pose)[:count], np.array(frames.by, np.uint8)[:count]
+    whole = outcome == "reached" and count == len(frames.pose)
+    future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.keep_trouble)
+    jpegs = frames.jpegs[:count]
+    arrays = {
+        "jpeg": np.concatenate(jpegs),
+        "jpeg_end": np.cumsum([len(jpeg) for jpeg in jpegs]).astype(np.int64),
+        "pose": pose,
+        "pose_odom": np.array(frames.pose_odom)[:count],
+        "state": np.array(frames.state, np.float32)[:count],
+        "future": future.astype(np.float32),
+        "future_steps": steps.astype(np.int16),
+        "plan_xy": np.array(frames.plan_xy, np.float32)[:count],
+        "by": by,
+    }
+    traces = tuple(frames.traces[: (count - 1) // TRACE_EVERY + 1])
+    return Recorded(outcome, collided, arrays, traces)
+
+
+def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | None) -> int:
+    """How many frames of a drive are learned from: those before its trouble; `pose` [N, 3].
+
+    `first_collision`: the frame by which it had collided, None if it never did or that is no trouble.
+    """
+    count = len(pose)
+    if outcome == "fell":
+        count -= _BEFORE_CRASH
+    if outcome == "timeout":  # the time it stood at the end, waiting for what never came
+        gaps = np.hypot(*(pose[:, :2] - pose[-1, :2]).T)
+        count = min(count, int(np.max(np.flatnonzero(gaps > _STUCK_M), initial=-1)) + 1 + RATE_HZ)
+    if first_collision is not None:
+        count = min(count, first_collision - _BEFORE_CRASH)
+    return max(count, 0)
+
+
+def start_of(episode: Episode) -> SE2:
+    """Where the robot begins."""
+    return SE2(*episode.start)

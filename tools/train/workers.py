@@ -1,0 +1,182 @@
+"""Jobs in processes of their own: a fresh interpreter each, one core, ended with their parent; JSON both ways.
+
+A worker module reads one job from its standard input and writes lines to the descriptor that it is given: whatever the
+libraries print goes to a log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final
+
+import cv2
+
+from sim_hil.benchmark.worker_process import SINGLE_THREADED, end_with_parent
+
+GRACE_S: Final = 2.0
+_TAIL_CHARS: Final = 400
+_GREETING: Final = "pybullet build time"  # of every process that loads the engine
+_EXIT_POLL_S: Final = 0.05
+
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a worker has said; `message` is None once it has ended, and `why` says how if it did not end well."""
+
+    key: str
+    message: Message | None
+    why: str = ""
+
+
+@dataclass
+class _Worker:
+    key: str
+    process: subprocess.Popen[bytes]
+    lines: IO[bytes]
+    log: Path
+    buffer: bytearray = field(default_factory=bytearray)
+    at_end: bool = False
+
+
+class Workers:
+    """Up to `jobs` processes of `command` at a time, each with a log in `logs`."""
+
+    def __init__(self, command: Sequence[str], jobs: int, logs: Path) -> None:
+        if jobs < 1:
+            raise ValueError(f"workers: expected 1 job or more, found {jobs}")
+        self._command, self._jobs, self._logs = command, jobs, logs
+        self._running: dict[str, _Worker] = {}
+        self._selector = selectors.DefaultSelector()
+
+    def free(self) -> int:
+        """Processes that may still be started."""
+        return self._jobs - len(self._running)
+
+    def running(self) -> int:
+        """Processes that have not ended."""
+        return len(self._running)
+
+    def start(self, key: str, job: Mapping[str, Any]) -> None:
+        """Start a process on a job. Raises OSError when there can be none."""
+        log = self._logs / f"{key}.log"
+        reading, writing = os.pipe()
+        try:
+            with log.open("wb") as output:
+                process = subprocess.Popen(
+                    [*self._command, "--fd", str(writing), "--parent", str(os.getpid())],
+                    stdin=subprocess.PIPE,
+                    stdout=output,
+                    stderr=output,
+                    pass_fds=(writing,),
+                    env={**os.environ, **SINGLE_THREADED},
+                    start_new_session=True,  # Ctrl-C is for the parent, which ends its workers itself
+                )
+        except BaseException:
+            os.close(reading)
+            raise
+        finally:
+            os.close(writing)
+        os.set_blocking(reading, False)
+        worker = _Worker(key, process, os.fdopen(reading, "rb", buffering=0), log)
+        self._running[key] = worker
+        self._selector.register(worker.lines, selectors.EVENT_READ, worker)
+        stdin = process.stdin
+        if stdin is not None:
+            with suppress(BrokenPipeError):  # it has died already, which `wait` finds
+                stdin.write(json.dumps(job).encode())
+            with suppress(BrokenPipeError):
+                stdin.close()
+
+    def wait(self, timeout_s: float) -> list[Told]:
+        """What was said since, waited for until something is or the time is over."""
+        if any(worker.at_end for worker in self._running.values()):
+            timeout_s = min(timeout_s, _EXIT_POLL_S)
+        told: list[Told] = []
+        for key, _ in self._selector.select(timeout_s):
+            told += self._read(key.data)
+        for worker in list(self._running.values()):
+            if worker.process.poll() is not None:
+                told += self._read(worker)
+                told.append(self._finish(worker))
+        return told
+
+    def close(self) -> None:
+        """End all processes: SIGTERM, then SIGKILL."""
+        for worker in self._running.values():
+            worker.process.terminate()
+        for worker in self._running.values():
+            try:
+                worker.process.wait(GRACE_S)
+            except subprocess.TimeoutExpired:
+                worker.process.kill()
+                worker.process.wait()
+            worker.lines.close()
+        self._running.clear()
+        self._selector.close()
+
+    def _read(self, worker: _Worker) -> list[Told]:
+        while not worker.at_end and (data := worker.lines.read(1 << 16)) is not None:  # None: nothing yet
+            worker.buffer += data
+            if not data:  # a pipe at its end is always readable
+                worker.at_end = True
+                self._selector.unregister(worker.lines)
+        *whole, rest = bytes(worker.buffer).split(b"\n")
+        worker.buffer[:] = rest
+        return [Told(worker.key, message) for line in whole if (message := _message(line)) is not None]
+
+    def _finish(self, worker: _Worker) -> Told:
+        del self._running[worker.key]
+        if not worker.at_end:
+            self._selector.unregister(worker.lines)
+        worker.lines.close()
+        code = worker.process.returncode
+        if code == 0:
+            worker.log.unlink(missing_ok=True)
+            return Told(worker.key, None)
+        how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        return Told(worker.key, None, f"{how}{_tail(worker.log)}")
+
+
+def _message(line: bytes) -> Message | None:
+    """A line that makes sense; one that a dying process has torn does not."""
+    try:
+        content = json.loads(line)
+    except ValueError:
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _tail(log: Path) -> str:
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:]
+    except OSError:
+        return ""
+    last = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith(_GREETING)]
+    return f": {last[-1]}" if last else ""
+
+
+def worker_main(prog: str, messages: Callable[[Message], Iterable[Mapping[str, Any]]]) -> int:
+    """Of a worker module: run the job from standard input, writing each of its messages as a line; returns 0."""
+    parser = argparse.ArgumentParser(prog=prog)
+    parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
+    parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
+    args = parser.parse_args()
+    end_with_parent(args.parent)
+    cv2.setNumThreads(1)
+    with os.fdopen(args.fd, "w", encoding="utf-8") as lines:
+        for message in messages(json.loads(sys.stdin.read())):
+            lines.write(json.dumps(message) + "\n")
+            lines.flush()
+    return 0
