@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
+from tools.train.greedy import decode
 from tools.train.language_batch import IGNORED, Row, buckets, collate, row_losses, run
 
 IMAGE = 5
@@ -102,6 +104,41 @@ def test_an_answers_last_token_is_not_fed_and_padding_is_no_target() -> None:
 def test_a_prompt_with_more_image_places_than_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="image places"):
         collate([ROWS[0], Row((IMAGE, 7, IMAGE, IMAGE), (8,), ROWS[2].frames)], img_context_id=IMAGE, device=DEVICE)
+
+
+@pytest.mark.parametrize("most", [0, 1, 6])
+def test_greedy_answers_of_a_batch_are_those_of_every_row_alone(language: LanguageModel, most: int) -> None:
+    silent = [dataclasses.replace(one, answer=()) for one in ROWS]
+    said = decode(language, collate(silent, img_context_id=IMAGE, device=DEVICE), most)
+    for one, row_said in zip(silent, said, strict=True):
+        ids: list[int] = []
+        while len(ids) < most:
+            spoken = Row((*one.prompt, *ids), (), one.frames)
+            chosen = int(alone(language, spoken, len(spoken.fed))[0].argmax())
+            if chosen == language.config.im_end_id:
+                break
+            ids.append(chosen)
+        assert row_said.ids == tuple(ids)
+        spoken = Row((*one.prompt, *ids), (), one.frames)
+        torch.testing.assert_close(
+            row_said.last_layer_kv, alone(language, spoken, len(spoken.fed))[1], atol=1e-5, rtol=0
+        )
+
+
+def test_greedy_decoding_ends_at_the_end_token_and_at_the_models_context(language: LanguageModel) -> None:
+    silent = [dataclasses.replace(one, answer=()) for one in ROWS]
+    batch = collate(silent, img_context_id=IMAGE, device=DEVICE)
+    free = decode(language, batch, 6)
+    short = copy.deepcopy(language)
+    longest = max(len(one.fed) for one in silent)
+    short.config = dataclasses.replace(language.config, max_context=longest + 2)
+    for i, said in enumerate(decode(short, batch, 6)):
+        assert said.ids == free[i].ids[: longest + 2 - len(silent[i].fed)]
+    ends = free[0].ids[2]
+    short.config = dataclasses.replace(language.config, im_end_id=ends)
+    for i, said in enumerate(decode(short, batch, 6)):
+        upto = free[i].ids.index(ends) if ends in free[i].ids else 6
+        assert said.ids == free[i].ids[:upto]
 
 
 def test_buckets_hold_every_index_once_and_rows_of_about_one_length() -> None:
