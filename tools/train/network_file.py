@@ -1,0 +1,84 @@
+"""The network between stages: each begins with the weights of the one before it and leaves its own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Final
+
+from safetensors import SafetensorError, safe_open
+
+from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config_file import config_from_dict
+from export.model.network import PARTS, TicVla, build
+from export.model.weights import WeightsInfo, save_weights
+from tools.train.job import StageJob
+
+ORDER: Final = ("encoder", "sft", "imitate", "rl")
+"""Stages that change weights, in the order in which `all` runs them."""
+FILE: Final = "model.safetensors"
+SHARED: Final = ("vision", "language")
+"""What ablations of the action expert have in common."""
+
+
+class NetworkFileError(ValueError):
+    """Weights that a stage cannot begin with; one line: what, expected, found."""
+
+
+def stage_weights(out: Path, stage: str) -> Path:
+    """Where a stage of the run in `out` leaves the whole network."""
+    return out / stage / FILE
+
+
+def weights_before(out: Path, stage: str) -> Path | None:
+    """The newest weights of the stages before `stage`; None where none of them has finished."""
+    earlier = ORDER[: ORDER.index(stage)] if stage in ORDER else ORDER
+    return next((path for name in reversed(earlier) if (path := stage_weights(out, name)).is_file()), None)
+
+
+def start_network(job: StageJob, stage: str) -> TicVla:
+    """The network that a stage begins with: of the stages before it, else of the recipe's seed; on the CPU.
+
+    Raises NetworkFileError for weights of another network.
+    """
+    path = weights_before(job.run_dir.out, stage)
+    if path is None:
+        return build(job.recipe.model, job.recipe.seed)
+    return read_network(path, job.recipe.model, job.recipe.seed)
+
+
+def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
+    """A network from a file of ours. An action expert or value network of other numbers begins from the seed.
+
+    Raises NetworkFileError where encoder or language model are others.
+    """
+    model = build(config, seed)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            found = config_from_dict(json.loads((file.metadata() or {})["config"]))
+            same = [part for part in PARTS if getattr(found, part) == getattr(config, part)]
+            if other := sorted(set(SHARED) - set(same)):
+                raise NetworkFileError(f"{path}: its {other[0]} is not the recipe's; train from the beginning")
+            tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError) as error:
+        if isinstance(error, NetworkFileError):
+            raise
+        raise NetworkFileError(f"{path}: not weights of ours ({error})") from error
+    wanted = {name for name in model.state_dict() if name.split(".")[0] in same}
+    if set(tensors) != wanted:
+        odd = sorted(set(tensors) ^ wanted)
+        raise NetworkFileError(f"{path}: expected the tensors of {', '.join(same)}; {odd[0]} is missing or unknown")
+    model.load_state_dict(tensors, strict=False)
+    return model
+
+
+def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
+    """Leave the network as this stage's, and as the run's `model.safetensors`; call it on the first rank only."""
+    path = stage_weights(job.run_dir.out, stage)
+    origin = f"edge-train {job.recipe.name}, seed {job.recipe.seed}, after {stage}"
+    save_weights(model, path, WeightsInfo(trained=True, origin=origin))
+    partial = job.run_dir.model_path.with_suffix(".partial")
+    shutil.copyfile(path, partial)
+    partial.replace(job.run_dir.model_path)
+    return path
