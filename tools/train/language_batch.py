@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,19 @@ POOL = 32
 """Batches that are sorted by length together: alike enough to waste little, mixed enough to be random."""
 
 Halves = npt.NDArray[np.float16]
+
+
+class FrameTokens(Protocol):
+    """Visual tokens of recorded frames, encoded once."""
+
+    def frames(self, drive_id: str) -> Halves:
+        """f16 [N, tokens, D] of all frames of a drive, mapped from a file."""
+
+
+def frames_of(tokens: FrameTokens, drive_id: str, frames: Sequence[int]) -> tuple[Halves, ...]:
+    """Tokens [tokens, D] of some frames of a drive."""
+    every = tokens.frames(drive_id)
+    return tuple(every[k] for k in frames)
 
 
 @dataclass(frozen=True)

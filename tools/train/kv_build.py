@@ -1,0 +1,169 @@
+"""Making semantic states: every 1 Hz anchor through the frozen language model, with the true text or its own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Final
+from zlib import crc32
+
+import numpy as np
+import torch
+from tokenizers import Tokenizer
+
+from export.model.network import TicVla
+from tools.train.anchors import WAYPOINTS_START, Anchor, DrawConfig, Drawn, Prompts, anchors_of, draw
+from tools.train.distributed import SINGLE, Ranks
+from tools.train.drive import TRACE_EVERY, Dataset
+from tools.train.greedy import decode
+from tools.train.job import QuietProgress, StageProgress
+from tools.train.kv_cache import FORMAT, KvCache, KvCacheError, Made, begin, write_states
+from tools.train.language_batch import FrameTokens, Row, collate, frames_of, run
+
+SEEN_PARTS: Final = ("vision", "language")
+"""Parts of the network that a semantic state depends on."""
+_TAG: Final = 0x5EE
+
+
+@dataclass(frozen=True)
+class KvConfig:
+    """Which states are kept."""
+
+    draws: int = 1
+    """States of each anchor, each with words and a `before` of its own."""
+    own_share: float = 0.0
+    """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
+    max_new_tokens: int = 160
+    """Of its own texts."""
+    every: int = TRACE_EVERY
+    """Frames between two anchors."""
+    batch: int = 32
+    words: DrawConfig = field(default_factory=lambda: DrawConfig(waypoints_only=0.0))
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.draws <= 64 and 0 <= self.own_share <= 1 and self.batch >= 1 and self.max_new_tokens >= 0):
+            raise ValueError("expected 1 to 64 draws, own_share from 0 to 1, a batch and max_new_tokens from 0 on")
+        if self.every < 1 or self.every % TRACE_EVERY:
+            raise ValueError(f"expected every to be a multiple of {TRACE_EVERY} frames, found {self.every}")
+
+
+def parts_sha256(network: TicVla, parts: Iterable[str] = SEEN_PARTS) -> str:
+    """Hash of the weights of some parts of a network."""
+    digest = hashlib.sha256()
+    wanted = tuple(parts)
+    for name, tensor in sorted(network.state_dict().items()):
+        if name.split(".")[0] in wanted:
+            digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def cache_key(network: TicVla, tokenizer: bytes, config: KvConfig, seed: int) -> str:
+    """What states depend on, except their drive."""
+    told = {key: value for key, value in asdict(config).items() if key != "batch"}
+    sizes = network.config.to_dict()
+    made = {
+        "format": FORMAT,
+        "weights": parts_sha256(network),
+        "sizes": {part: sizes[part] for part in SEEN_PARTS},
+        "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
+        "config": told,
+        "seed": seed,
+    }
+    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
+
+
+def build_kv_cache(
+    folder: Path,
+    network: TicVla,
+    tokenizer: bytes,
+    dataset: Dataset,
+    tokens: FrameTokens,
+    config: KvConfig,
+    *,
+    seed: int,
+    ids: Sequence[str] | None = None,
+    ranks: Ranks = SINGLE,
+    progress: StageProgress | None = None,
+) -> KvCache:
+    """States of all drives (or `ids`), those that are missing made now, in a folder of its own under `folder`.
+
+    The network runs where its weights are; ranks share the drives. Raises KvCacheError for numbers that f16 cannot
+    hold, OSError.
+    """
+    key = cache_key(network, tokenizer, config, seed)
+    place = folder / key[:16]
+    if ranks.first:
+        begin(place, key=key, kv_dim=network.config.kv_dim, draws=config.draws)
+    ranks.barrier()
+    cache = KvCache(place)
+    wanted = set(dataset.ids if ids is None else ids)
+    missing = [entry for entry in dataset.entries if entry.id in wanted and not cache.has(entry.id, entry.sha256)]
+    own = missing[ranks.rank :: ranks.world]
+    prompts = Prompts(Tokenizer.from_buffer(tokenizer), network.config)
+    for done, entry in enumerate(own, 1):
+        anchors = anchors_of(dataset.load(entry.id, pictures=False), config.every)
+        states = _states(network, prompts, tokens, anchors, config, seed)
+        write_states(place, entry.id, entry.sha256, states, network.config.kv_dim)
+        (progress or QuietProgress()).update(done, len(own))
+    ranks.barrier()
+    return KvCache(place)
+
+
+def _states(
+    network: TicVla, prompts: Prompts, tokens: FrameTokens, anchors: Sequence[Anchor], config: KvConfig, seed: int
+) -> list[Made]:
+    """All states of one drive by frame and draw; made in batches of about one length."""
+    wanted: list[tuple[Anchor, int, Drawn, bool]] = []
+    for anchor in anchors:
+        for number in range(config.draws):
+            # Of the state's own: what it is made with does not depend on which others are made.
+            rng = np.random.default_rng((seed, _TAG, crc32(anchor.drive_id.encode()), anchor.k, number))
+            own = bool(rng.uniform() < config.own_share)
+            wanted.append((anchor, number, draw(anchor, config.words, rng), own))
+    made: list[Made] = []
+    for own in (False, True):
+        rows = [(each, prompts.of(each[0], each[2])) for each in wanted if each[3] is own]
+        rows.sort(key=lambda row: len(row[1][0]) + len(row[1][1]))
+        for start in range(0, len(rows), config.batch):
+            made += _batch(network, prompts, tokens, rows[start : start + config.batch], own, config.max_new_tokens)
+    return sorted(made, key=lambda state: (state.k, state.draw))
+
+
+@torch.no_grad()
+def _batch(
+    network: TicVla,
+    prompts: Prompts,
+    tokens: FrameTokens,
+    rows: Sequence[tuple[tuple[Anchor, int, Drawn, bool], tuple[tuple[int, ...], tuple[int, ...]]]],
+    own: bool,
+    max_new_tokens: int,
+) -> list[Made]:
+    language = network.language
+    batch = collate(
+        [
+            Row(prompt, () if own else answer, frames_of(tokens, anchor.drive_id, anchor.frames))
+            for (anchor, *_), (prompt, answer) in rows
+        ],
+        img_context_id=language.config.img_context_id,
+        device=language.embed.weight.device,
+    )
+    if own:
+        said = decode(language, batch, max_new_tokens)
+        states = [each.last_layer_kv for each in said]
+        answers = [each.ids for each in said]
+    else:
+        kv = run(language, batch.input_ids, batch.visual_tokens, None).last_layer_kv
+        states = [kv[i, :length] for i, length in enumerate(batch.lengths.tolist())]
+        answers = [answer[:-1] for _, (_, answer) in rows]
+    made: list[Made] = []
+    for ((anchor, number, drawn, _), (prompt, _)), state, answer in zip(rows, states, answers, strict=True):
+        half = state.to(torch.float16).cpu().numpy()
+        if not np.isfinite(half).all():
+            raise KvCacheError(f"drive {anchor.drive_id}, frame {anchor.k}: keys or values beyond what float16 holds")
+        text = (WAYPOINTS_START if drawn.waypoints_only else "") + prompts.text(answer)
+        made.append(Made(anchor.k, number, half, len(prompt), own, text))
+    return made
