@@ -1,0 +1,120 @@
+"""The words of reasoning traces: phrases for places, things, people and plans, and every sentence that they can make.
+
+A trace has five lines (paper appendix B); each is a few canonical words, so that a small model can learn to say them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import MappingProxyType
+from typing import Final
+
+from edge.reasoning_text import PROGRESS_HEAD, Progress, format_progress, format_waypoints
+
+SITUATION, OBJECTS, MOTION, PLAN = "Situation: ", "Objects: ", "Motion: ", "Plan: "
+MAX_WORDS: Final = 45  # of the five lines together
+MAX_RANGE_M: Final = 30
+SIDES: Final = ("left", "ahead", "right")
+WAYS: Final = ("coming", "leaving", "crossing left", "crossing right", "standing")
+AREAS: Final = MappingProxyType(
+    {
+        "corridor": "in a corridor", "aisle": "in an aisle", "room": "in a room", "lobby": "in a lobby",
+        "yard": "in a yard", "sidewalk": "on a sidewalk", "crossing": "on a crossing", "plaza": "on a plaza",
+        "street": "on a street",
+    }
+)  # fmt: skip
+NO_AREA: Final = "in the open"
+CROWDS: Final = ("", ", few people", ", many people")
+OPENINGS: Final = MappingProxyType({"room": "doorway", "crossing": "crossing"})
+OPENING: Final = "opening"  # of every other kind
+NOTHING, NOBODY = "none", "nobody near"
+_INTO: Final = MappingProxyType(
+    {
+        "corridor": "corridor", "aisle": "aisle", "room": "room", "lobby": "lobby", "yard": "yard",
+        "sidewalk": "sidewalk", "plaza": "plaza",
+    }
+)  # fmt: skip
+
+
+def distance(metres: float) -> str:
+    """Whole metres, 1 to 30: "3 m"."""
+    return f"{min(max(round(metres), 1), MAX_RANGE_M)} m"
+
+
+def opening(kind: str) -> str:
+    """What an opening into an area of a kind is called."""
+    return OPENINGS.get(kind, OPENING)
+
+
+def seen(name: str, side: str, metres: float) -> str:
+    """A thing in view: "vending machine left 6 m"."""
+    return f"{name} {side} {distance(metres)}"
+
+
+def person(side: str, metres: float, way: str) -> str:
+    """Somebody in view: "person ahead 2 m coming"."""
+    return f"person {side} {distance(metres)} {way}"
+
+
+def turn(side: str, kind: str, metres: float) -> str:
+    """The next step: "turn left into the room in 3 m"; near it "now"."""
+    when = "now" if metres < 1.0 else f"in {distance(metres)}"
+    if kind == "crossing":
+        return f"cross {'ahead' if side == 'straight' else side} {when}"
+    if side == "straight":
+        return f"go straight to the {_INTO[kind]} {when}"
+    return f"turn {side} into the {_INTO[kind]} {when}"
+
+
+def stop(metres: float) -> str:
+    """The end: "stop in 6 m"."""
+    return "stop now" if metres < 1.0 else f"stop in {distance(metres)}"
+
+
+WAIT: Final = "wait, then "
+
+
+def lines(situation: str, objects: str, motion: str, progress: Progress, plan: str) -> str:
+    """The five lines, each ending in a full stop."""
+    return "\n".join(
+        (
+            f"{SITUATION}{situation}.", f"{OBJECTS}{objects}.", f"{MOTION}{motion}.",
+            f"{PROGRESS_HEAD}{format_progress(progress)}", f"{PLAN}{plan}.",
+        )
+    )  # fmt: skip
+
+
+def landmarks() -> list[str]:
+    """Names of all things that a trace may speak of: every kind's own words, with and without each colour."""
+    from sim_hil.benchmark.instruction_words import NOUNS
+    from sim_hil.benchmark.route import COLOUR_WORDS
+
+    return [*sorted(NOUNS), *(f"{colour} {noun}" for noun in sorted(NOUNS) for colour in sorted(COLOUR_WORDS))]
+
+
+def corpus() -> Iterator[str]:
+    """Texts with every phrase, number and sentence form that traces can hold, for a tokenizer; always the same."""
+    situations = [f"{place}{crowd}" for place in (*AREAS.values(), NO_AREA) for crowd in CROWDS]
+    metres = list(range(1, MAX_RANGE_M + 1))
+    things = [*landmarks(), *sorted(set(OPENINGS.values())), OPENING]
+    plans = [turn(side, kind, m) for m in (0, *metres) for side in ("left", "right", "straight")
+             for kind in (*_INTO, "crossing")] + [stop(m) for m in (0, *metres)]  # fmt: skip
+    people = [person(side, m, way) for m in metres for side in SIDES for way in WAYS]
+    steps = [Progress(k, n, m) for n in range(1, 7) for k in range(1, n + 1) for m in range(9)]
+    steps += [Progress(n + 1, n, 0) for n in range(7)]
+    for i in range(max(len(things), len(plans), len(people), len(steps))):
+        names = [things[(3 * i + j) % len(things)] for j in range(i % 4)]
+        objects = ", ".join(
+            seen(name, SIDES[(i + j) % 3], metres[(7 * i + 11 * j) % 30]) for j, name in enumerate(names)
+        )
+        motion = ", ".join(people[(5 * i + 7 * j) % len(people)] for j in range(i % 3))
+        plan = plans[i % len(plans)]
+        text = lines(
+            situations[i % len(situations)],
+            objects or NOTHING,
+            motion or NOBODY,
+            steps[i % len(steps)],
+            f"{WAIT}{plan}" if i % 5 == 4 else plan,
+        )
+        x, y = (i * 37 % 91) / 10, ((i * 53) % 121 - 60) / 10
+        yield f"{text}\n{format_waypoints(((x / 3, y / 9), (2 * x / 3, y / 3), (x, y)))}"
