@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge.geometry import SE2, wrap_angle
 from edge.reasoning_text import Progress, format_waypoints
-from sim_hil.benchmark.openings import LINEAR, Frame, Opening, bounds_of
+from sim_hil.benchmark.openings import LINEAR, Frame, bounds_of
 from sim_hil.benchmark.route import Step
 from sim_hil.benchmark.sights import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
 from sim_hil.benchmark.visibility import EYE_M, HFOV_RAD
@@ -29,6 +29,7 @@ PEOPLE_M: Final = 6.0  # nobody further away is spoken of
 _MANY: Final = (1, 4)  # people in view within PEOPLE_M: few, many
 _AHEAD_RAD: Final = radians(15.0)
 _STANDING_MPS: Final = 0.2
+_ALONG: Final = cos(radians(30.0))
 _BODY_M: Final = (0.35, 0.5, 1.7)  # a person: depth, width, height
 _WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
 _WAIT_FOR_M: Final = 2.5
@@ -139,10 +140,8 @@ class Tracer:
 
     def _objects(self, pose: SE2, step: Step | None, people: Array, crowd: list[tuple[int, float]]) -> list[str]:
         found: list[tuple[int, float, str]] = []
-        if step is not None:
-            for opening, point, gap in self._openings(pose, step):
-                found.append((1, gap, words.seen(words.opening(opening.area.kind), _side(pose, point), gap)))
-                break
+        if step is not None and (opening := self._next_opening(pose, step)) is not None:
+            found.append((1, *opening))
         for thing in self._things:
             at = np.array(thing.position_m[:2])
             gap = hypot(at[0] - pose.x_m, at[1] - pose.y_m)
@@ -156,12 +155,14 @@ class Tracer:
                 said.append(text)
         return said[:MAX_THINGS]
 
-    def _openings(self, pose: SE2, step: Step) -> list[tuple[Opening, Array, float]]:
-        """Openings that count for a step and are in view, nearest first."""
-        frame, found = Frame(step.ahead), []
+    def _next_opening(self, pose: SE2, step: Step) -> tuple[float, str] | None:
+        """Distance, m, and words of the nearest opening ahead that counts for a step and is in view."""
+        frame = Frame(step.ahead)
+        here, own = frame.along((pose.x_m, pose.y_m)), frame.across((pose.x_m, pose.y_m))
         for opening in step.counted:
+            if opening.middle_m <= here:
+                continue
             (_, _), (right, left) = frame.span(bounds_of(opening.area))
-            own = frame.across((pose.x_m, pose.y_m))
             # The border nearest to the robot; an area that the corridor runs across opens a metre to the side.
             across = right if opening.side == "left" else left
             if opening.area.kind in LINEAR and right < own < left:
@@ -169,8 +170,11 @@ class Tracer:
             point = np.array(frame.point(opening.middle_m, across))
             gap = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
             if gap < self._range_m and self._in_sight(pose, point):
-                found.append((opening, point, gap))
-        return sorted(found, key=lambda item: item[2])
+                # Along the corridor it is on the side on which it counts, however small the angle.
+                along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
+                side = opening.side if along else _side(pose, point)
+                return gap, words.seen(words.opening(opening.area.kind), side, gap)
+        return None
 
     def _in_sight(self, pose: SE2, point: Array) -> bool:
         """Whether a post as high as the eye would be seen at a point."""
