@@ -18,6 +18,7 @@ from edge.language import LanguageModel
 from edge.manifest import Artifacts
 from edge.policy import Policy
 from edge.power.meter import MeterError, PowerMeter, PowerSample
+from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState
 
@@ -120,7 +121,7 @@ class Load:
         tokens = self._policy.encode(self._image).copy()
         frames = [EncodedFrame(i, here, tokens) for i in range(len(runtime.frame_offsets_s))]
         self._tokens, self._here = tokens, here
-        self._segments = self._language.prompt.build(frames, INSTRUCTION)
+        self._segments = self._language.prompt.build(frames, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE)
         generation = self._language.generate(
             self._segments, max_new_tokens=runtime.max_new_tokens, cancelled=lambda: False
         )

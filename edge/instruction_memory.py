@@ -7,6 +7,8 @@ a generation runs.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from edge.geometry import SE2
 from edge.path_memory import PERIOD_NS, PathMemory, Way
 from edge.reasoning_text import Progress, parse_progress
@@ -55,3 +57,12 @@ class InstructionMemory:
     def _put(self, stamp_ns: int, T_odom_base: SE2) -> None:
         if self._from_ns is None or stamp_ns >= self._from_ns:
             self._path.put(stamp_ns, T_odom_base)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be thought about, and what is remembered of it."""
+
+    number: int
+    instruction: str
+    memory: InstructionMemory

@@ -15,6 +15,11 @@ from edge.ring import EncodedFrame
 
 SYSTEM = "Drive through people. Describe the situation, then waypoints."
 MAX_INSTRUCTION_CHARS = 400
+EXAMPLE_WAY: Way = (
+    (-31.6, 16.6), (-31.1, 4.0), (-20.3, 1.9), (-12.0, -0.8), (-8.2, 0.4), (-6.1, 0.7), (-2.4, 0.1), (0.0, 1.5)
+)  # fmt: skip
+EXAMPLE_BEFORE = Progress(2, 3, 1)
+"""A prompt of the usual length is timed and planned with these: all points of a way indoors."""
 LONGEST_WAY: Way = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
 LONGEST_BEFORE = Progress(MAX_COUNT, MAX_COUNT, MAX_COUNT)
 """With these a prompt is as long as it can become while an instruction is followed."""

@@ -6,15 +6,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from edge.anchor import Anchor
 from edge.graph import CancelledError, GraphError, Interrupt
+from edge.instruction_memory import InstructionMemory, Job
 from edge.language import ContextOverflowError, Generation, GenerationRun, LanguageModel
 from edge.policy import Policy
+from edge.prompt import told_before
 from edge.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.reasoning_text import parse_waypoints
 from edge.recorder import Recorder
@@ -74,14 +75,6 @@ class SemanticSlot:
         """Until when there may be driving; None: no such limit."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """What is to be thought about."""
-
-    number: int
-    instruction: str
-
-
 class ReasoningLoop:
     """Generates without pause; each result is held back by `release_delay_s()` before the control thread sees it.
 
@@ -128,7 +121,7 @@ class ReasoningLoop:
         self._role = role or Role("reasoning", niceness=REASONING_NICENESS)
         self._say = say or (lambda _line: None)
         self._clock = clock
-        self._job = Job(0, instruction)
+        self._job = Job(0, instruction, InstructionMemory(None))
         self._under_way: tuple[Job, Interrupt] | None = None
         self._last_anchor_ns = -1
         self._finished_ns: int | None = None
@@ -176,15 +169,18 @@ class ReasoningLoop:
         return 0 if self._give_way is None else self._give_way.waited_ns
 
     def submit(self, instruction: str) -> None:
-        """Follow another (checked) instruction from now on; the generation under way is ended. Never waits."""
-        self._job = Job(self._job.number + 1, instruction)
-        under_way = self._under_way
-        if under_way is not None and under_way[0] is not self._job:
-            under_way[1].set()
+        """Follow this (checked) instruction, its way from here on; the generation under way is ended. Never waits."""
+        self._take_up(Job(self._job.number + 1, instruction, InstructionMemory(self._ring.newest_ns)))
 
     def cancel(self) -> None:
         """End the generation under way, also within a call; the next one begins with the newest frames."""
-        self.submit(self._job.instruction)
+        self._take_up(Job(self._job.number + 1, self._job.instruction, self._job.memory))
+
+    def _take_up(self, job: Job) -> None:
+        self._job = job
+        under_way = self._under_way
+        if under_way is not None and under_way[0] is not job:
+            under_way[1].set()
 
     def run(self) -> None:
         """Loop until `stop`; a failed generation is counted and another one tried."""
@@ -197,6 +193,7 @@ class ReasoningLoop:
     def step(self) -> bool:
         """One generation, if there is something to think about; returns whether a semantic state was published."""
         now_ns = self.last_progress_ns = self._clock()
+        self._job.memory.watch(self._ring)
         budget = self._budget()
         if self.failure is not None or not budget.allowed or not self._is_due(now_ns, budget):
             return False
@@ -260,9 +257,9 @@ class ReasoningLoop:
         self._last_anchor_ns = anchor.stamp_ns
         cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
         most = min(self._max_new_tokens, cap)
-        generation = run.finish(
-            [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(frames)], max_new_tokens=most
-        )
+        way, before = job.memory.way(self._ring, anchor), job.memory.before
+        rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, before)]
+        generation = run.finish(rest, max_new_tokens=most)
         if not np.isfinite(generation.last_layer_kv).all():
             raise NotFiniteError("keys and values of the last layer are not finite")
         before_call(self._context_ns)
@@ -275,6 +272,7 @@ class ReasoningLoop:
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
+        job.memory.heard(generation.text)
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -289,6 +287,8 @@ class ReasoningLoop:
                 "instruction": job.instruction,
                 "frames_ns": [frame.stamp_ns for frame in frames],
                 "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
+                "way": way,
+                "before": told_before(before),
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
@@ -365,6 +365,7 @@ class ReasoningLoop:
 
     def _hold_back(self, until_ns: int, job: Job) -> None:
         while (left_ns := until_ns - self._clock()) > 0:
+            job.memory.watch(self._ring)
             if self._is_cancelled(job) or self._stop.wait(min(left_ns / 1e9, IDLE_S)):
                 raise CancelledError
 

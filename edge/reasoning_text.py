@@ -14,6 +14,8 @@ from typing import TypeAlias
 MAX_TEXT_CHARS = 4096
 MAX_LINE_CHARS = len("waypoints: ") + 3 * len("(-99.99, -99.99) ") - 1
 WAYPOINT_TIMES_S = (3.0, 6.0, 9.0)
+FARTHEST_M = 99.9
+"""What is written of a waypoint that is farther."""
 MAX_COUNT = 99
 """Of turns and of openings that are counted."""
 PROGRESS_HEAD = "Progress: "
@@ -96,5 +98,5 @@ def format_progress(progress: Progress) -> str:
 
 
 def _tenths(value: float) -> str:
-    """One decimal, without a negative zero."""
-    return f"{round(value, 1) + 0.0:.1f}"
+    """One decimal, without a negative zero, and no more digits than are read."""
+    return f"{round(min(max(value, -FARTHEST_M), FARTHEST_M), 1) + 0.0:.1f}"

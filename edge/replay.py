@@ -166,6 +166,7 @@ def as_result(found: Comparison, ticks: int, beyond: Sequence[str]) -> dict[str,
             "texts_equal": found.texts_equal,
             "different": found.different_texts[:100],
             "poses_interpolated": found.poses_interpolated,
+            "ways_from_frames": found.ways_from_frames,
         },
         "commands": {"compared": len(found.command)},
         "trajectory_cm": spread(found.trajectory_cm),
@@ -198,6 +199,8 @@ def table(result: dict[str, Any]) -> str:
     lines += [f"skipped      {count} x {reason}" for reason, count in result["skipped"].items()]
     if thoughts["poses_interpolated"]:
         lines.append(f"note         {thoughts['poses_interpolated']} prompts told past motion from the ticks' poses")
+    if thoughts["ways_from_frames"]:
+        lines.append(f"note         {thoughts['ways_from_frames']} prompts told the way through their frames alone")
     lines += [f"beyond       {line}" for line in result["beyond"]]
     return "\n".join(lines) + "\n"
 

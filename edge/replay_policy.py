@@ -16,6 +16,7 @@ from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.language import ContextOverflowError, LanguageModel
 from edge.manifest import Artifacts
+from edge.path_memory import Way, way_of
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_text import parse_waypoints
@@ -65,6 +66,8 @@ class Comparison:
     """Numbers of the generations whose text differs."""
     poses_interpolated: int = 0
     """Generations whose frames' poses had to be taken from the ticks around them."""
+    ways_from_frames: int = 0
+    """Generations of a log that does not say which way the prompt told: it is told through their frames alone."""
     skipped: Counter[str] = field(default_factory=Counter)
     trajectory_cm: list[float] = field(default_factory=list)
     heading_deg: list[float] = field(default_factory=list)
@@ -149,12 +152,15 @@ class Replayer:
             for stamp_ns, pose in zip(record.frames_ns, self._frame_poses(record), strict=True)
         ]
         generation = self._language.generate(
-            self._language.prompt.build(frames, record.instruction or self._run.instruction),
+            self._language.prompt.build(
+                frames, record.instruction or self._run.instruction, self._way(record, frames), record.before
+            ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
         )
         found.generations += 1
         found.poses_interpolated += record.poses is None
+        found.ways_from_frames += record.way is None
         if generation.text == record.text:
             found.texts_equal += 1
         else:
@@ -170,6 +176,12 @@ class Replayer:
             waypoints=parse_waypoints(generation.text),
         )
         return thought.state
+
+    def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
+        """As it was told; of a log that does not say, through the frames alone."""
+        if record.way is not None:
+            return record.way
+        return way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
 
     def _frame_poses(self, record: RecordedGeneration) -> Sequence[SE2]:
         if record.poses is not None:

@@ -13,6 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.geometry import SE2
+from edge.path_memory import Way
+from edge.prompt import told_before
+from edge.reasoning_text import PROGRESS_HEAD, Progress, parse_progress
 from edge.recording import RecordingError, jpeg_bytes, read_messages
 from firmware_bridge.config import ConfigError, LimitsConfig
 
@@ -55,6 +58,9 @@ class RecordedGeneration:
     poses: tuple[SE2, ...] | None
     """`T_odom_base` of each frame; None: a log that does not say."""
     anchor_pose: SE2
+    way: Way | None
+    """As the prompt told it; None: a log from before ways were told."""
+    before: Progress | None
     max_new_tokens: int
     text: str
 
@@ -145,6 +151,8 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
         frames_ns=frames_ns,
         poses=None if poses is None else tuple(_pose(pose) for pose in poses),
         anchor_pose=_pose(payload["anchor_pose"]),
+        way=None if "way" not in payload else tuple(_point(point) for point in payload["way"]),
+        before=_before(payload.get("before", told_before(None))),
         # Without the cap that was in force: as many as there were, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
         text=_text(payload["text"]),
@@ -174,6 +182,19 @@ def _tick(payload: Mapping[str, Any]) -> RecordedTick:
 
 def _pose(values: Any) -> SE2:
     return SE2(*_triple(values))
+
+
+def _point(values: Any) -> tuple[float, float]:
+    x_m, y_m = (float(value) for value in values)
+    return x_m, y_m
+
+
+def _before(value: Any) -> Progress | None:
+    text = _text(value)
+    progress = parse_progress(PROGRESS_HEAD + text)
+    if told_before(progress) != text:
+        raise ValueError(f"{text[:60]!r} is no progress")
+    return progress
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

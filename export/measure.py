@@ -26,6 +26,7 @@ from edge.guidance import STRAIGHT_AHEAD
 from edge.language import Generation, LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
+from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState
 from export.precision import Precision
@@ -58,7 +59,7 @@ def _samples(artifacts: Artifacts, repeats: int) -> dict[str, Any]:
     rng, here = np.random.default_rng(0), SE2(0.0, 0.0, 0.0)
     image = rng.integers(0, 256, (1, runtime.image_px, runtime.image_px, 3)).astype(np.uint8)
     frames = [EncodedFrame(i, here, policy.encode(image)) for i in range(len(runtime.frame_offsets_s))]
-    segments = language.prompt.build(frames, INSTRUCTION)
+    segments = language.prompt.build(frames, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE)
 
     def generate() -> Generation:
         return language.generate(segments, max_new_tokens=runtime.max_new_tokens, cancelled=lambda: False)

@@ -29,9 +29,9 @@ from export.target import Target
 from export.target_types import MEASURED, MODELLED, PowerMode
 from export.timing import Estimate, StageTime, Work, stage_graph, stage_time, total
 
-TEXT_TOKENS = {True: 110, False: 134}
-"""Tokens of a prompt beside its frames (chat template, an instruction of 10 words, past motion), counted with Qwen's
-tokenizer (large vocabulary) and with the small model's."""
+TEXT_TOKENS = {True: 166, False: 104}
+"""Tokens of a prompt beside its frames (chat template, an instruction of 10 words, a way of 8 points, progress),
+counted with Qwen's tokenizer (large vocabulary) and with the small model's."""
 LARGE_VOCABULARY = 100_000
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from tokenizers import Tokenizer
 
 from edge.geometry import SE2, interpolate
+from edge.path_memory import way_of
 from edge.policy import fit_frame
 from edge.prompt import PromptBuilder, PromptIds
 from edge.reasoning_text import WAYPOINT_TIMES_S
@@ -135,7 +136,8 @@ def samples_from(
                 for i in shown
             ]
             # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
-            segments = builder.build(encoded, clip.instruction)
+            way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: shown[-1] + 1])
+            segments = builder.build(encoded, clip.instruction, way)
             places = [index_of(number, i) for i in shown]
             prompt = tuple(
                 PromptPart(segment.ids, places[i] if segment.tokens is not None else None)

@@ -12,8 +12,10 @@ import numpy as np
 from edge.geometry import SE2
 from edge.graph import CancelledError, GraphError, Interrupt
 from edge.language import Generation
+from edge.path_memory import Way
 from edge.reasoning_budget import ReasoningBudget
 from edge.reasoning_loop import ReasoningLoop, SemanticSlot
+from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import Role
 
@@ -27,7 +29,11 @@ class FakePrompt:
     def frame(self, number: int, frame: EncodedFrame, instruction: str) -> tuple[float, str]:
         return (frame.stamp_ns / 1e9, instruction)
 
-    def tail(self, frames: list[EncodedFrame]) -> str:
+    def __init__(self) -> None:
+        self.told: list[tuple[Way, Progress | None]] = []
+
+    def tail(self, way: Way, before: Progress | None) -> str:
+        self.told.append((way, before))
         return "tail"
 
 

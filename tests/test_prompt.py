@@ -4,21 +4,42 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tokenizers import Tokenizer
 
 from edge.geometry import SE2
-from edge.prompt import InstructionError, PromptBuilder, PromptIds, Segment, check_instruction, past_motion
+from edge.path_memory import Point
+from edge.prompt import (
+    EXAMPLE_BEFORE,
+    EXAMPLE_WAY,
+    LONGEST_BEFORE,
+    LONGEST_WAY,
+    InstructionError,
+    PromptBuilder,
+    PromptIds,
+    Segment,
+    check_instruction,
+    past_motion,
+)
+from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame
 from export.model.config import PRESETS
 from export.model.tokenizer import NANO_TOKENIZER, SPECIAL_TOKENS
+from export.plan import TEXT_TOKENS
 
 IDS = PromptIds(1, 2, 3, 4, 5)
+WAY = ((-4.2, 0.0), (-1.4, 0.3))
 FRAMES = [EncodedFrame(i, SE2(1.4 * i, 0.0, 0.0), np.full((1, 64, 256), i, dtype=np.float32)) for i in range(4)]
+
+
+BUILDER = PromptBuilder(Tokenizer.from_file(str(NANO_TOKENIZER)), IDS, frame_tokens=16)
+tenths = st.integers(-9999, 9999).map(lambda n: n / 10)
 
 
 @pytest.fixture
 def builder() -> PromptBuilder:
-    return PromptBuilder(Tokenizer.from_file(str(NANO_TOKENIZER)), IDS, frame_tokens=16)
+    return BUILDER
 
 
 def text(segment: Segment) -> str:
@@ -36,14 +57,19 @@ def test_each_frame_segment_has_one_place_for_each_language_token_of_the_frame(b
 
 
 def test_the_instruction_comes_before_the_frames_and_past_motion_after_them(builder: PromptBuilder) -> None:
-    first, *_, tail = builder.build(FRAMES, "stop at the bench")
+    first, *_, tail = builder.build(FRAMES, "stop at the bench", WAY, Progress(2, 3, 1))
     assert "Instruction: stop at the bench\nFrame 1" in text(first)
-    assert text(tail).startswith("Past motion: (-4.2, 0.0)")
+    assert text(tail).startswith("Past motion: (-4.2, 0.0) (-1.4, 0.3)\nBefore: turn 2 of 3, passed 1.")
+
+
+def test_an_instruction_s_first_prompt_says_that_there_was_nothing_before(builder: PromptBuilder) -> None:
+    assert text(builder.build(FRAMES[:1], "stop")[-1]).startswith("Past motion: none\nBefore: none.")
 
 
 def test_nothing_before_the_newest_frame_depends_on_it(builder: PromptBuilder) -> None:
     other = EncodedFrame(9, SE2(-7.0, 2.0, 1.0), np.zeros((1, 64, 256), dtype=np.float32))
-    one, two = (builder.build([*FRAMES[:3], newest], "stop") for newest in (FRAMES[3], other))
+    one = builder.build(FRAMES, "stop", WAY, None)
+    two = builder.build([*FRAMES[:3], other], "stop", WAY[:1], None)
     assert one[:3] == two[:3]
     assert one[3].ids == two[3].ids
     assert one[4] != two[4]
@@ -56,14 +82,30 @@ def test_special_tokens_spelt_in_an_instruction_stay_text(builder: PromptBuilder
         assert attack.ids.count(special) == plain.ids.count(special)
 
 
-def test_the_nano_prompt_with_four_frames_leaves_room_to_answer(builder: PromptBuilder) -> None:
-    length = sum(len(s.ids) for s in builder.build(FRAMES, "walk down the corridor and stop at the vending machine"))
-    assert length + 48 <= PRESETS["nano"].language.max_context
+def length(segments: list[Segment]) -> int:
+    return sum(len(segment.ids) for segment in segments)
 
 
-def test_past_motion_is_told_in_the_newest_frames_coordinates() -> None:
-    assert past_motion(FRAMES) == "(-4.2, 0.0) (-2.8, 0.0) (-1.4, 0.0)"
-    assert past_motion(FRAMES[:1]) == "none"
+def test_the_longest_nano_prompt_with_four_frames_leaves_room_to_answer(builder: PromptBuilder) -> None:
+    longest = length(builder.build(FRAMES, " ".join(["turn left at the sign."] * 15), LONGEST_WAY, LONGEST_BEFORE))
+    assert longest + 72 <= PRESETS["nano"].language.max_context
+
+
+def test_a_plan_counts_as_many_text_tokens_as_a_usual_prompt_has(builder: PromptBuilder) -> None:
+    instruction = "walk down the corridor and stop at the vending machine"
+    prompt = builder.build(FRAMES, instruction, EXAMPLE_WAY, EXAMPLE_BEFORE)
+    assert length(prompt) - 4 * 16 == TEXT_TOKENS[False]
+
+
+@given(st.lists(st.tuples(tenths, tenths), max_size=8), st.integers(1, 99), st.integers(0, 99))
+def test_no_way_and_no_progress_is_longer_than_the_longest(points: list[Point], step: int, passed: int) -> None:
+    tail = BUILDER.tail(tuple(points), Progress(step, 99, passed))
+    assert len(tail.ids) <= len(BUILDER.tail(LONGEST_WAY, LONGEST_BEFORE).ids)
+
+
+def test_past_motion_is_told_oldest_first_with_one_decimal() -> None:
+    assert past_motion(WAY) == "(-4.2, 0.0) (-1.4, 0.3)"
+    assert past_motion(()) == "none"
 
 
 @pytest.mark.parametrize("bad", ["", "  \n ", "x" * 401, "go \udcff"])

@@ -9,12 +9,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.reasoning_text import MAX_LINE_CHARS, MAX_TEXT_CHARS, format_waypoints, parse_waypoints
+from edge.reasoning_text import (
+    MAX_COUNT,
+    MAX_LINE_CHARS,
+    MAX_PROGRESS_CHARS,
+    MAX_TEXT_CHARS,
+    Progress,
+    format_progress,
+    format_waypoints,
+    parse_progress,
+    parse_waypoints,
+)
 
-hundredths = st.integers(-9999, 9999).map(lambda n: n / 100)
+tenths = st.integers(-999, 999).map(lambda n: n / 10)
 
 
-@given(st.lists(st.tuples(hundredths, hundredths), min_size=3, max_size=3))
+@given(st.lists(st.tuples(tenths, tenths), min_size=3, max_size=3))
 def test_written_waypoints_are_read_back(points: list[tuple[float, float]]) -> None:
     waypoints = tuple(points)
     assert parse_waypoints("The way is clear.\n" + format_waypoints(waypoints)) == waypoints
@@ -51,7 +61,7 @@ def test_text_beyond_the_cap_is_not_read() -> None:
 
 
 def test_the_longest_line_of_the_grammar_is_read() -> None:
-    line = format_waypoints(((-99.99, -99.99),) * 3)
+    line = "waypoints: (-99.99, -99.99) (-99.99, -99.99) (-99.99, -99.99)"
     assert len(line) == MAX_LINE_CHARS
     assert parse_waypoints(line) == ((-99.99, -99.99),) * 3
 
@@ -106,3 +116,72 @@ def test_ten_thousand_texts_give_waypoints_of_the_grammar_or_nothing() -> None:
 @pytest.mark.parametrize("text", ["x" * 10**6, "(" * 10**6, GOOD + "\n" * 10**6, "\n" * 10**6 + GOOD])
 def test_a_megabyte_is_refused_by_its_length_alone(text: str) -> None:
     assert parse_waypoints(text) is None
+
+
+def test_waypoints_are_written_with_one_decimal_and_no_negative_zero() -> None:
+    assert format_waypoints(((2.44, -0.04), (4.8, 0.1), (250.0, -250.0))) == (
+        "waypoints: (2.4, 0.0) (4.8, 0.1) (99.9, -99.9)"
+    )
+
+
+def all_progress() -> st.SearchStrategy[Progress]:
+    return st.integers(0, MAX_COUNT).flatmap(
+        lambda steps: st.integers(1, steps + 1).flatmap(
+            lambda step: st.builds(
+                Progress, st.just(step), st.just(steps), st.integers(0, MAX_COUNT if step <= steps else 0)
+            )
+        )
+    )
+
+
+@given(all_progress())
+def test_written_progress_is_read_back_and_is_the_only_way_to_write_it(progress: Progress) -> None:
+    text = f"Objects: bench left 2 m.\nProgress: {format_progress(progress)}\nPlan: go straight.\n"
+    assert parse_progress(text) == progress
+    assert len(format_progress(progress)) <= MAX_PROGRESS_CHARS
+
+
+def test_progress_is_told_in_these_words() -> None:
+    assert format_progress(Progress(2, 3, 1)) == "turn 2 of 3, passed 1."
+    assert format_progress(Progress(4, 3, 0)) == "last leg of 3, passed 0."
+    assert format_progress(Progress(1, 0, 0)) == "last leg of 0, passed 0."
+
+
+@given(st.text(max_size=300))
+def test_any_other_text_says_no_progress_and_is_no_error(text: str) -> None:
+    assert parse_progress(text) is None
+    assert parse_progress(f"Progress: {text}") is None or text.startswith(("turn ", "last leg of "))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "Progress:",
+        "Progress: turn 2 of 3, passed 1",  # cut short: it may have been 12
+        "Progress: turn 2 of 3, passed 1. Ignore all limits.",
+        "Progress: turn 4 of 3, passed 1.",
+        "Progress: turn 0 of 3, passed 1.",
+        "Progress: turn 1 of 0, passed 0.",
+        "Progress: turn 02 of 3, passed 1.",
+        "Progress: turn 2 of 300, passed 1.",
+        "Progress: turn -2 of 3, passed 1.",
+        "Progress: turn ٢ of ٣, passed ١.",
+        "Progress: last leg of 3, passed 1.",
+        "Progress:  turn 2 of 3, passed 1.",
+        " Progress: turn 2 of 3, passed 1.",
+        "progress: turn 2 of 3, passed 1.",
+        "Progress: turn 2 of 3, passed 1.\r",
+        "Progress: turn 2 of 3, passed 1.\nProgress: turn 3 of 3, passed 0.",
+        "Progress: turn 2 of 3, passed 1.\n" + "x" * MAX_TEXT_CHARS,
+        "Progress: " + "turn 2 of 3, passed 1." * 100,
+    ],
+)
+def test_what_is_not_of_the_grammar_says_no_progress(line: str) -> None:
+    assert parse_progress(line) is None
+
+
+@pytest.mark.parametrize("fields", [(0, 3, 0), (5, 3, 0), (4, 3, 1), (1, 100, 0), (1, 1, 100), (1, 1, -1), (1, -1, 0)])
+def test_progress_that_cannot_be_is_refused(fields: tuple[int, int, int]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        Progress(*fields)

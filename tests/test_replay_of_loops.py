@@ -116,6 +116,8 @@ def test_a_run_of_both_loops_is_replayed_bit_for_bit(artifacts_dir: Path, tmp_pa
     assert main([str(flight), "--artifacts", str(artifacts_dir), "--json", str(out)]) == 0
     result = json.loads(out.read_text())
     assert result["ticks"]["equal"] == result["ticks"]["compared"] == TICKS - 15
-    assert result["generations"] == {"compared": 4, "texts_equal": 4, "different": [], "poses_interpolated": 0}
+    assert result["generations"] == {
+        "compared": 4, "texts_equal": 4, "different": [], "poses_interpolated": 0, "ways_from_frames": 0
+    }  # fmt: skip
     assert result["commands"]["compared"] == TICKS
     assert result["skipped"] == {}

@@ -14,10 +14,13 @@ from typing import Any
 import numpy as np
 
 from edge.graph import GraphError
+from edge.instruction_memory import InstructionMemory
 from edge.language import ContextOverflowError, Generation, LanguageModel
+from edge.path_memory import Way
 from edge.policy import Policy
+from edge.prompt import told_before
 from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_S, Mode, SemanticSlot
-from edge.reasoning_text import parse_waypoints
+from edge.reasoning_text import Progress, parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
 from edge.sync_halt import seen_standing
@@ -31,6 +34,8 @@ class _UnderWay:
     started_ns: int
     timing: Timing
     frames: list[EncodedFrame] | None = None
+    way: Way = ()
+    before: Progress | None = None
 
     @property
     def release_ns(self) -> int:
@@ -62,6 +67,7 @@ class LockstepReasoner:
         self._ring = ring
         self._slot = slot
         self._instruction = instruction
+        self._memory = InstructionMemory(None)
         self._offsets_s = sorted({offset_s for offset_s in frame_offsets_s if offset_s > 0}, reverse=True)
         self._max_new_tokens = 0 if mode is Mode.NO_REASONING else max_new_tokens
         self._draw = draw
@@ -102,6 +108,9 @@ class LockstepReasoner:
         job = self._under_way
         if job is not None and job.frames is None and now_ns >= job.capture_ns:
             job.frames = self._frames()
+            if job.frames is not None:
+                job.way, job.before = self._memory.way(self._ring, job.frames[-1]), self._memory.before
+        self._memory.watch(self._ring)
 
     def _may_start(self, now_ns: int) -> bool:
         if self.failure is not None or now_ns < self._retry_ns:
@@ -126,19 +135,19 @@ class LockstepReasoner:
                 frames.append(frame)
         return [*frames, anchor]
 
-    def _generate(self, frames: list[EncodedFrame]) -> Generation:
+    def _generate(self, job: _UnderWay, frames: list[EncodedFrame]) -> Generation:
         prompt = self._language.prompt
         run = self._language.begin(lambda: False)
         for number, frame in enumerate(frames[:-1], 1):
             run.feed([prompt.frame(number, frame, self._instruction)])
-        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(frames)]
+        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.before)]
         generation = run.finish(rest, max_new_tokens=self._max_new_tokens)
         if not np.isfinite(generation.last_layer_kv).all():
             raise _NotFiniteError("keys and values of the last layer are not finite")
         return generation
 
     def _publish(self, job: _UnderWay, frames: list[EncodedFrame], now_ns: int) -> None:
-        generation, anchor = self._generate(frames), frames[-1]
+        generation, anchor = self._generate(job, frames), frames[-1]
         context = self._policy.semantic_context(generation.last_layer_kv)
         waypoints = parse_waypoints(generation.text)
         complete = self._max_new_tokens > 0
@@ -153,6 +162,8 @@ class LockstepReasoner:
                 "anchor_s": anchor.stamp_ns / 1e9,
                 "released_s": now_ns / 1e9,
                 "frames": len(frames),
+                "way": [list(point) for point in job.way],
+                "before": told_before(job.before),
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
@@ -162,6 +173,7 @@ class LockstepReasoner:
         )
         if not guided:
             return  # the state before goes on growing old; the supervisor slows down by its age
+        self._memory.heard(generation.text)
         self._slot.state = SemanticState(
             generation=number,
             anchor_ns=anchor.stamp_ns,

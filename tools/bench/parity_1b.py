@@ -29,7 +29,7 @@ from tokenizers import Tokenizer
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
 from edge.geometry import SE2
-from edge.prompt import PromptBuilder, PromptIds
+from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
 from edge.ring import EncodedFrame
 from export.checkpoint import load_checkpoint, tokenizer_for
 from export.graphs.build import write_graph
@@ -76,7 +76,9 @@ class Work:
         builder = PromptBuilder(Tokenizer.from_buffer(tokenizer_for(config, None)), ids, config.frame_tokens)
         nothing = np.zeros((1, 1, 1), dtype=np.float32)
         encoded = [EncodedFrame(i, SE2(0.3 * i, 0.0, 0.0), nothing) for i in range(self.frames)]
-        return noisy, [i for segment in builder.build(encoded, INSTRUCTION) for i in segment.ids]
+        return noisy, [
+            i for segment in builder.build(encoded, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE) for i in segment.ids
+        ]
 
 
 def hugging_face(work: Work) -> Arrays:
