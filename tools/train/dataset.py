@@ -33,7 +33,7 @@ class DatasetWriter:
     """One writer at a time; methods raise OSError when the disk fails."""
 
     def __init__(self, folder: Path) -> None:
-        """Make or go on with the data set of a folder; drives whose file is not whole are forgotten. Raises DriveError."""
+        """Make a data set, or go on with one, less drives whose file is not whole. Raises DriveError."""
         (folder / DRIVES).mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._lock = _locked(folder)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
@@ -23,14 +22,18 @@ from tools.train.steering import Velocity
 
 Steer = Callable[[Observation, Velocity], tuple[Velocity, int]]
 """From what is observed and what the expert wants to what is commanded, and whose that is (EXPERT, NOISE, POLICY)."""
-Tell = Callable[[EpisodeWorld], Mapping[str, Any]]
-"""The trace of this instant; asked once a second, in order."""
+Tell = Callable[[EpisodeWorld, NDArray[np.float64]], Mapping[str, Any]]
+"""From the world and what the expert has chosen ([50, 3]) to the trace of this instant; asked once a second."""
 
 LEAST_FRAMES: Final = 30  # a shorter drive teaches nothing
 _BEFORE_CRASH: Final = 20  # frames: what led to a collision or a fall is not to be learned
 _STUCK_FRAMES: Final = 150
 _STUCK_M: Final = 0.5
 _OFF_M: Final = 6.0
+
+
+class NothingToLearnError(Exception):
+    """A drive of which there is nothing to keep; its text says why, in a few words that many drives share."""
 
 
 @dataclass(frozen=True)
@@ -84,13 +87,16 @@ class DrivePlan:
     keep_trouble: bool = False
 
 
-def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded | None:
-    """Drive and record; None where there is less than 3 s that can be learned from. Raises ValueError, SceneError."""
+def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded:
+    """Drive and record. Raises NothingToLearnError where less than 3 s can be learned from, SceneError, ValueError."""
     frames = _Frames()
     options = WorldOptions(camera=(plan.look.render_px,) * 2, drift=plan.drift)
     first_collision: int | None = None
     with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
-        expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
+        try:
+            expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
+        except ValueError as error:
+            raise NothingToLearnError("the expert sees no way") from error
         try:
             while not world.done:
                 observation = _shrunk(world.observe())
@@ -98,7 +104,7 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
                 command, by = steer(observation, wanted)
                 _keep(frames, plan, world, observation, expert, by)
                 if len(frames.traces) * TRACE_EVERY < len(frames.pose):
-                    frames.traces.append(tell(world))
+                    frames.traces.append(tell(world, frames.chosen[-1]))
                 world.step(command)
                 if first_collision is None and world.collided:
                     first_collision = len(frames.pose)
@@ -107,7 +113,7 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
         finally:
             expert.close()
         end, collided = world.end, world.collided
-    outcome = {"stopped": "cut"}.get(end or "", end or "")
+    outcome = "cut" if end == "stopped" else str(end)
     return _finish(frames, plan, outcome, collided, first_collision)
 
 
@@ -157,12 +163,10 @@ def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
     return float(np.min(np.hypot(*(point - nearest).T)))
 
 
-def _finish(
-    frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None
-) -> Recorded | None:
+def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None) -> Recorded:
     count = kept_frames(np.array(frames.pose), outcome, None if plan.keep_trouble else first_collision)
     if count < LEAST_FRAMES:
-        return None
+        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before it {outcome}")
     pose, by = np.array(frames.pose)[:count], np.array(frames.by, np.uint8)[:count]
     whole = outcome == "reached" and count == len(frames.pose)
     future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.keep_trouble)
@@ -196,8 +200,3 @@ def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | 
     if first_collision is not None:
         count = min(count, first_collision - _BEFORE_CRASH)
     return max(count, 0)
-
-
-def start_of(episode: Episode) -> SE2:
-    """Where the robot begins."""
-    return SE2(*episode.start)

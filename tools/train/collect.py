@@ -1,0 +1,29 @@
+"""The first stage: the expert drives through training scenes, and every frame is recorded with what it did next."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tools.train.collect_config import CollectConfig
+
+if TYPE_CHECKING:
+    from tools.train.job import StageJob
+
+__all__ = ["CollectConfig", "run"]
+
+PREFIX = "e"
+
+
+def run(job: StageJob) -> dict[str, Any]:
+    """Record the recipe's drives into `collect/`; goes on where a run before was ended. Raises CollectError."""
+    # Here: a recipe needs the numbers alone, and the simulator takes its time to load.
+    from tools.train.collection import CollectError, Collection, fill, job_count, result_of
+    from tools.train.dataset import DatasetWriter
+
+    config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
+    if job.ranks.world > 1:
+        raise CollectError("collect starts processes of its own (collect.jobs): run it without torchrun")
+    collection = Collection(PREFIX, config.episodes, job.seed, 0, config)
+    with DatasetWriter(job.run_dir.stage("collect")) as writer:
+        fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
+        return result_of(writer, PREFIX)

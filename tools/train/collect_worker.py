@@ -1,0 +1,197 @@
+"""The process that records drives: some scenarios of one layout, one after the other, each in fresh physics.
+
+What is drawn for a drive depends on the collection's seed and the drive's number alone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.artifact_files import ArtifactError
+from edge.prompt import InstructionError
+from export.typed import build, plain
+from sim_hil.benchmark.expert import ExpertPolicy
+from sim_hil.benchmark.observation import Observation
+from sim_hil.benchmark.world import EpisodeWorld
+from sim_hil.scene import SceneError
+from tools.train.collect_config import CollectConfig
+from tools.train.dagger_driver import PolicyDriver, PolicyOptions
+from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TRACE_EVERY, About, Drive, Entry
+from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
+from tools.train.scenarios import SHARES, TASKS_PER_SCENE, Scenario, ScenarioError, training_episodes
+from tools.train.steering import SteeringNoise, Velocity
+from tools.train.traces import Tracer
+from tools.train.workers import Message, worker_main
+
+MODULE: Final = "tools.train.collect_worker"
+_TAG: Final = 0xC011
+_PLAN_STEP: Final = 3 * RATE_HZ - 1  # of a future: where the robot means to be in 3 s
+
+
+@dataclass(frozen=True)
+class Order:
+    """What one process is told: drives `start` to `start + count - 1` into `folder`, but for those in `skip`.
+
+    `policy`: the artifacts that drive, and how; None where the expert does.
+    """
+
+    folder: str
+    prefix: str
+    seed: int
+    scenario_seed: int
+    start: int
+    count: int
+    skip: tuple[str, ...]
+    config: CollectConfig
+    policy: PolicyOptions | None = None
+
+    def id(self, number: int) -> str:
+        """Of a drive of this collection."""
+        return f"{self.prefix}{number:05d}"
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        return dict(plain(self))
+
+    @staticmethod
+    def of_json(content: Mapping[str, Any]) -> Order:
+        """An order that `as_json` has written; raises FieldError."""
+        return build(Order, content, "order")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What is drawn for one drive beside its scenario."""
+
+    noise: bool
+    look: Look
+    drift: str
+
+    @staticmethod
+    def of(config: CollectConfig, seed: int, number: int) -> Draw:
+        """The same for the same numbers, whoever asks."""
+        rng = np.random.default_rng((seed, number, _TAG))
+        noise, sharp, drift = (float(value) for value in rng.uniform(size=3))
+        quality = int(rng.integers(config.jpeg_quality_min, config.jpeg_quality_max + 1))
+        severe, typical = config.severe_drift_share, config.typical_drift_share
+        return Draw(
+            noise=noise < config.noise_share,
+            look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
+            drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
+        )
+
+
+def messages(job: Message) -> Iterator[Mapping[str, Any]]:
+    """What comes of an order: `{"begun": id}`, then `{"drive": entry}` or `{"dropped": id, "why": …}`, for each drive.
+
+    `{"refused": …}` ends it: the policy's artifacts cannot be used.
+    """
+    order = Order.of_json(job)
+    numbers = range(order.start, order.start + order.count)
+    if order.start // TASKS_PER_SCENE != (numbers[-1] // TASKS_PER_SCENE):
+        raise ValueError("an order is of one layout")
+    try:
+        scenarios = list(training_episodes(order.scenario_seed, order.count, _kinds(order), start=order.start))
+    except ScenarioError:
+        for number in numbers:
+            yield {"dropped": order.id(number), "why": "no such layout"}
+        return
+    for number, scenario in zip(numbers, scenarios, strict=True):
+        drive_id = order.id(number)
+        if drive_id in order.skip:
+            continue
+        yield {"begun": drive_id}
+        try:
+            yield {"drive": asdict(_drive(order, number, scenario))}
+        except (NothingToLearnError, SceneError) as error:
+            yield {"dropped": drive_id, "why": str(error)}
+        except InstructionError:
+            yield {"dropped": drive_id, "why": "its instruction is too long for the model"}
+        except ArtifactError as error:
+            yield {"refused": str(error)}
+            return
+
+
+def _kinds(order: Order) -> Mapping[str, float]:
+    return order.config.kinds or SHARES
+
+
+def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
+    config = order.config
+    draw = Draw.of(config, order.seed, number)
+    threshold_m = scenario.episode.threshold_m
+    episode = replace(scenario.episode, id=order.id(number), threshold_m=config.arrive_share * threshold_m)
+    plan = DrivePlan(
+        episode=episode,
+        scene=scenario.scene,
+        path=np.array(scenario.task.path, np.float64),
+        look=draw.look,
+        drift=draw.drift,
+        hopeless=order.policy is not None,
+        keep_trouble=order.policy is not None,
+    )
+    rng = np.random.default_rng((order.seed, number, _TAG, 1))
+    expert = ExpertPolicy(margin_m=config.margin_m, speed_mps=config.speed_mps)
+    if order.policy is not None:
+        with PolicyDriver(order.policy, episode, rng) as policy:
+            recorded, driver = record(plan, expert, policy.steer, _teller(scenario)), policy.name
+    else:
+        steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _as_wanted
+        recorded, driver = record(plan, expert, steer, _teller(scenario)), "expert-noise" if draw.noise else "expert"
+    drive = Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays)
+    path = Path(order.folder) / DRIVES / f"{drive.id}.safetensors"
+    drive.save(path)
+    return Entry.of(drive, path)
+
+
+def _as_wanted(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+    return wanted, EXPERT
+
+
+def _noisy(noise: SteeringNoise, _: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+    return noise.command(wanted)
+
+
+def _teller(scenario: Scenario) -> Tell:
+    tracer = Tracer(scenario)
+
+    def tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
+        means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
+        return tracer.trace(world.pose(), world.people(), world.people_velocities(), means).to_json()
+
+    return tell
+
+
+def _about(scenario: Scenario, drive_id: str, recorded: Recorded, driver: str, draw: Draw) -> About:
+    episode = scenario.episode
+    traces = tuple({"k": TRACE_EVERY * i, **trace} for i, trace in enumerate(recorded.traces))
+    return About(
+        id=drive_id,
+        kind=scenario.kind,
+        layout_seed=scenario.layout_seed,
+        scene=scenario.scene.name,
+        robot=episode.robot,
+        people=episode.people,
+        seed=episode.seed,
+        driver=driver,
+        drift=draw.drift,
+        goal_xy=episode.goal_xy,
+        threshold_m=episode.threshold_m,
+        outcome=recorded.outcome,
+        collided=recorded.collided,
+        wordings=scenario.wordings,
+        told=tuple(scenario.told_json()),
+        traces=traces,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(worker_main(f"python -m {MODULE}", messages))

@@ -1,0 +1,49 @@
+"""Rounds in which the policy drives and the expert says what it would have done (DAgger, Ross et al. 2011).
+
+The exported artifacts drive, with delays drawn for every drive, through the code that drives on a robot: what is
+labelled are the states that the deployed policy gets itself into.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tools.train.collect_config import CollectConfig
+
+if TYPE_CHECKING:
+    from tools.train.job import StageJob
+
+BETA: Final = 0.5  # the expert's share of the first round; halved in every one after it
+
+
+def prefix_of(round_number: int) -> str:
+    """How the ids of a round's drives begin; rounds count from 1."""
+    return f"d{round_number}-"
+
+
+def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, Any]:
+    """Record round `round_number` (1, 2, …) into `collect/`, beside the expert's drives; goes on where it was ended.
+
+    Raises ArtifactError for artifacts that cannot drive, CollectError.
+    """
+    from edge.manifest import load_artifacts
+    from tools.train.collection import CollectError, Collection, fill, job_count, result_of
+    from tools.train.dagger_driver import PolicyOptions
+    from tools.train.dataset import DatasetWriter
+
+    if round_number < 1:
+        raise ValueError(f"dagger: rounds count from 1, found {round_number}")
+    if job.ranks.world > 1:
+        raise CollectError("dagger starts processes of its own (collect.jobs): run it without torchrun")
+    config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
+    sha256 = load_artifacts(artifacts).manifest_sha256
+    beta, mean_s = BETA / 2 ** (round_number - 1), job.recipe.dagger.latency_mean_s
+    policy = PolicyOptions(str(artifacts.absolute()), sha256, beta, mean_s)
+    prefix = prefix_of(round_number)
+    collection = Collection(prefix, job.recipe.dagger.episodes, job.seed, round_number, config, policy)
+    with DatasetWriter(job.run_dir.stage("collect")) as writer:
+        if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"policy:{sha256[:12]}"}):
+            raise CollectError(f"dagger round {round_number}: begun with {others[0]}; go on with the same artifacts")
+        fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
+        return {**result_of(writer, prefix), "beta": beta, "policy": sha256}
