@@ -9,15 +9,17 @@ from collections.abc import Mapping
 from typing import Final
 
 JOBS: Final[Mapping[str, tuple[str, str]]] = {
+    "latency": ("calib.latency", "measure how long generations take beside control, for edge-bench and edge-train"),
     "odometry": ("calib.odometry", "fit scale, bias and drift of a robot's odometry to a flight log"),
     "power": ("calib.power", "measure power at rest and in every stage, and fit the plan's energy model"),
 }
 
 EXAMPLES: Final = """examples:
+  edge-calib latency --artifacts out/nano --out orin.latency.json
   edge-calib odometry flight.mcap --out go2.odometry.toml
   edge-calib power --artifacts out/nano --out orin.power.toml
-exit codes: 0 done, 1 the fit is not good enough to be used, 2 bad arguments or input, 3 refused: the device cannot be
-measured, 130 interrupted
+exit codes: 0 done, 1 what was measured is not good enough to be used, 2 bad arguments or input, 3 refused: the device
+cannot be measured, 130 interrupted
 """
 
 

@@ -1,0 +1,181 @@
+"""The reasoning thread of a run, as it is on a robot, beside ticks that encode and act; no robot is needed."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from edge.artifact_files import ArtifactError
+from edge.geometry import SE2
+from edge.graph import GraphError
+from edge.language import ContextOverflowError, LanguageModel
+from edge.latency_profile import times_of
+from edge.manifest import Artifacts
+from edge.policy import Policy, fit_frame
+from edge.reasoning_loop import Mode, ReasoningLoop, SemanticSlot
+from edge.ring import EncodedFrame, TokenRing
+from edge.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
+from edge.warm_up import warm_up
+from export.calibration import Clip
+
+WARM: Final = 3
+"""Generations that are left out: what they wait for is not known before there were some."""
+SAY_EVERY_S: Final = 15.0
+POLL_S: Final = 0.05
+JOIN_S: Final = 5.0
+
+
+class MeasureError(RuntimeError):
+    """A measurement that cannot be used; one line."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured: (time of a generation, how late its newest frame was captured) in s, and the ticks beside."""
+
+    times_s: tuple[tuple[float, float], ...]
+    ticks: int
+    late: int
+    """Ticks that were not over by the next one's deadline."""
+    failed: int
+
+
+@dataclass
+class Generations:
+    """Takes the records of generations, as a flight log would."""
+
+    times_s: list[tuple[float, float]] = field(default_factory=list)
+
+    def put(self, topic: str, _stamp_ns: int, record: Mapping[str, Any]) -> None:
+        """Keep the times of a finished generation."""
+        if topic == "/semantic":
+            self.times_s.append(times_of(record))
+
+
+class Ticks:
+    """The control thread's work at its rate: a picture encoded into the ring, the action expert asked."""
+
+    def __init__(
+        self, artifacts: Artifacts, policy: Policy, ring: TokenRing, slot: SemanticSlot, clip: Clip, schedule: Schedule
+    ) -> None:
+        self._policy, self._ring, self._slot, self._schedule = policy, ring, slot, schedule
+        self._period_ns = artifacts.runtime.tick_period_ms * 1_000_000
+        self._pictures = [fit_frame(frame.image, artifacts.runtime.image_px) for frame in clip.frames]
+        self._poses = [frame.T_odom_base for frame in clip.frames]
+        self.ticks = self.late = 0
+        self.error = ""
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop`, on absolute deadlines; those that were slept over are skipped."""
+        enter(self._schedule.control)
+        deadline_ns = time.monotonic_ns() + self._period_ns
+        try:
+            while not stop.wait(max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9)):
+                self._tick()
+                now_ns = time.monotonic_ns()
+                deadline_ns += self._period_ns
+                if now_ns > deadline_ns:
+                    self.late += 1
+                    deadline_ns += math.ceil((now_ns - deadline_ns) / self._period_ns) * self._period_ns
+        except (GraphError, ValueError) as error:
+            self.error = str(error)
+            stop.set()
+
+    def _tick(self) -> None:
+        now_ns = time.monotonic_ns()
+        # The clip's pictures are about a second apart; each is shown for as long.
+        index = (self.ticks * self._period_ns // 1_000_000_000) % len(self._pictures)
+        tokens = self._policy.encode(self._pictures[index], self._ring.next_buffer())
+        self._ring.put(EncodedFrame(now_ns, self._poses[index], tokens))
+        state = self._slot.state
+        if state is not None and (state.waypoints is not None or not self._policy.guided_by_waypoints):
+            delay_s = (now_ns - state.anchor_ns) / 1e9
+            self._policy.act(tokens, (0.5, 0.0, 0.0), delay_s, SE2(0.0, 0.0, 0.0), state)
+        self.ticks += 1
+
+
+def measure(
+    artifacts: Artifacts,
+    clip: Clip,
+    *,
+    instruction: str,
+    mode: Mode,
+    generations: int,
+    seconds: float,
+    say: Callable[[str], None],
+    stop: threading.Event,
+) -> Measured:
+    """Run both threads until there are so many generations or the time is over; `stop` ends it before.
+
+    Raises ArtifactError, InstructionError, MeasureError.
+    """
+    # Here: they load every robot's protocol, which no other job of `edge-calib` needs.
+    from edge.assembly import HISTORY_MARGIN_S
+    from edge.runner import SWITCH_INTERVAL_S
+
+    runtime = artifacts.runtime
+    schedule = schedule_for(artifacts)
+    activity = TickActivity(runtime.tick_period_ms * 1_000_000)
+    policy = Policy(artifacts, schedule=schedule, activity=activity)
+    language = LanguageModel(artifacts, schedule=schedule)
+    language.check_instruction(instruction, len(runtime.frame_offsets_s))
+    try:
+        warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+    except (GraphError, ContextOverflowError) as error:
+        raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
+    slot, found = SemanticSlot(), Generations()
+    capacity = math.ceil((max(runtime.frame_offsets_s) + HISTORY_MARGIN_S) * 1e3 / runtime.tick_period_ms)
+    ring = TokenRing(capacity, policy.tokens_shape)
+    ticks = Ticks(artifacts, policy, ring, slot, clip, schedule)
+    reasoning = ReasoningLoop(
+        language=language,
+        policy=policy,
+        ring=ring,
+        slot=slot,
+        instruction=instruction,
+        frame_offsets_s=runtime.frame_offsets_s,
+        max_new_tokens=runtime.max_new_tokens,
+        release_delay_s=lambda: 0.0,
+        recorder=found,  # type: ignore[arg-type]  # it only puts
+        stop=stop,
+        mode=mode,
+        give_way=GiveWay(activity) if schedule.shared else None,
+        role=schedule.reasoning,
+        say=say,
+    )
+    threads = [
+        threading.Thread(target=lambda: ticks.run(stop), name="control", daemon=True),
+        threading.Thread(target=reasoning.run, name="reasoning", daemon=True),
+    ]
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    try:
+        for thread in threads:
+            thread.start()
+        _wait(found, generations + WARM, seconds, stop, say)
+    finally:
+        stop.set()
+        reasoning.cancel()
+        for thread in threads:
+            thread.join(JOIN_S)
+        sys.setswitchinterval(interval_s)
+    why = ticks.error or reasoning.failure
+    if why:
+        raise MeasureError(f"it ended by itself: {why}")
+    return Measured(tuple(found.times_s[WARM:]), ticks.ticks, ticks.late, reasoning.failed)
+
+
+def _wait(found: Generations, wanted: int, seconds: float, stop: threading.Event, say: Callable[[str], None]) -> None:
+    started_s = said_s = time.monotonic()
+    while len(found.times_s) < wanted and not stop.wait(POLL_S):
+        now_s = time.monotonic()
+        if now_s - started_s > seconds:
+            return
+        if now_s - said_s > SAY_EVERY_S:
+            said_s = now_s
+            say(f"{max(0, len(found.times_s) - WARM)} of {wanted - WARM} generations, {now_s - started_s:.0f} s")
