@@ -1,0 +1,22 @@
+"""A few training scenarios of every kind, drawn once for all tests."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from tools.train.scenarios import Scenario, scenario_group
+from tools.train.sites import KINDS
+
+SEED = 5
+EACH = 3
+
+
+@cache
+def scenarios(kind: str) -> tuple[Scenario, ...]:
+    """Three of one kind, all of one layout as a rule."""
+    return tuple(scenario_group(SEED, KINDS.index(kind), {kind: 1.0}, EACH))
+
+
+def all_scenarios() -> tuple[Scenario, ...]:
+    """Those of every kind."""
+    return tuple(scenario for kind in KINDS for scenario in scenarios(kind))
