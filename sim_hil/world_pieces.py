@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import floor
 
 from sim_hil.mesh import MeshBuilder
@@ -11,18 +12,18 @@ Vec2 = tuple[float, float]
 
 
 class Pieces:
-    """Meshes by the square that their point lies in; `around` is for what is far outside."""
+    """Meshes by the square that their point lies in, each begun by `make`; `around` is for what is far outside."""
 
-    def __init__(self, square_m: float) -> None:
-        self._square_m = square_m
+    def __init__(self, square_m: float, make: Callable[[], MeshBuilder] = MeshBuilder) -> None:
+        self._square_m, self._make = square_m, make
         self._meshes: dict[tuple[int, int], MeshBuilder] = {}
-        self.around = MeshBuilder()
+        self.around = make()
 
     def at(self, x: float, y: float) -> MeshBuilder:
         """The mesh of the square around a point, m."""
         square = (floor(x / self._square_m), floor(y / self._square_m))
         if square not in self._meshes:
-            self._meshes[square] = MeshBuilder()
+            self._meshes[square] = self._make()
         return self._meshes[square]
 
     def all(self) -> list[MeshBuilder]:

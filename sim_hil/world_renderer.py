@@ -44,9 +44,13 @@ class RendererError(RuntimeError):
 
 
 class Renderer:
-    """A stage that takes pictures of itself; `sky` is the background, RGB 0..1. Not to be shared between threads."""
+    """A stage that takes pictures of itself; `sky` is the background, RGB 0..1. Not to be shared between threads.
 
-    def __init__(self, sky: Vec3) -> None:
+    `smooth` edges mix the colours on both sides; without it every pixel has the colour of one thing.
+    """
+
+    def __init__(self, sky: Vec3, *, smooth: bool = True) -> None:
+        self._samples = _SAMPLES if smooth else 1
         self._pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe")
         if self._pipe is None or not self._pipe.is_valid():
             raise RendererError(
@@ -113,7 +117,7 @@ class Renderer:
         self._camera.set_mat(core.LMatrix4(*(float(value) for row in rows for value in row)))
         self._lens.set_fov(degrees(hfov_rad), degrees(2 * atan(tan(hfov_rad / 2) / aspect)))
         self._lens.set_near_far(NEAR_M, FAR_M)
-        samples = _SAMPLES if width * height <= _SAMPLED_PX else 1
+        samples = self._samples if width * height <= _SAMPLED_PX else 1
         drawn = self._draw(width * samples, height * samples)
         if samples > 1:
             drawn = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA)
