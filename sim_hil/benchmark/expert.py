@@ -52,8 +52,14 @@ class ExpertPolicy:
     privileged = True
     needs_image = False
 
-    def __init__(self, *, margin_m: float = 0.0, speed_mps: float | None = None) -> None:
-        """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place."""
+    def __init__(
+        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = ()
+    ) -> None:  # fmt: skip
+        """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
+
+        `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
+        """
+        self._told = told
         self._margin_m = margin_m
         self._speed_mps = speed_mps
         self._world: EpisodeWorld | None = None
@@ -64,7 +70,12 @@ class ExpertPolicy:
         if world is None:
             raise ValueError("expert: expected the episode's world, which only a privileged policy is given")
         planner = RoutePlanner(
-            world.scene, episode.goal_xy, world.robot.radius_m, max_step_m(episode.robot), _NEAR * episode.threshold_m
+            world.scene,
+            episode.goal_xy,
+            world.robot.radius_m,
+            max_step_m(episode.robot),
+            _NEAR * episode.threshold_m,
+            self._told,
         )
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):

@@ -6,6 +6,7 @@ whole scene can be searched anew, with a price on the places that people take up
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import hypot
 from typing import Final
 
@@ -26,6 +27,8 @@ _WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
 _STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
 # Distance from somebody who stands there, m, and what a metre costs more at it: between two people one may pass.
 _CROWD: Final = ((0.5, 60.0), (0.7, 12.0), (1.4, 0.0))
+_WAY_M: Final = 2.0  # nearer than this to the way that it was told, it is on it
+_STRAY_PRICE: Final = 5.0  # twice as far from it, a metre costs so much more
 _SHORT_PRICE: Final = 4.0  # each metre that one ends short of the goal is as bad as so many metres of way
 _SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
 _NO_ROOM: Final = 1000.0
@@ -36,14 +39,22 @@ _KEEP: Final = (1.2, 2.5)  # the way so far is kept while it costs at most so ma
 class RoutePlanner:
     """Ways to one goal. `clearance_m` is the least distance from the robot's centre to anything solid.
 
-    Within `near_m` of the goal is near enough where people keep the robot from the goal itself. Raises ValueError when
-    the scene has no room for it.
+    Within `near_m` of the goal is near enough where people keep the robot from the goal itself. `told`, m, is the way
+    to keep to where there are several. Raises ValueError when the scene has no room for it.
     """
 
-    def __init__(self, scene: Scene, goal_xy: Vec2, clearance_m: float, max_step_m: float, near_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        goal_xy: Vec2,
+        clearance_m: float,
+        max_step_m: float,
+        near_m: float = 0.0,
+        told: Sequence[Vec2] = (),
+    ) -> None:
         self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
         self._goal = goal_xy
-        self._price = self._static_price(scene)
+        self._price = self._static_price(scene) * self._stray_price(told)
         self._coarsen()
         self._ends, self._end_prices = self._ends_near(near_m)
         self._costs, self._onwards = self._search(np.zeros((0, 2)))
@@ -61,6 +72,16 @@ class RoutePlanner:
                     cells = [self.grid.cell(x, y)[::-1] for x, y in area.polygon]
                     cv2.fillPoly(street, [np.array(cells, np.int32)], value)
         return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
+
+    def _stray_price(self, told: Sequence[Vec2]) -> Array:
+        """What leaving the told way multiplies the price of each cell by."""
+        off = np.ones(self.grid.shape, np.uint8)
+        if not told:
+            return off.astype(np.float64)
+        cells = [self.grid.cell(x, y)[::-1] for x, y in told]
+        cv2.polylines(off, [np.array(cells, np.int32)], isClosed=False, color=0)
+        gap_m = cv2.distanceTransform(off, cv2.DIST_L2, 5) * self.grid.resolution_m
+        return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)
 
     def _coarsen(self) -> None:
         """Join every two by two cells to one: free where one of them is, and standing for the roomiest of them."""

@@ -139,7 +139,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         keep_trouble=order.policy is not None,
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
-    expert = ExpertPolicy(margin_m=config.margin_m, speed_mps=config.speed_mps)
+    expert = ExpertPolicy(margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path)
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
             recorded, driver = record(plan, expert, policy.steer, _teller(scenario)), policy.name
