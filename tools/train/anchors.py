@@ -11,9 +11,9 @@ goes on. The prompt that asks for reasoning stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from tokenizers import Tokenizer
@@ -124,18 +124,12 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 way=memory.way(drive.T_odom_base(k)),
                 wordings=drive.wordings,
                 points=points,
-                reasoning=trace_of(trace).text(points),
+                reasoning=Trace.from_json(trace).text(points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
             )
         )
     return found
-
-
-def trace_of(content: Mapping[str, Any]) -> Trace:
-    """A trace as a drive's header keeps it."""
-    parts = {key: value for key, value in content.items() if key != "k"}
-    return Trace(**{**parts, "progress": Progress(**parts["progress"])})
 
 
 def draw(anchor: Anchor, config: DrawConfig, rng: np.random.Generator) -> Drawn:

@@ -1,0 +1,184 @@
+"""An anchor asks what the runner would ask at that instant, and answers what is true there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from tokenizers import Tokenizer
+
+from edge.language import Generation
+from edge.prompt import PromptBuilder, PromptIds, Segment
+from edge.reasoning_loop import Mode, SemanticSlot
+from edge.reasoning_text import Progress, parse_progress, parse_waypoints
+from edge.ring import EncodedFrame, TokenRing
+from export.model.config import PRESETS
+from export.model.tokenizer import NANO_TOKENIZER
+from sim_hil.benchmark.latency import Timing
+from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner
+from tests.train_drives import WORDINGS, made_up_drive, trace_at
+from tools.train.anchors import (
+    WAYPOINTS_START,
+    Anchor,
+    DrawConfig,
+    Drawn,
+    Prompts,
+    anchors_of,
+    confused,
+    draw,
+    frames_at,
+)
+
+NANO = PRESETS["nano"]
+PERIOD_NS = 100_000_000
+START_NS = 1_000_000_000
+
+
+def tokenizer() -> Tokenizer:
+    return Tokenizer.from_file(str(NANO_TOKENIZER))
+
+
+@pytest.fixture(scope="module")
+def prompts() -> Prompts:
+    return Prompts(tokenizer(), NANO)
+
+
+@pytest.fixture(scope="module")
+def anchors() -> dict[int, Anchor]:
+    return {anchor.k: anchor for anchor in anchors_of(made_up_drive("a"))}
+
+
+class Listener:
+    """In the language model's place: keeps every prompt and says what is true at its newest frame."""
+
+    def __init__(self) -> None:
+        c = NANO.language
+        ids = PromptIds(c.im_start_id, c.im_end_id, c.img_start_id, c.img_end_id, c.img_context_id)
+        self.prompt = PromptBuilder(tokenizer(), ids, NANO.frame_tokens)
+        self.heard: list[tuple[int, ...]] = []
+        self.says: list[str] = []
+
+    def begin(self, cancelled: object) -> Listener:
+        self.heard.append(())
+        return self
+
+    def feed(self, segments: Sequence[Segment]) -> None:
+        self.heard[-1] += tuple(i for segment in segments for i in segment.ids)
+
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int) -> Generation:
+        self.feed(segments)
+        text = self.says[len(self.heard) - 1]
+        return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0)
+
+
+class NoPolicy:
+    guided_by_waypoints = False
+
+    def semantic_context(self, last_layer_kv: np.ndarray) -> dict[str, np.ndarray]:
+        return {}
+
+
+@pytest.mark.parametrize("seconds", [1, 2, 3])
+def test_prompts_are_those_that_the_runner_builds_along_the_drive(
+    prompts: Prompts, anchors: dict[int, Anchor], seconds: int
+) -> None:
+    drive, language, ring = made_up_drive("a"), Listener(), TokenRing(160)
+    asked = list(range(0, 130, 10 * seconds))
+    language.says = [anchors[k].reasoning for k in asked]
+    reasoner = LockstepReasoner(
+        language=language,  # type: ignore[arg-type]
+        policy=NoPolicy(),  # type: ignore[arg-type]
+        ring=ring,
+        slot=SemanticSlot(),
+        instruction=WORDINGS[0],
+        frame_offsets_s=(0.0, 3.0, 6.0, 9.0),
+        max_new_tokens=8,
+        draw=lambda: Timing(seconds * 10 * PERIOD_NS, 0),
+        mode=Mode.ASYNC,
+    )
+    for k in range(130):
+        now_ns = START_NS + k * PERIOD_NS
+        reasoner.release(now_ns)
+        ring.put(EncodedFrame(now_ns, drive.T_odom_base(k), np.zeros((1, 1, 1), np.float32)))
+        reasoner.start(now_ns)
+    assert reasoner.failed == 0 and len(language.heard) >= 4
+    for k, heard in zip(asked, language.heard, strict=False):
+        drawn = Drawn(WORDINGS[0], anchors[k].before(float(seconds)))
+        assert prompts.prompt(anchors[k], drawn) == heard
+
+
+@pytest.mark.parametrize("k", [0, 4, 25, 30, 31, 58, 60, 85, 86, 90, 129])
+def test_frames_are_those_that_the_runner_takes_from_its_ring(k: int) -> None:
+    ring, drive = TokenRing(200), made_up_drive("a")
+    for i in range(k + 1):
+        ring.put(EncodedFrame(i * PERIOD_NS, drive.T_odom_base(i), np.zeros((1, 1, 1), np.float32)))
+    chosen: list[int] = []
+    for offset_s in (9.0, 6.0, 3.0):
+        frame = ring.nearest(k * PERIOD_NS - round(offset_s * 1e9))
+        if frame is not None and frame.stamp_ns < k * PERIOD_NS and frame.stamp_ns // PERIOD_NS not in chosen:
+            chosen.append(frame.stamp_ns // PERIOD_NS)
+    assert frames_at(k) == (*chosen, k)
+
+
+def test_the_answer_reads_back_as_the_label(prompts: Prompts, anchors: dict[int, Anchor]) -> None:
+    for k, anchor in anchors.items():
+        _, answer = prompts.of(anchor, Drawn(WORDINGS[0], None))
+        assert answer[-1] == NANO.language.im_end_id and answer.count(answer[-1]) == 1
+        text = prompts.text(answer)
+        assert text == anchor.reasoning
+        assert parse_progress(text) == trace_at(k).progress == anchor.progress
+        assert parse_waypoints(text) == pytest.approx(np.round(anchor.points, 1))
+
+
+def test_waypoints_alone_are_asked_for_by_beginning_the_answer(prompts: Prompts, anchors: dict[int, Anchor]) -> None:
+    anchor = anchors[60]
+    whole, _ = prompts.of(anchor, Drawn(WORDINGS[0], None))
+    begun, rest = prompts.of(anchor, Drawn(WORDINGS[0], None, waypoints_only=True))
+    assert begun[: len(whole)] == whole
+    assert prompts.text(begun[len(whole) :]) == WAYPOINTS_START
+    assert parse_waypoints(WAYPOINTS_START + prompts.text(rest)) == pytest.approx(np.round(anchor.points, 1))
+    last_line = tokenizer().encode(anchor.reasoning.rsplit("\n", 1)[-1], add_special_tokens=False).ids
+    assert (*begun[len(whole) :], *rest[:-1]) == tuple(last_line)
+
+
+def test_before_is_what_was_true_when_the_last_generation_looked(anchors: dict[int, Anchor]) -> None:
+    assert anchors[0].before(0.3) is None
+    assert anchors[100].before(0.5) == trace_at(90).progress
+    assert anchors[100].before(1.5) == trace_at(80).progress
+    assert anchors[100].before(10.0) == trace_at(0).progress
+    assert anchors[100].before(10.1) is None
+
+
+def test_wrong_words_are_as_rare_as_told_and_always_wrong(anchors: dict[int, Anchor]) -> None:
+    config = DrawConfig(before_min_s=1.0, before_max_s=1.0, before_wrong=0.2, waypoints_only=0.3)
+    rng = np.random.default_rng(0)
+    drawn = [draw(anchors[60], config, rng) for _ in range(2000)]
+    wrong = [each for each in drawn if each.before != anchors[60].before(1.0)]
+    assert len(wrong) / 2000 == pytest.approx(0.2, abs=0.03)
+    assert {each.before for each in wrong} == set(confused(anchors[60].earlier[-2]))
+    assert np.mean([each.waypoints_only for each in drawn]) == pytest.approx(0.3, abs=0.04)
+    assert {each.wording for each in drawn} == set(WORDINGS)
+
+
+@pytest.mark.parametrize("progress", [Progress(1, 1, 0), Progress(2, 3, 2), Progress(4, 3, 0), Progress(1, 0, 0)])
+def test_confused_progress_is_never_the_right_one(progress: Progress) -> None:
+    assert progress not in confused(progress)
+
+
+def test_draws_follow_from_the_seed(anchors: dict[int, Anchor]) -> None:
+    first, again = (np.random.default_rng(7) for _ in range(2))
+    config = DrawConfig()
+    assert [draw(a, config, first) for a in anchors.values()] == [draw(a, config, again) for a in anchors.values()]
+
+
+def test_an_answer_that_does_not_fit_the_context_is_refused(anchors: dict[int, Anchor]) -> None:
+    language = dataclasses.replace(NANO.language, max_context=120)
+    narrow = Prompts(tokenizer(), dataclasses.replace(NANO, language=language))
+    with pytest.raises(ValueError, match="the model reads 120"):
+        narrow.of(anchors[90], Drawn(WORDINGS[0], None))
+
+
+def test_a_drive_without_traces_has_no_anchors() -> None:
+    assert anchors_of(made_up_drive("b", traces=())) == []

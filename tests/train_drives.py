@@ -1,0 +1,86 @@
+"""Recorded drives as training's tests need them: made up, small, and with answers that depend on what is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import cos, pi, sin
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge.reasoning_text import Progress
+from tools.train.dataset import DatasetWriter
+from tools.train.drive import EXPERT, TRACE_EVERY, About, Dataset, Drive, Entry
+from tools.train.traces import Trace
+
+WORDINGS = ("Turn left, then stop at the desk.", "Take the first left and wait at the desk.")
+
+
+def pose_at(k: int) -> tuple[float, float, float]:
+    """0.5 m/s straight ahead for 8 s, then a quarter turn to the left within 2 s, then on."""
+    if k <= 80:
+        return (0.05 * k, 0.0, 0.0)
+    if k <= 100:
+        angle = pi / 2 * (k - 80) / 20
+        return (4.0 + 0.6 * sin(angle), 0.6 * (1 - cos(angle)), angle)
+    return (4.6, 0.6 + 0.05 * (k - 100), pi / 2)
+
+
+def trace_at(k: int) -> Trace:
+    """Before the turn at frame 90 it is next, after it there is the last leg."""
+    left = k < 90
+    return Trace(
+        "in a corridor" if left else "in a room",
+        "desk left 6 m, red chair right 3 m" if left else "none",
+        "nobody near",
+        Progress(1, 1, min(k // 30, 2)) if left else Progress(2, 1, 0),
+        "turn left into the room in 3 m" if left else "stop in 6 m",
+    )
+
+
+def made_up_drive(drive_id: str, frames: int = 130, *, layout_seed: int = 100, **about: Any) -> Drive:
+    """A drive with traces and no pictures to speak of: every frame's JPEG is one byte."""
+    poses = np.array([pose_at(k) for k in range(frames)])
+    traces = [{"k": k, **trace_at(k).to_json()} for k in range(0, frames, TRACE_EVERY)]
+    facts: Mapping[str, Any] = {
+        "kind": "office", "layout_seed": layout_seed, "scene": "office", "robot": "go2", "people": 0, "seed": 1,
+        "driver": "expert", "drift": "none", "goal_xy": (4.6, 4.0), "threshold_m": 1.5, "outcome": "reached",
+        "collided": False, "wordings": WORDINGS, "told": (), "traces": tuple(traces), **about,
+    }  # fmt: skip
+    plan = np.array([[(s / 2, 0.0) for s in (3.0, 6.0, 9.0)]] * frames, np.float32)
+    plan[:90, 2] = (3.0, 1.5)
+    return Drive(
+        about=About(id=drive_id, **facts),
+        jpeg=np.zeros(frames, np.uint8),
+        jpeg_end=np.arange(1, frames + 1),
+        pose=poses,
+        pose_odom=poses + np.array((7.0, -3.0, 0.0)),
+        state=np.zeros((frames, 3), np.float32),
+        future=np.zeros((frames, 50, 3), np.float32),
+        future_steps=np.full(frames, 50, np.int16),
+        plan_xy=plan,
+        by=np.full(frames, EXPERT, np.uint8),
+    )
+
+
+def write_dataset(folder: Path, drives: Sequence[Drive]) -> Dataset:
+    """A data set of these drives."""
+    with DatasetWriter(folder) as writer:
+        for drive in drives:
+            drive.save(writer.path(drive.id))
+            writer.add(Entry.of(drive, writer.path(drive.id)))
+        return writer.finish()
+
+
+class MadeUpTokens:
+    """f16 [N, tokens, width] a drive, seeded by frame, with a mark of whether the turn is still to come."""
+
+    def __init__(self, tokens: int, width: int, frames: int = 130) -> None:
+        self._shape = (frames, tokens, width)
+
+    def frames(self, drive_id: str) -> np.ndarray:
+        """The same for every drive."""
+        found = np.random.default_rng(5).standard_normal(self._shape).astype(np.float16) * np.float16(0.1)
+        found[:90, :, 0] = 2.0
+        return found

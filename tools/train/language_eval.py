@@ -1,0 +1,193 @@
+"""How well the language model speaks of places that it has never seen: what it says against what is true.
+
+Twice: told the right progress of the generation before, as in training, and told what it said itself, generation after
+generation along a drive, as on the robot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import hypot
+from typing import Any, Final
+
+import numpy as np
+
+from edge.reasoning_text import WAYPOINT_TIMES_S, Progress, parse_progress, parse_waypoints
+from export.model.language import LanguageModel
+from tools.train import trace_words
+from tools.train.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
+from tools.train.drive import RATE_HZ
+from tools.train.greedy import decode
+from tools.train.language_batch import FrameTokens, Row, collate, frames_of
+
+_TAG: Final = 0xE7A1
+_SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
+_PLACE: Final = re.compile(rf" ({'|'.join(trace_words.SIDES)}) \d+ m$", re.ASCII)
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """How much is looked at."""
+
+    anchors: int = 384
+    """Anchors that are answered with the right words before them."""
+    drives: int = 24
+    """Drives along which the model hears only itself."""
+    gap_s: float = 2.0
+    """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
+    max_new_tokens: int = 160
+    batch: int = 48
+
+    def __post_init__(self) -> None:
+        if min(self.anchors, self.drives) < 0 or self.batch < 1 or self.max_new_tokens < 1:
+            raise ValueError("expected anchors and drives from 0 on, batch and max_new_tokens from 1 on")
+        if self.gap_s < 1 or self.gap_s != round(self.gap_s):
+            raise ValueError(f"expected gap_s to be whole seconds from 1 on, found {self.gap_s}")
+
+
+class Score:
+    """Adds up answers; `numbers` are shares and means over them."""
+
+    def __init__(self) -> None:
+        self._count: Counter[str] = Counter()
+        self._errors_m: list[list[float]] = []
+
+    def add(self, text: str, anchor: Anchor) -> None:
+        """One answer to an anchor."""
+        found = self._count
+        found["answers"] += 1
+        waypoints = parse_waypoints(text)
+        progress = parse_progress(text)
+        found["waypoints"] += waypoints is not None
+        found["progress"] += progress is not None
+        found["progress right"] += progress == anchor.progress
+        found["turn right"] += progress is not None and progress.step == anchor.progress.step
+        true_side = side_of(anchor.reasoning)
+        if true_side is not None:
+            found["sides"] += 1
+            found["side right"] += side_of(text) == true_side
+        said, there = landmarks_of(text), landmarks_of(anchor.reasoning)
+        found["landmarks said"] += said.total()
+        found["landmarks there"] += there.total()
+        found["landmarks right"] += (said & there).total()
+        if waypoints is not None:
+            pairs = zip(waypoints, anchor.points, strict=True)
+            self._errors_m.append([hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs])
+
+    def numbers(self) -> dict[str, Any]:
+        """JSON values; a share of nothing is None."""
+        n = self._count
+        errors = np.array(self._errors_m).reshape(-1, len(WAYPOINT_TIMES_S))
+        return {
+            "answers": n["answers"],
+            "waypoints_parsable": _share(n["waypoints"], n["answers"]),
+            "progress_parsable": _share(n["progress"], n["answers"]),
+            "progress_right": _share(n["progress right"], n["answers"]),
+            "turn_right": _share(n["turn right"], n["answers"]),
+            "side_right": _share(n["side right"], n["sides"]),
+            "sides": n["sides"],
+            "landmark_precision": _share(n["landmarks right"], n["landmarks said"]),
+            "landmark_recall": _share(n["landmarks right"], n["landmarks there"]),
+            "waypoint_error_m": [float(mean) for mean in errors.mean(0)] if len(errors) else None,
+        }
+
+
+def evaluate(
+    language: LanguageModel,
+    prompts: Prompts,
+    tokens: FrameTokens,
+    anchors: Sequence[Anchor],
+    config: EvalConfig,
+    *,
+    seed: int,
+) -> dict[str, Any]:
+    """Scores under `taught` (right words before), `own` (its own words before) and `waypoints_only`."""
+    rng = np.random.default_rng((seed, _TAG))
+    some = [anchors[int(i)] for i in sorted(rng.permutation(len(anchors))[: config.anchors])]
+    wordings = [anchor.wordings[int(rng.integers(len(anchor.wordings)))] for anchor in some]
+    speaker = Speaker(language, prompts, tokens, config)
+    scores: dict[str, Any] = {}
+    for name, only in (("taught", False), ("waypoints_only", True)):
+        drawn = [
+            Drawn(wording, anchor.before(config.gap_s), only) for anchor, wording in zip(some, wordings, strict=True)
+        ]
+        score = Score()
+        for anchor, text in zip(some, speaker.say(list(zip(some, drawn, strict=True))), strict=True):
+            score.add(text, anchor)
+        scores[name] = score.numbers()
+    ids = sorted({anchor.drive_id for anchor in anchors})
+    chosen = {ids[int(i)] for i in rng.permutation(len(ids))[: config.drives]}
+    scores["own"] = closed_loop(speaker, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
+    return scores
+
+
+class Speaker:
+    """Greedy answers of a language model, in batches of about one length."""
+
+    def __init__(self, language: LanguageModel, prompts: Prompts, tokens: FrameTokens, config: EvalConfig) -> None:
+        self._language = language
+        self._prompts = prompts
+        self._tokens = tokens
+        self._config = config
+
+    def say(self, questions: Sequence[tuple[Anchor, Drawn]]) -> list[str]:
+        """The text after each prompt, the start that it was given included."""
+        rows = [
+            Row(self._prompts.prompt(anchor, drawn), (), frames_of(self._tokens, anchor.drive_id, anchor.frames))
+            for anchor, drawn in questions
+        ]
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i].prompt))
+        texts = [""] * len(rows)
+        language = self._language
+        for start in range(0, len(order), self._config.batch):
+            chosen = order[start : start + self._config.batch]
+            batch = collate(
+                [rows[i] for i in chosen],
+                img_context_id=language.config.img_context_id,
+                device=language.embed.weight.device,
+            )
+            for i, said in zip(chosen, decode(language, batch, self._config.max_new_tokens), strict=True):
+                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
+        return texts
+
+
+def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
+    """Scores along drives where `before` is what the model itself said last, as the runner remembers it."""
+    drives: dict[str, list[Anchor]] = {}
+    for anchor in anchors:
+        if anchor.k % round(gap_s * RATE_HZ) == 0:
+            drives.setdefault(anchor.drive_id, []).append(anchor)
+    wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
+    before: dict[str, Progress | None] = dict.fromkeys(drives)
+    score = Score()
+    for step in range(max((len(each) for each in drives.values()), default=0)):
+        now = [each[step] for each in drives.values() if step < len(each)]
+        drawn = [Drawn(wording[anchor.drive_id], before[anchor.drive_id]) for anchor in now]
+        for anchor, text in zip(now, speaker.say(list(zip(now, drawn, strict=True))), strict=True):
+            score.add(text, anchor)
+            before[anchor.drive_id] = parse_progress(text) or before[anchor.drive_id]
+    return score.numbers()
+
+
+def side_of(text: str) -> str | None:
+    """The side of the turn that the text plans: "left", "right"; None where it plans none."""
+    found = _SIDE.search(_line(text, trace_words.PLAN))
+    return found.group() if found else None
+
+
+def landmarks_of(text: str) -> Counter[str]:
+    """Names that the text's objects have, without where they are."""
+    items = (_PLACE.sub("", item.strip()) for item in _line(text, trace_words.OBJECTS).rstrip(".").split(","))
+    return Counter(item for item in items if item not in ("", trace_words.NOTHING))
+
+
+def _line(text: str, head: str) -> str:
+    """What the first line with this head says; empty without one."""
+    return next((line[len(head) :] for line in text.split("\n") if line.startswith(head)), "")
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

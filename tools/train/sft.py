@@ -1,0 +1,259 @@
+"""Stage 1: the language model learns reasoning with waypoints, and waypoints alone, over a frozen encoder (equation 3).
+
+What is random — words, `before`, kind of answer, order — is a pure function of seed and epoch, so a run that was ended
+goes on exactly, and any number of ranks sees the same batches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tokenizers import Tokenizer
+
+from export.checkpoint import tokenizer_for
+from export.model.network import TicVla
+from tools.train import checkpoint
+from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw
+from tools.train.drive import Dataset
+from tools.train.job import StageJob
+from tools.train.kv_build import parts_sha256
+from tools.train.language_batch import FrameTokens, LanguageBatch, Row, buckets, collate, frames_of, row_losses
+from tools.train.language_eval import EvalConfig, evaluate
+from tools.train.network_file import finish_network, start_network
+from tools.train.optim import OptimConfig, Optimiser, autocast
+
+STAGE: Final = "sft"
+_DRAWS, _ORDER, _HELD = 0x5F71, 0x5F72, 0x5F73
+
+
+class SftError(ValueError):
+    """Data or a checkpoint that cannot be learned from; one line."""
+
+
+@dataclass(frozen=True)
+class SftConfig:
+    """Supervised fine-tuning of the language model."""
+
+    epochs: int = 8
+    batch: int = 32
+    """Samples of all ranks together."""
+    words: DrawConfig = field(default_factory=DrawConfig)
+    optim: OptimConfig = field(default_factory=lambda: OptimConfig(lr=1e-3, warmup_steps=200))
+    """The paper's 2e-5 (Table 8) is for a language model that can speak; ours begins from nothing."""
+    held_anchors: int = 512
+    """Anchors of held-out layouts whose loss is looked at after every epoch."""
+    checkpoint_steps: int = 200
+    """Steps between two checkpoints."""
+    evaluate: EvalConfig = field(default_factory=EvalConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.batch, self.checkpoint_steps) < 1 or self.held_anchors < 0:
+            raise ValueError("expected epochs, batch and checkpoint_steps from 1 on and held_anchors from 0 on")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One drawn question and answer as ids, int32, and the anchor whose frames it is about."""
+
+    anchor: int
+    prompt: npt.NDArray[np.int32]
+    answer: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.prompt) + len(self.answer)
+
+
+class Samples:
+    """What can be drawn from the anchors of some drives."""
+
+    def __init__(self, anchors: Sequence[Anchor], prompts: Prompts, tokens: FrameTokens, words: DrawConfig) -> None:
+        self.anchors = tuple(anchors)
+        self._prompts = prompts
+        self._tokens = tokens
+        self._words = words
+
+    def draw(self, rng: np.random.Generator) -> list[Sample]:
+        """One sample of every anchor."""
+        drawn: list[Sample] = []
+        for index, anchor in enumerate(self.anchors):
+            prompt, answer = self._prompts.of(anchor, draw(anchor, self._words, rng))
+            drawn.append(Sample(index, np.array(prompt, np.int32), np.array(answer, np.int32)))
+        return drawn
+
+    def rows(self, samples: Sequence[Sample]) -> list[Row]:
+        """The same with their frames' tokens."""
+        return [
+            Row(tuple(each.prompt.tolist()), tuple(each.answer.tolist()), self._frames(each.anchor)) for each in samples
+        ]
+
+    def _frames(self, index: int) -> tuple[npt.NDArray[np.float16], ...]:
+        anchor = self.anchors[index]
+        return frames_of(self._tokens, anchor.drive_id, anchor.frames)
+
+
+def run(job: StageJob) -> dict[str, Any]:
+    """Train on the run's data set; leaves the network with its new language model. Raises SftError, DriveError."""
+    from tools.train.tokens import TokenCache
+
+    dataset = Dataset.open(job.run_dir.stage("collect"))
+    network = start_network(job, STAGE).to(job.device)
+    tokens = TokenCache(dataset, network.vision)
+    result = fit(job, network, dataset, tokens)
+    if job.ranks.first:
+        finish_network(job, STAGE, network.cpu())
+    job.ranks.barrier()
+    return result
+
+
+def fit(job: StageJob, network: TicVla, dataset: Dataset, tokens: FrameTokens) -> dict[str, Any]:
+    """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is."""
+    config, language = _config(job), network.language
+    content = tokenizer_for(network.config, None)
+    prompts = Prompts(Tokenizer.from_buffer(content), network.config)
+    data = Samples(list(_anchors(dataset, dataset.train)), prompts, tokens, config.words)
+    held = Samples(list(_anchors(dataset, dataset.val)), prompts, tokens, config.words)
+    if not data.anchors:
+        raise SftError(f"{dataset.folder}: no anchors with reasoning to learn from; collect drives first")
+    per_epoch = -(-len(data.anchors) // config.batch)
+    total = per_epoch * config.epochs
+    job.ranks.copy_parameters(language.parameters())
+    optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
+    state = _State(job, network, optimiser, _key(config, dataset, content, network))
+    held_loss = state.load()
+    loss = float("nan")
+    questions = _held(held, config, job.seed)
+    while optimiser.step_count < total:
+        epoch, within = divmod(optimiser.step_count, per_epoch)
+        samples = data.draw(np.random.default_rng((job.seed, _DRAWS, epoch)))
+        order = buckets([len(each) for each in samples], config.batch, np.random.default_rng((job.seed, _ORDER, epoch)))
+        for chosen in order[within:]:
+            loss = _learn(job, network, optimiser, data, [samples[i] for i in chosen])
+            step = optimiser.step_count
+            if job.ranks.first:
+                job.run_dir.log(STAGE, step, loss=loss, lr=optimiser.lr)
+            job.progress.update(step, total, loss=loss, held_loss=held_loss)
+            if job.should_stop():
+                state.save(held_loss)
+                raise KeyboardInterrupt
+            if step % config.checkpoint_steps == 0 and step % per_epoch:
+                state.save(held_loss)
+        held_loss = mean_loss(job, network, held, questions)
+        if job.ranks.first and questions:
+            job.run_dir.log(STAGE, optimiser.step_count, held_loss=held_loss)
+        state.save(held_loss)
+    result: dict[str, Any] = {
+        "steps": total,
+        "anchors": len(data.anchors),
+        "held_anchors": len(held.anchors),
+        "loss": loss,
+        "held_loss": held_loss,
+    }
+    if job.ranks.first and held.anchors:
+        result["held_out"] = evaluate(network.language, prompts, tokens, held.anchors, config.evaluate, seed=job.seed)
+    return result
+
+
+def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence[Sample]) -> float:
+    """Equation 3 over given samples, in batches shared by the ranks; NaN where there are none."""
+    config = _config(job)
+    order = sorted(range(len(questions)), key=lambda i: (len(questions[i]), i))
+    batches = [order[at : at + config.batch] for at in range(0, len(order), config.batch)]
+    total, count = 0.0, 0
+    with torch.no_grad(), autocast(job.device, config.optim.bf16):
+        for chosen in batches[job.ranks.rank :: job.ranks.world]:
+            batch = _batch(job, network, data, [questions[i] for i in chosen])
+            total += float(row_losses(network.language, batch).sum())
+            count += len(chosen)
+    whole = job.ranks.sum(count)
+    return job.ranks.sum(total) / whole if whole else float("nan")
+
+
+def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, samples: Sequence[Sample]) -> float:
+    """One step from one global batch; returns its mean loss over all ranks."""
+    own = samples[job.ranks.rank :: job.ranks.world]
+    value = 0.0
+    if own:
+        batch = _batch(job, network, data, own)
+        with autocast(job.device, optimiser.config.bf16):
+            loss = row_losses(network.language, batch).mean()
+        loss.backward()  # type: ignore[no-untyped-call]
+        value = float(loss.detach())
+    optimiser.step(len(own))
+    return job.ranks.mean(value, len(own))
+
+
+def _batch(job: StageJob, network: TicVla, data: Samples, samples: Sequence[Sample]) -> LanguageBatch:
+    image_id = network.config.language.img_context_id
+    return collate(data.rows(samples), img_context_id=image_id, device=torch.device(job.device))
+
+
+def _held(held: Samples, config: SftConfig, seed: int) -> list[Sample]:
+    """Questions of held-out layouts, the same after every epoch, spread over all drives."""
+    rng = np.random.default_rng((seed, _HELD))
+    samples = held.draw(rng)
+    chosen = rng.permutation(len(samples))[: config.held_anchors]
+    return [samples[int(i)] for i in sorted(chosen)]
+
+
+def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
+    for drive in dataset.drives(ids, pictures=False):
+        yield from anchors_of(drive)
+
+
+def _config(job: StageJob) -> SftConfig:
+    if job.recipe.sft is None:
+        raise SftError("the recipe has no table [sft]")
+    return job.recipe.sft
+
+
+def _key(config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla) -> str:
+    """What a checkpoint must have been made with to be gone on from."""
+    made = {
+        "config": asdict(config),
+        "dataset": dataset.sha256,
+        "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
+        "network": network.config.to_dict(),
+        "vision": parts_sha256(network, ("vision",)),
+    }
+    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
+
+
+class _State:
+    """The stage's checkpoint: weights, moments, step."""
+
+    def __init__(self, job: StageJob, network: TicVla, optimiser: Optimiser, key: str) -> None:
+        self._job = job
+        self._network = network
+        self._optimiser = optimiser
+        self._key = key
+        self._path: Path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
+
+    def save(self, held_loss: float) -> None:
+        """Written by the first rank alone: all have the same."""
+        if self._job.ranks.first:
+            weights = checkpoint.with_prefix("language", self._network.language.state_dict())
+            meta = {"key": self._key, "step": self._optimiser.step_count, "held_loss": held_loss}
+            checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
+
+    def load(self) -> float:
+        """Go on if asked to and able to; gives the last held-out loss. Raises SftError for another run's."""
+        if not (self._job.resume and self._path.exists()):
+            if self._job.ranks.first:
+                self._job.run_dir.rewind(STAGE, -1)
+            return float("nan")
+        tensors, meta = checkpoint.load(self._path)
+        if meta["key"] != self._key:
+            raise SftError(f"{self._path}: of other data, another encoder or another recipe; delete it to begin anew")
+        self._network.language.load_state_dict(checkpoint.under("language", tensors))
+        self._optimiser.restore(tensors)
+        if self._job.ranks.first:
+            self._job.run_dir.rewind(STAGE, int(meta["step"]))
+        return float(meta["held_loss"])
