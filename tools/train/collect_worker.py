@@ -135,8 +135,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         path=np.array(scenario.task.path, np.float64),
         look=draw.look,
         drift=draw.drift,
-        hopeless=order.policy is not None,
-        keep_trouble=order.policy is not None,
+        pupil=order.policy is not None,
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
     expert = ExpertPolicy(margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path)

@@ -19,6 +19,7 @@ from tools.train.windows import relative
 
 Array = NDArray[np.float64]
 
+_ARRIVED_M: Final = 0.4  # of the way's end
 _STANDS_M: Final = 0.02  # a last step of this length is standing
 
 
@@ -36,6 +37,10 @@ def chosen_future(pose: SE2, choice: Choice, route: Array) -> Array:
     on_plan = wanted <= times[-1] + 1e-9
     future = np.stack([np.interp(wanted, times, known[:, axis]) for axis in range(3)], axis=1)
     future[~on_plan] = _followed(known[-2], known[-1], wanted[~on_plan] - times[-1], route)
+    # Who has arrived stands: the plan, made to drive on, would turn on the spot there.
+    arrived = np.flatnonzero(np.hypot(*(future[:, :2] - route[-1]).T) < _ARRIVED_M)
+    if len(arrived) and len(route) > 1:
+        future[arrived[0] :] = future[arrived[0]]
     return relative(here, future)
 
 
@@ -51,15 +56,11 @@ def _followed(before: Array, end: Array, later_s: Array, route: Array) -> Array:
     along = np.arange(len(route)) * SPACING_M
     marks = np.minimum(nearest * SPACING_M + later_s * ahead / STEP_S, along[-1])
     on_way = np.stack([np.interp(marks, along, route[:, axis]) for axis in range(2)], axis=1)
-    start = route[nearest]
     ways = np.diff(route, axis=0, append=2 * route[-1:] - route[-2:-1])
     turns = np.unwrap(np.arctan2(ways[:, 1], ways[:, 0]))
-    # It keeps beside the way as far as it was, and turns as the way does.
+    # It keeps beside the way as it was, and turns as the way does.
     turned = np.interp(marks, along, turns) - turns[nearest]
-    c, s = np.cos(turned), np.sin(turned)
-    off = end[:2] - start
-    moved = on_way + np.stack((c * off[0] - s * off[1], s * off[0] + c * off[1]), axis=1)
-    return np.column_stack((moved, end[2] + turned))
+    return np.column_stack((on_way + (end[:2] - route[nearest]), end[2] + turned))
 
 
 def driven_future(pose: Array, k: int, last: int) -> Array:

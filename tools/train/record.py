@@ -74,8 +74,9 @@ class _Frames:
 class DrivePlan:
     """What is driven: the episode in its scene, and how it is looked at.
 
-    `path` [n, 2]: the told way, m; with `hopeless`, a drive is cut that strays 6 m from it, or that stays where it is
-    for 15 s. `keep_trouble`: a drive that collides is kept as it is, and not only up to there.
+    `path` [n, 2]: the told way, m. With `pupil` a policy drives: what goes wrong is kept, as there is something to
+    learn from it, until it has gone 6 m from the way or has stayed where it is for 15 s. The expert's drives are kept
+    up to their trouble, and none that goes further than `off_m` from the way: it would not be what the words say.
     """
 
     episode: Episode
@@ -83,8 +84,8 @@ class DrivePlan:
     path: NDArray[np.float64]
     look: Look
     drift: str
-    hopeless: bool = False
-    keep_trouble: bool = False
+    pupil: bool = False
+    off_m: float = 4.0
 
 
 def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded:
@@ -108,7 +109,7 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
                 world.step(command)
                 if first_collision is None and world.collided:
                     first_collision = len(frames.pose)
-                if plan.hopeless and not world.done and is_hopeless(np.array(frames.pose), plan.path):
+                if plan.pupil and not world.done and is_hopeless(np.array(frames.pose), plan.path):
                     world.stop()
         finally:
             expert.close()
@@ -164,12 +165,14 @@ def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
 
 
 def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None) -> Recorded:
-    count = kept_frames(np.array(frames.pose), outcome, None if plan.keep_trouble else first_collision)
+    count = kept_frames(np.array(frames.pose), outcome, None if plan.pupil else first_collision)
     if count < LEAST_FRAMES:
-        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before it {outcome}")
+        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before trouble ({outcome})")
+    if not plan.pupil and max(off_way_m(point, plan.path) for point in np.array(frames.pose)[:count, :2]) > plan.off_m:
+        raise NothingToLearnError("it left the way that it was told")
     pose, by = np.array(frames.pose)[:count], np.array(frames.by, np.uint8)[:count]
     whole = outcome == "reached" and count == len(frames.pose)
-    future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.keep_trouble)
+    future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.pupil)
     jpegs = frames.jpegs[:count]
     arrays = {
         "jpeg": np.concatenate(jpegs),
