@@ -143,7 +143,7 @@ def test_the_demos_corridor_is_itself_for_even_seeds_and_rearranged_for_odd_ones
 
 
 def test_the_same_seed_gives_the_same_scenarios_whichever_of_them_are_drawn() -> None:
-    kinds = {"office": 1.0}
+    kinds = {CORRIDOR: 1.0}
     together = [s.episode for s in training_episodes(SEED, 3, kinds, tasks_per_scene=2)]
     alone = [s.episode for s in training_episodes(SEED, 1, kinds, start=2, tasks_per_scene=2)]
     assert together[2:] == alone

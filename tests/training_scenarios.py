@@ -8,12 +8,12 @@ from tools.train.scenarios import Scenario, scenario_group
 from tools.train.sites import KINDS
 
 SEED = 5
-EACH = 3
+EACH = 2
 
 
 @cache
 def scenarios(kind: str) -> tuple[Scenario, ...]:
-    """Three of one kind, all of one layout as a rule."""
+    """Two of one kind, all of one layout as a rule."""
     return tuple(scenario_group(SEED, KINDS.index(kind), {kind: 1.0}, EACH))
 
 

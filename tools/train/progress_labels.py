@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 _SPACING_M: Final = 0.1
 _TURNED_M: Final = 1.0  # whoever is still in the corridor that a turn leaves has not turned until so far beyond it
+_BEYOND_M: Final = 0.3
+_ASIDE_M: Final = 2.0  # to the side of where one should have turned, in the corridor's going on
 
 
 class RouteProgress:
@@ -43,7 +45,7 @@ class RouteProgress:
         self._grid = scenario.site.grid
         self._nearest, self._gap_m = _nearest_points(self._grid, self._points)
         self._at = [self._index_near(step.at) for step in self._steps]
-        self._areas = [self._area_labels(i) for i in range(len(self._steps))]
+        self._areas = [self._area_labels(i) for i in range(len(self._steps) + 1)]
 
     @property
     def length_m(self) -> float:
@@ -89,6 +91,8 @@ class RouteProgress:
         """Index of the step that is next; their number on the last leg."""
         place = self._place(pose)
         index = sum(place >= at for at in self._at)
+        if index and self._overshot(index - 1, pose):
+            return index - 1
         if index and (place - self._at[index - 1]) * _SPACING_M < _TURNED_M:
             step = self._steps[index - 1]
             area = self._scene.area_at(pose.x_m, pose.y_m)
@@ -97,6 +101,17 @@ class RouteProgress:
                 index -= 1
         return index
 
+    def _overshot(self, index: int, pose: SE2) -> bool:
+        """Whether one went straight on past a turn, across the corridor that it leads into."""
+        step = self._steps[index]
+        if not step.counted:
+            return False
+        frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
+        area = self._scene.area_at(*xy)
+        beyond = frame.along(xy) > step.counted[step.ordinal - 1].high_m + _BEYOND_M
+        aside_m = abs(frame.across(xy) - frame.across(step.at))
+        return beyond and aside_m < _ASIDE_M and area is not None and area.label not in self._areas[index + 1]
+
     def _passed(self, index: int, pose: SE2) -> int:
         step = self._steps[index]
         if not step.counted:
@@ -104,7 +119,7 @@ class RouteProgress:
         frame = Frame(step.ahead)
         area = self._scene.area_at(pose.x_m, pose.y_m)
         # Beside the corridor (in a room, say) what counts is where one came out of it.
-        on_leg = area is not None and area.label in self._areas[index]
+        on_leg = area is not None and (area.label in self._areas[index] or self._overshot(index, pose))
         point = (pose.x_m, pose.y_m) if on_leg else tuple(self._points[self._place(pose)])
         here = frame.along((float(point[0]), float(point[1])))
         return sum(
@@ -127,9 +142,10 @@ class RouteProgress:
         return area.label if area is not None else ""
 
     def _area_labels(self, index: int) -> frozenset[str]:
-        """Areas that the way leads through up to a step from the one before."""
+        """Areas that the way leads through up to a step, or to the goal, from the step before."""
         first = self._at[index - 1] if index else 0
-        found = (self._scene.area_at(float(x), float(y)) for x, y in self._points[first : self._at[index]])
+        last = self._at[index] if index < len(self._steps) else len(self._points)
+        found = (self._scene.area_at(float(x), float(y)) for x, y in self._points[first:last])
         return frozenset(area.label for area in found if area is not None)
 
 

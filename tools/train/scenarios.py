@@ -181,8 +181,7 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
         except RouteError as error:
             why = str(error)
             continue
-        shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
-        if not isfinite(shortest_m) or not _wanted(site, task, rng):
+        if not _wanted(site, task, rng):
             why = "it was not wanted"
             continue
         try:
@@ -192,6 +191,10 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
             continue
         if any(untrue(text, task.told) for text in texts):
             why = "a wording is not true of it"
+            continue
+        shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
+        if not isfinite(shortest_m):
+            why = f"the {robot} cannot get there"
             continue
         return Scenario(_episode(site, task, tuple(texts), robot, people, seed, number, shortest_m), task, site)
     raise RouteError(f"{site.scene.name}: no task found in {_DRAWS} draws; the last: {why}")
