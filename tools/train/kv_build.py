@@ -101,8 +101,9 @@ def build_kv_cache(
     ranks.barrier()
     cache = KvCache(place)
     wanted = set(dataset.ids if ids is None else ids)
-    missing = [entry for entry in dataset.entries if entry.id in wanted and not cache.has(entry.id, entry.sha256)]
-    own = missing[ranks.rank :: ranks.world]
+    entries = [entry for entry in dataset.entries if entry.id in wanted]
+    # By place in the whole list: what is missing changes while the others work.
+    own = [entry for entry in entries[ranks.rank :: ranks.world] if not cache.has(entry.id, entry.sha256)]
     prompts = Prompts(Tokenizer.from_buffer(tokenizer), network.config)
     for done, entry in enumerate(own, 1):
         anchors = anchors_of(dataset.load(entry.id, pictures=False), config.every)
