@@ -156,7 +156,7 @@ def test_a_plan_with_the_measured_target_has_the_measured_energies(artifacts_dir
     manifest = read_manifest(artifacts_dir)
     target = parse_target(manifest["provenance"]["target"], "cpu")
     fit, ran = fit_energy(phases()), phases()
-    lengths = {"prompt": 198, "new": 48, **stage_ms(ran)}
+    lengths = {"prompt": 168, "new": 48, **stage_ms(ran)}
     points = [
         measured_point(target, manifest, artifacts, stage, lengths, machine="m", date="d", energy_j=TRUE_J[stage])
         for stage in STAGES
