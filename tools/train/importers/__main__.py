@@ -1,0 +1,76 @@
+"""`python -m tools.train.importers`: recordings of real robots into a data set that the training stages read."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
+from tools.train.dataset import DatasetWriter
+from tools.train.drive import DriveError, Entry
+from tools.train.importers import gnd, scand
+from tools.train.importers.cut import drives
+from tools.train.importers.recording import ImportedError
+
+LAYOUTS: Final[Mapping[str, ModuleType]] = {scand.KIND: scand, gnd.KIND: gnd}
+
+EXAMPLES = """examples:
+  python -m tools.train.importers scand extracted/scand --robot jackal --out data/real
+  python -m tools.train.importers gnd extracted/gnd --robot jackal --out data/real --json -
+
+exit codes: 0 done, 2 bad input, 130 interrupted
+"""
+
+
+def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, Any]:
+    """Every recording below `root` into the data set `out`; those that are there already stay. Returns counts.
+
+    Raises ImportedError, DriveError, OSError.
+    """
+    module = LAYOUTS[layout]
+    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and module.is_recording(folder))
+    if not folders:
+        raise ImportedError(f"{root}: holds no recording of {layout}; its folders are described in {module.__name__}")
+    with DatasetWriter(out) as writer:
+        for folder in folders:
+            for drive in drives(module.read(folder), layout, robot):
+                if not writer.has(drive.id):
+                    path = writer.path(drive.id)
+                    drive.save(path)
+                    writer.add(Entry.of(drive, path))
+        return {"recordings": len(folders), **writer.summary(f"{layout}-"), "sha256": writer.finish().sha256}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.train.importers",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("layout", choices=sorted(LAYOUTS), help="how the recordings lie there")
+    parser.add_argument("root", type=Path, metavar="DIR", help="folder that holds a folder for each recording")
+    parser.add_argument("--robot", default="unknown", metavar="NAME", help="whose recordings these are")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the data set, new or to be added to")
+    parser.add_argument("--json", metavar="FILE", help="write counts as JSON to FILE, or to standard output for -")
+    args = parser.parse_args(argv)
+    try:
+        check_result_target(args.json)
+        result = import_folder(args.root, args.layout, args.robot, args.out)
+        write_result(args.json, result)
+    except (ImportedError, DriveError, OSError) as error:
+        sys.stderr.write(f"importers: {error}\n")
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    sys.stderr.write(f"importers: {result['drives']} episodes of 20 s from {result['recordings']} recordings\n")
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""From a recording to drives: 10 Hz, cut into episodes of 20 s, futures in the robot's frame (paper appendix B)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+from zlib import crc32
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.train.drive import (
+    EXPERT,
+    FUTURE_STEPS,
+    PICTURE_PX,
+    PLAN_TIMES_S,
+    RATE_HZ,
+    TRACE_EVERY,
+    About,
+    Drive,
+)
+from tools.train.futures import driven_future
+from tools.train.importers.recording import ImportedError, Recording, Words, read_picture
+from tools.train.windows import EPISODE_S, relative
+
+Array = NDArray[np.float64]
+
+FRAMES: Final = round(EPISODE_S * RATE_HZ)
+PICTURE_GAP_S: Final = 0.25  # an instant without a picture so new lies in a hole of the recording
+POSE_GAP_S: Final = 0.25  # and so does one between two poses further apart than this
+QUALITY: Final = 90
+THRESHOLD_M: Final = 1.5
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Part of a recording without holes, at 10 Hz: for each instant its newest picture [n], its pose [n, 3] and the
+    velocity since the instant before [n, 3]."""
+
+    picture: NDArray[np.int64]
+    pose: Array
+    state: Array
+
+
+def pieces(recording: Recording) -> list[Piece]:
+    """The recording at 10 Hz, cut at its holes. No instant is given a picture that was taken after it."""
+    stamps, poses = recording.stamps_s, recording.poses
+    start, end = max(stamps[0], poses[0, 0]), min(stamps[-1], poses[-1, 0])
+    times = start + np.arange(max(0, int(np.floor((end - start) * RATE_HZ + 1e-6)) + 1)) / RATE_HZ
+    picture = np.searchsorted(stamps, times + 1e-6, side="right") - 1
+    after = np.clip(np.searchsorted(poses[:, 0], times), 1, len(poses) - 1)
+    whole = (times - stamps[picture] <= PICTURE_GAP_S) & (poses[after, 0] - poses[after - 1, 0] <= POSE_GAP_S)
+    heading = np.unwrap(poses[:, 3])
+    columns = [np.interp(times, poses[:, 0], column) for column in (poses[:, 1], poses[:, 2], heading)]
+    pose = np.stack(columns, axis=1)
+    pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    edges = np.flatnonzero(np.diff(np.concatenate(((False,), whole, (False,))).astype(np.int8)))
+    return [
+        Piece(picture[a:b], pose[a:b], _states(pose[a:b]))
+        for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+    ]
+
+
+def _states(pose: Array) -> Array:
+    """[n, 3] body velocity over the tenth of a second before each instant: nothing of what comes after it."""
+    states = np.zeros((len(pose), 3))
+    for k in range(1, len(pose)):
+        states[k] = relative(pose[k - 1], pose[k])[0] * RATE_HZ
+    return states
+
+
+def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
+    """Episodes of 20 s, one after the other; what is shorter, before a hole or at the end, is left out.
+
+    Raises ImportedError for a picture that cannot be read and for words of an episode that there is not.
+    """
+    parts = [(piece, k) for piece in pieces(recording) for k in range(0, len(piece.pose) - FRAMES + 1, FRAMES)]
+    if unknown := sorted(set(recording.words) - set(range(len(parts)))):
+        raise ImportedError(f"recording {recording.name}: words for episode {unknown[0]}, of {len(parts)} from 0 on")
+    for number, (piece, start) in enumerate(parts):
+        words = recording.words.get(number, Words())
+        if words.traces and len(words.traces) != FRAMES // TRACE_EVERY:
+            raise ImportedError(
+                f"recording {recording.name}: episode {number}: expected {FRAMES // TRACE_EVERY} traces, one a second, "
+                f"found {len(words.traces)}"
+            )
+        yield _drive(recording, kind, robot, number, piece, start, words)
+
+
+def _drive(
+    recording: Recording, kind: str, robot: str, number: int, piece: Piece, start: int, words: Words
+) -> Drive:  # fmt: skip
+    span = slice(start, start + FRAMES)
+    last = len(piece.pose) - 1
+    future = np.zeros((FRAMES, FUTURE_STEPS, 3), np.float32)
+    steps = np.zeros(FRAMES, np.int16)
+    plan = np.zeros((FRAMES, len(PLAN_TIMES_S), 2), np.float32)
+    ahead = np.array([round(time_s * RATE_HZ) for time_s in PLAN_TIMES_S])
+    for k in range(FRAMES):
+        here = start + k
+        known = driven_future(piece.pose, here, last)
+        steps[k] = len(known)
+        future[k, : len(known)] = known
+        future[k, len(known) :] = known[-1] if len(known) else 0.0
+        plan[k] = relative(piece.pose[here], piece.pose[np.minimum(here + ahead, last)])[:, :2]
+    jpegs = [_jpeg(recording, int(index)) for index in piece.picture[span]]
+    goal = piece.pose[start + FRAMES - 1]
+    about = About(
+        id=f"{kind}-{recording.name}-{number:04d}",
+        kind=kind,
+        layout_seed=crc32(recording.name.encode()),
+        scene=recording.name,
+        robot=robot,
+        people=0,
+        seed=0,
+        driver="imported",
+        drift="none",
+        goal_xy=(float(goal[0]), float(goal[1])),
+        threshold_m=THRESHOLD_M,
+        outcome="imported",
+        collided=False,
+        wordings=words.wordings,
+        told=(),
+        traces=tuple({"k": TRACE_EVERY * i, **trace} for i, trace in enumerate(words.traces)),
+    )
+    return Drive(
+        about=about,
+        jpeg=np.concatenate(jpegs),
+        jpeg_end=np.cumsum([len(jpeg) for jpeg in jpegs]).astype(np.int64),
+        pose=piece.pose[span].copy(),
+        pose_odom=piece.pose[span].copy(),
+        state=piece.state[span].astype(np.float32),
+        future=future,
+        future_steps=steps,
+        plan_xy=plan,
+        by=np.full(FRAMES, EXPERT, np.uint8),
+    )
+
+
+def _jpeg(recording: Recording, index: int) -> NDArray[np.uint8]:
+    """The whole picture, squeezed to 128 x 128 as the robot's own camera's are."""
+    picture = read_picture(recording.pictures[index])
+    small = cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
+    done, jpeg = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not done:
+        raise ImportedError(f"{recording.pictures[index]}: could not be compressed")
+    return np.asarray(jpeg, np.uint8).ravel()

@@ -1,0 +1,76 @@
+"""GND (Liang et al. 2025) as we read it: its bags extracted to one folder a recording, poses of its lidar map.
+
+RECORDING/recording.json      {"frames": [{"stamp_s", "file"}], "poses": [{"stamp_s", "position_m", "quaternion_xyzw"}]}
+RECORDING/…                   the pictures that it names, JPEG or PNG, by paths below the recording's folder
+RECORDING/texts.json          optional, see `tools.train.importers.recording`
+
+Poses are in three dimensions; what is kept is where the robot is on the ground and which way its x axis points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import atan2
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+
+from tools.train.importers.recording import ImportedError, Recording, read_json, read_words
+
+KIND: Final = "gnd"
+TABLE: Final = "recording.json"
+_UNIT: Final = 0.01  # so far from length 1 a quaternion may be
+
+
+def is_recording(folder: Path) -> bool:
+    """Whether a folder looks like one of these."""
+    return (folder / TABLE).is_file()
+
+
+def read(folder: Path) -> Recording:
+    """One recording. Raises ImportedError."""
+    path = folder / TABLE
+    content = read_json(path)
+    try:
+        if set(content) != {"frames", "poses"}:
+            raise ImportedError(f"{path}: expected the keys frames and poses, found {sorted(content)}")
+        frames = sorted((_number(each["stamp_s"]), _below(folder, each["file"])) for each in content["frames"])
+        poses = sorted(_pose(path, each) for each in content["poses"])
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, ImportedError):
+            raise
+        raise ImportedError(f"{path}: a frame or pose lacks or misshapes a key ({error!r})") from error
+    if not frames or not poses:
+        raise ImportedError(f"{path}: expected frames and poses")
+    first_s = min(frames[0][0], poses[0][0])
+    return Recording(
+        name=folder.name,
+        stamps_s=np.array([stamp_s - first_s for stamp_s, _ in frames]),
+        pictures=tuple(picture for _, picture in frames),
+        poses=np.array([(stamp_s - first_s, *pose) for stamp_s, *pose in poses], np.float64),
+        words=read_words(folder),
+    )
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"expected a number, found {value!r}")
+    return float(value)
+
+
+def _below(folder: Path, name: str) -> Path:
+    """A file of the recording; nothing outside of it."""
+    plain = PurePosixPath(name)
+    if plain.is_absolute() or ".." in plain.parts:
+        raise ImportedError(f"{folder / TABLE}: {name!r} is not a path below the recording")
+    return folder / plain
+
+
+def _pose(path: Path, table: Mapping[str, Any]) -> tuple[float, float, float, float]:
+    x, y, _ = (_number(value) for value in table["position_m"])
+    qx, qy, qz, qw = (_number(value) for value in table["quaternion_xyzw"])
+    if abs(qx * qx + qy * qy + qz * qz + qw * qw - 1.0) > _UNIT:
+        raise ImportedError(f"{path}: expected quaternions of length 1, found {[qx, qy, qz, qw]}")
+    heading = atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return (_number(table["stamp_s"]), x, y, heading)

@@ -1,0 +1,118 @@
+"""A real robot's recording, whatever files it came in: when each picture was taken, where the robot was, and words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.jpeg import MAX_BYTES, jpeg_refusal
+
+TEXTS: Final = "texts.json"
+MAX_TABLE_BYTES: Final = 200_000_000
+_TRACE_KEYS: Final = frozenset(("situation", "objects", "motion", "progress", "plan"))
+_JPEG = (".jpg", ".jpeg")
+
+
+class ImportedError(ValueError):
+    """A recording that cannot be read; one line: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """What somebody has written about one episode of 20 s: instructions that say the same, one trace a second."""
+
+    wordings: tuple[str, ...] = ()
+    traces: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """`stamps_s` [p] and `pictures` [p] in order of time; `poses` [n, 4]: stamp s, x m, y m, theta rad, likewise.
+
+    `words`: by number of the episode that is cut out of it.
+    """
+
+    name: str
+    stamps_s: NDArray[np.float64]
+    pictures: tuple[Path, ...]
+    poses: NDArray[np.float64]
+    words: Mapping[int, Words]
+
+    def __post_init__(self) -> None:
+        what = f"recording {self.name}"
+        if self.stamps_s.shape != (len(self.pictures),) or self.poses.ndim != 2 or self.poses.shape[1] != 4:
+            raise ImportedError(f"{what}: expected a stamp a picture and poses [n, 4]")
+        if len(self.pictures) < 2 or len(self.poses) < 2:
+            raise ImportedError(f"{what}: expected two pictures and two poses or more")
+        if not (np.isfinite(self.stamps_s).all() and np.isfinite(self.poses).all()):
+            raise ImportedError(f"{what}: a stamp or pose is not finite")
+        if np.any(np.diff(self.stamps_s) <= 0) or np.any(np.diff(self.poses[:, 0]) <= 0):
+            raise ImportedError(f"{what}: expected stamps that grow, of pictures and of poses")
+
+
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """uint8 RGB [height, width, 3] of a JPEG or PNG. Raises ImportedError."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ImportedError(f"{path}: more than {MAX_BYTES} bytes, which is no picture of a robot")
+        data = path.read_bytes()
+    except OSError as error:
+        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+    if path.suffix.lower() in _JPEG and (why := jpeg_refusal(data)) is not None:
+        raise ImportedError(f"{path}: {why}")
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise ImportedError(f"{path}: expected a picture, found something else")
+    return np.asarray(picture[..., ::-1], np.uint8)
+
+
+def read_json(path: Path) -> Any:
+    """A JSON file's content. Raises ImportedError."""
+    try:
+        if path.stat().st_size > MAX_TABLE_BYTES:
+            raise ImportedError(f"{path}: more than {MAX_TABLE_BYTES} bytes")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, ImportedError):
+            raise
+        raise ImportedError(f"{path}: not JSON ({error})") from error
+
+
+def read_words(folder: Path) -> dict[int, Words]:
+    """`texts.json` of a recording, if it has one: `{"0": {"wordings": [texts], "traces": [20 tables]}, …}` by episode.
+
+    `traces` may be left out; a trace is {situation, objects, motion, progress {step, steps, passed}, plan}.
+    """
+    path = folder / TEXTS
+    if not path.exists():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, Mapping):
+        raise ImportedError(f"{path}: expected a table by number of the episode")
+    return {_number(path, key): _words(f"{path}: {key}", value) for key, value in content.items()}
+
+
+def _number(path: Path, key: str) -> int:
+    if not (key.isascii() and key.isdigit()):
+        raise ImportedError(f"{path}: expected the number of an episode, found {key!r}")
+    return int(key)
+
+
+def _words(where: str, value: object) -> Words:
+    if not isinstance(value, Mapping) or not {"wordings"} <= set(value) <= {"wordings", "traces"}:
+        raise ImportedError(f"{where}: expected wordings and traces")
+    wordings, traces = value["wordings"], value.get("traces", [])
+    if not isinstance(wordings, list) or not all(isinstance(text, str) and text.strip() for text in wordings):
+        raise ImportedError(f"{where}: expected wordings to be a list of texts")
+    if not isinstance(traces, list) or not all(isinstance(t, Mapping) and set(t) == _TRACE_KEYS for t in traces):
+        raise ImportedError(f"{where}: expected each trace to have {', '.join(sorted(_TRACE_KEYS))}")
+    return Words(tuple(wordings), tuple(dict(trace) for trace in traces))

@@ -1,0 +1,67 @@
+"""SCAND (Karnan et al. 2022) as we read it: its bags extracted to one folder a recording.
+
+RECORDING/image/STAMP.jpg     front camera, STAMP in whole nanoseconds; .jpeg and .png are read as well
+RECORDING/odometry.csv        columns stamp_ns, x_m, y_m, theta_rad (in any order, others are left alone)
+RECORDING/texts.json          optional, see `tools.train.importers.recording`
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from tools.train.importers.recording import ImportedError, Recording, read_words
+
+KIND: Final = "scand"
+PICTURES, POSES = "image", "odometry.csv"
+_COLUMNS: Final = ("stamp_ns", "x_m", "y_m", "theta_rad")
+_SUFFIXES: Final = (".jpg", ".jpeg", ".png")
+
+
+def is_recording(folder: Path) -> bool:
+    """Whether a folder looks like one of these."""
+    return (folder / PICTURES).is_dir() and (folder / POSES).is_file()
+
+
+def read(folder: Path) -> Recording:
+    """One recording. Raises ImportedError."""
+    pictures = sorted((_stamp(path), path) for path in (folder / PICTURES).iterdir() if path.suffix in _SUFFIXES)
+    rows = _rows(folder / POSES)
+    if not pictures or not rows:
+        raise ImportedError(f"{folder}: expected pictures in {PICTURES}/ and rows in {POSES}")
+    # Whole nanoseconds are subtracted before they become floats, which could not hold them.
+    first_ns = min(pictures[0][0], rows[0][0])
+    return Recording(
+        name=folder.name,
+        stamps_s=np.array([(stamp_ns - first_ns) / 1e9 for stamp_ns, _ in pictures]),
+        pictures=tuple(path for _, path in pictures),
+        poses=np.array([((stamp_ns - first_ns) / 1e9, *pose) for stamp_ns, *pose in rows], np.float64),
+        words=read_words(folder),
+    )
+
+
+def _stamp(path: Path) -> int:
+    if not (path.stem.isascii() and path.stem.isdigit()):
+        raise ImportedError(f"{path}: expected a name in whole nanoseconds, such as 1636492800123456789.jpg")
+    return int(path.stem)
+
+
+def _rows(path: Path) -> list[tuple[int, float, float, float]]:
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            table = csv.DictReader(file)
+            if missing := [name for name in _COLUMNS if name not in (table.fieldnames or ())]:
+                raise ImportedError(f"{path}: column {missing[0]} is missing; expected {', '.join(_COLUMNS)}")
+            rows = [
+                (int(row["stamp_ns"]), float(row["x_m"]), float(row["y_m"]), float(row["theta_rad"])) for row in table
+            ]
+    except OSError as error:
+        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, TypeError, csv.Error) as error:
+        if isinstance(error, ImportedError):
+            raise
+        raise ImportedError(f"{path}: a row is not of numbers ({error})") from error
+    return sorted(rows)
