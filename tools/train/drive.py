@@ -210,8 +210,10 @@ def _about(path: Path, text: str) -> About:
         x, y = content["goal_xy"]
         tuples = {key: tuple(content[key]) for key in ("wordings", "told", "traces")}
         return About(**{**content, **tuples, "goal_xy": (float(x), float(y))})
+    except DriveError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise error if isinstance(error, DriveError) else DriveError(f"{path}: its header is not of a drive") from error
+        raise DriveError(f"{path}: its header is not of a drive") from error
 
 
 @dataclass(frozen=True)
@@ -255,9 +257,9 @@ class Dataset:
             if content["format"] != FORMAT:
                 raise DriveError(f"{path}: expected format {FORMAT}; collect again")
             entries = tuple(Entry(**entry) for entry in content["drives"])
+        except DriveError:
+            raise
         except (OSError, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, DriveError):
-                raise
             raise DriveError(f"{path}: not the index of a data set ({error!r}); make one with collect") from error
         dataset = Dataset(folder, tuple(sorted(entries, key=lambda entry: entry.id)))
         if verify:
