@@ -29,6 +29,7 @@ from tools.train.drive import Dataset, Drive, Entry
 from tools.train.job import QuietProgress, StageProgress
 
 FORMAT: Final = 1
+FOLDER: Final = "tokens"
 _MAX_OPEN: Final = 256  # a mapped file takes one of a process's descriptors, of which there may be 1024
 Halves = NDArray[np.float16]
 
@@ -47,12 +48,12 @@ def encoder_sha256(vision: VisionEncoder) -> str:
 
 
 class TokenCache:
-    """Tokens of a data set's drives as one encoder sees them, in a folder of their own under `folder`."""
+    """Tokens of a data set's drives as one encoder sees them, in a folder of their own under `tokens/`."""
 
-    def __init__(self, folder: Path, dataset: Dataset, vision: VisionEncoder) -> None:
-        """Opens what is there and makes nothing; `build` encodes what is missing."""
+    def __init__(self, dataset: Dataset, vision: VisionEncoder, folder: Path | None = None) -> None:
+        """Opens what is there and makes nothing; `build` encodes what is missing. `folder` stands in for `tokens/`."""
         self.key = encoder_sha256(vision)
-        self.folder = folder / self.key[:16]
+        self.folder = (dataset.folder / FOLDER if folder is None else folder) / self.key[:16]
         self.shape = (vision.config.tokens, vision.config.token_dim)
         """Of one frame's tokens."""
         self._dataset, self._vision = dataset, vision
