@@ -16,7 +16,10 @@ from edge.controller import Controller, ControllerConfig, ControllerInputs
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
+from edge.path_memory import way_of
 from edge.policy import Policy
+from edge.prompt import told_before
+from edge.reasoning_text import Progress
 from edge.recorder import Recorder
 from edge.replay import main
 from edge.ring import EncodedFrame
@@ -95,22 +98,25 @@ def drive(artifacts: Artifacts) -> list[Record]:
         }
         records.append(("/tick", start_ns, payload))
         if tick % THINK_TICKS == THINK_TICKS - 1:
-            states.append(think(policy, language, frames[tick - THINK_TICKS + 1 :: -6][::-1], len(states)))
+            states.append(think(policy, language, frames[: tick - THINK_TICKS + 2], len(states)))
             records.append(semantic_record(states[-1], frames, start_ns + 50_000_000))
     return records
 
 
-def think(policy: Policy, language: LanguageModel, seen: list[EncodedFrame], number: int) -> SemanticState:
-    generation = language.generate(
-        language.prompt.build(seen, INSTRUCTION), max_new_tokens=6 + number, cancelled=lambda: False
-    )
+def think(policy: Policy, language: LanguageModel, frames: list[EncodedFrame], number: int) -> SemanticState:
+    seen, before = frames[::-6][::-1], Progress(1, 3, number) if number else None
+    way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
+    prompt = language.prompt.build(seen, INSTRUCTION, way, before)
+    generation = language.generate(prompt, max_new_tokens=6 + number, cancelled=lambda: False)
     context = policy.semantic_context(generation.last_layer_kv)
     anchor, kv = seen[-1], generation.last_layer_kv
+    TOLD[number] = {"way": way, "before": told_before(before)}
     THOUGHTS[number] = [frame.stamp_ns for frame in seen], generation.new_tokens
     return SemanticState(number, anchor.stamp_ns, anchor.T_odom_base, 0, kv, context, generation.text, None)
 
 
 THOUGHTS: dict[int, tuple[list[int], int]] = {}
+TOLD: dict[int, dict[str, Any]] = {}
 
 
 def semantic_record(state: SemanticState, frames: list[EncodedFrame], ready_ns: int) -> Record:
@@ -124,6 +130,7 @@ def semantic_record(state: SemanticState, frames: list[EncodedFrame], ready_ns: 
         "ready_ns": ready_ns,
         "frames_ns": stamps,
         "frame_poses": [poses[stamp_ns] for stamp_ns in stamps],
+        **TOLD[state.generation],
         "max_new_tokens": 6 + state.generation,
         "new_tokens": new_tokens,
         "text": state.text,
@@ -225,6 +232,15 @@ def test_another_instruction_is_another_prompt(log: Log) -> None:
     assert log.replay()[0] == 1
 
 
+@pytest.mark.parametrize(
+    "told", [{"way": [[-9.0, 3.0]]}, {"before": "last leg of 3, passed 0."}], ids=["way", "before"]
+)
+def test_what_the_prompt_told_of_the_way_and_progress_is_told_again(log: Log, told: dict[str, Any]) -> None:
+    log.payload("/semantic", 1).update(told)
+    code, result = log.replay("--tolerance-cm", "0")
+    assert code == 1 and result["ticks"]["equal"] < result["ticks"]["compared"]
+
+
 def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
     lost_ns = log.payload("/tick", 20)["frame_ns"]
     log.drop(lambda topic, stamp_ns, _: topic == "/camera" and stamp_ns == lost_ns)
@@ -269,8 +285,9 @@ def test_records_of_two_threads_may_lie_in_the_file_the_other_way_round(log: Log
 def test_without_the_frames_poses_past_motion_is_told_from_the_ticks(log: Log) -> None:
     for index in range(3):
         del log.payload("/semantic", index)["frame_poses"]
+        del log.payload("/semantic", index)["way"]
     _, result = log.replay()
-    assert result["generations"]["poses_interpolated"] == 3
+    assert result["generations"]["poses_interpolated"] == result["generations"]["ways_from_frames"] == 3
 
 
 def test_without_limits_commands_are_not_compared(log: Log) -> None:
@@ -316,6 +333,8 @@ def test_the_table_says_the_same_as_the_json(log: Log, capsys: pytest.CaptureFix
         (lambda log: log.payload("/tick", 20).pop("offset"), "a /tick record lacks"),
         (lambda log: log.payload("/tick", 20).update(state=[1]), "a /tick record lacks"),
         (lambda log: log.payload("/semantic", 0).update(frames_ns=[]), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(way=[[1.0]]), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(before="turn 9 of 3, passed 0."), "a /semantic record lacks"),
         (lambda log: log.payload("/run", 0).update(limits={"vx_max_mps": 1}), "a /run record lacks"),
         (lambda log: log.path.write_bytes(b"notes"), "not an MCAP file"),
     ],
