@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from safetensors import SafetensorError, safe_open
 
+from export.checkpoint.load import load_checkpoint
 from export.model.config import ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
 from tools.train.job import StageJob
 
-ORDER: Final = ("encoder", "sft", "imitate", "rl")
-"""Stages that change weights, in the order in which `all` runs them."""
+START: Final = "start"
+"""Folder of weights that were there before the first stage."""
+ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
+"""Where weights come from, in the order in which they do."""
 FILE: Final = "model.safetensors"
 SHARED: Final = ("vision", "language")
 """What ablations of the action expert have in common."""
@@ -32,9 +36,17 @@ def stage_weights(out: Path, stage: str) -> Path:
 
 
 def weights_before(out: Path, stage: str) -> Path | None:
-    """The newest weights of the stages before `stage`; None where none of them has finished."""
+    """The newest weights of what comes before `stage`; None where there are none."""
     earlier = ORDER[: ORDER.index(stage)] if stage in ORDER else ORDER
     return next((path for name in reversed(earlier) if (path := stage_weights(out, name)).is_file()), None)
+
+
+def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], seed: int) -> Path:
+    """Begin a run with somebody's weights; an action expert that they lack is of the seed. Raises CheckpointError."""
+    path = stage_weights(out, START)
+    loaded = load_checkpoint(checkpoints, config, fill_seed=seed)
+    save_weights(loaded.model, path, WeightsInfo(trained=loaded.info.trained, origin=loaded.info.origin))
+    return path
 
 
 def start_network(job: StageJob, stage: str) -> TicVla:

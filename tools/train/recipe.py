@@ -9,6 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+from zlib import crc32
+
+import numpy as np
 
 from calib.toml_text import toml_text
 from export.model.config import ModelConfigError, TicVlaConfig
@@ -143,6 +146,11 @@ def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recip
     if not isinstance(name, str) or type(seed) is not int:
         raise RecipeError(f"expected name, a text, and seed, a whole number; found {name!r} and {seed!r}")
     return Recipe(name, seed, model, **stages)
+
+
+def stage_seed(recipe: Recipe, stage: str) -> int:
+    """The seed of a stage's job: of the run's seed, another one for every stage."""
+    return int(np.random.default_rng((recipe.seed, crc32(stage.encode()))).integers(2**31))
 
 
 def stage_config(name: str) -> type:

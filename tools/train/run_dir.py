@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
 from edge.cli import write_whole
-from tools.train.recipe import Recipe
+from tools.train.recipe import STAGES, Recipe, load_recipe
 
+VERSIONS: Final = "versions.json"
+SHARED_PARTS: Final = ("vision", "language")
+"""Of the network: what another run's encoder and language model are used in."""
 PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "tokenizers", "panda3d", "pybullet")
 """Whose versions decide what a run gives."""
 
@@ -28,26 +31,70 @@ class RunDir:
         self.out = out
 
     @staticmethod
-    def open(out: Path, recipe: Recipe, *, resume: bool) -> RunDir:
-        """Make the folder, or continue the run in it; raises RunDirError if it holds another run.
+    def open(out: Path, recipe: Recipe) -> RunDir:
+        """Make the folder, or go on with the run in it; raises RunDirError if it holds another run.
 
-        Stages of one run may be started one by one: the folder of the same recipe is always welcome. `resume` decides
-        whether a stage that was begun goes on; it is looked at by the stages.
+        Stages may be started one by one, and numbers of a stage that has not begun may still be changed.
         """
         run_dir = RunDir(out)
-        text = recipe.to_toml()
         if run_dir.recipe_path.exists():
-            if run_dir.recipe_path.read_text(encoding="utf-8") != text:
-                raise RunDirError(f"{out}: holds a run of another recipe; name another --out, or use its recipe.toml")
-        elif resume:
-            raise RunDirError(f"{out}: holds no run to resume; leave out --resume, or name its folder")
+            if changed := run_dir._changed(recipe):
+                raise RunDirError(
+                    f"{out}: was begun with other numbers ({changed}); name another --out, or leave them as they were"
+                )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise RunDirError(f"{out}: expected a new or empty directory, or one that edge-train has made")
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            write_whole(run_dir.out / "versions.json", json.dumps(versions(), indent=1) + "\n")
-            write_whole(run_dir.recipe_path, text)
+        out.mkdir(parents=True, exist_ok=True)
+        if not (out / VERSIONS).exists():
+            write_whole(out / VERSIONS, json.dumps(versions(), indent=1) + "\n")
+        write_whole(run_dir.recipe_path, recipe.to_toml())
         return run_dir
+
+    def _changed(self, recipe: Recipe) -> str:
+        """The first number of what has begun that differs from the recipe's; empty: none."""
+        found, asked = load_recipe(str(self.recipe_path)).to_tables(), recipe.to_tables()
+        begun = [name for name in STAGES if self.begun(name)]
+        fixed = [*begun, *(("seed", "name", "model") if begun else ())]
+        if any(self.out.glob("dagger-*")):
+            fixed.append("dagger")
+        for section in fixed:
+            if difference := _difference(section, found.get(section), asked.get(section)):
+                return difference
+        return ""
+
+    def begun(self, stage: str) -> bool:
+        """Whether a stage has left anything."""
+        folder = self.out / stage
+        return folder.is_dir() and any(folder.iterdir())
+
+    def borrow(self, other: RunDir, stages: Sequence[str], recipe: Recipe) -> None:
+        """Use finished stages of another run as they are, by links; raises RunDirError if they would be others here."""
+        if not other.recipe_path.exists():
+            raise RunDirError(f"--from {other.out}: holds no run of edge-train")
+        found, asked = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
+        for stage in stages:
+            if other.result(stage) is None:
+                raise RunDirError(f"--from {other.out}: its stage {stage} has not finished")
+            if difference := _difference(stage, found[stage], asked[stage]):
+                raise RunDirError(f"--from {other.out}: was trained with other numbers ({difference})")
+        for part in SHARED_PARTS:
+            if difference := _difference(f"model.{part}", found["model"][part], asked["model"][part]):
+                raise RunDirError(f"--from {other.out}: its {part} is another one ({difference})")
+        for stage in stages:
+            link = self.out / stage
+            if not link.exists():
+                link.symlink_to(os.path.relpath((other.out / stage).resolve(), self.out.resolve()))
+
+    def borrowed(self, stage: str) -> bool:
+        """Whether a stage is another run's."""
+        return (self.out / stage).is_symlink()
+
+    def retire(self, stage: str, name: str) -> None:
+        """Keep what a stage has left, and its lines of the log, under another name: the stage is to be done again."""
+        (self.out / stage).rename(self.out / name)
+        lines = [{**line, "stage": name} if line["stage"] == stage else line for line in self.lines()]
+        if lines:
+            write_whole(self.log_path, "".join(json.dumps(line) + "\n" for line in lines))
 
     @property
     def recipe_path(self) -> Path:
@@ -106,6 +153,15 @@ class RunDir:
     def finish(self, stage: str, result: Mapping[str, Any]) -> None:
         """Say that a stage is done, and what it gave."""
         write_whole(self.stage(stage) / "result.json", json.dumps(result, indent=1, sort_keys=True) + "\n")
+
+
+def _difference(where: str, found: object, asked: object) -> str:
+    """`where.key: A there, B asked for` of the first difference of two tables; empty: there is none."""
+    if isinstance(found, Mapping) and isinstance(asked, Mapping):
+        keys = sorted({*found, *asked} - {"jobs"})  # how many processes worked on it changes nothing
+        return next((d for key in keys if (d := _difference(f"{where}.{key}", found.get(key), asked.get(key)))), "")
+    same = json.dumps(found) == json.dumps(asked)
+    return "" if same else f"{where}: {json.dumps(found)} there, {json.dumps(asked)} asked for"
 
 
 def versions() -> dict[str, Any]:

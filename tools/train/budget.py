@@ -1,0 +1,95 @@
+"""What a run will take before it is begun: samples of every stage, and time by throughputs that were measured.
+
+A stage's module may have `budget(recipe)`: a list of (what, number of samples, key of its throughput).
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from export.progress import duration
+from tools.train.chain import Step
+from tools.train.recipe import STAGES, Recipe
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+FILE: Final = Path(__file__).with_name("throughput.toml")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One kind of work of a step; `rate` in samples a second, None where nobody has measured it."""
+
+    step: str
+    what: str
+    samples: int
+    rate: float | None
+
+    @property
+    def seconds(self) -> float | None:
+        """How long it takes, s."""
+        return None if self.rate is None else self.samples / self.rate
+
+
+def throughputs(model: str, device: str) -> Mapping[str, float]:
+    """Measured samples a second by key, for a network and a kind of device; empty where there are none."""
+    tables = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    found: Mapping[str, float] = tables.get(model, {}).get(device.partition(":")[0], {}).get("rates", {})
+    return found
+
+
+def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
+    """The work of every step, as far as its stage tells it."""
+    rates = throughputs(recipe.model.name, device)
+    lines: list[Line] = []
+    for step in steps:
+        lines += [Line(step.name, what, count, rates.get(key)) for what, count, key in _work(recipe, step)]
+    return lines
+
+
+def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
+    if step.stage == "dagger":
+        return [("drives of the policy", recipe.dagger.episodes, "policy-drive")]
+    if step.stage == "evaluate":
+        count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
+        return [("episodes", count, "policy-drive")]
+    told = getattr(importlib.import_module(STAGES[step.stage][0]), "budget", None)
+    return [] if told is None else list(told(recipe))
+
+
+def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:
+    """The plan for people."""
+    shown = [f"{recipe.name}: network {recipe.model.name}, seed {recipe.seed}, {device}"]
+    for step in steps:
+        own = [line for line in budget if line.step == step.name]
+        for line in own:
+            took = "not measured" if line.seconds is None else duration(line.seconds)
+            shown.append(f"  {step.name:<11}{line.samples:>9,} {line.what:<28} {took}")
+        if not own:
+            shown.append(f"  {step.name:<11}{'':>9} its module does not tell")
+    known = sum(line.seconds for line in budget if line.seconds is not None)
+    open_ends = sum(line.seconds is None for line in budget)
+    shown.append(f"  in all {duration(known)}{f' and {open_ends} parts that nobody has measured' if open_ends else ''}")
+    return shown
+
+
+def as_json(budget: Sequence[Line]) -> list[dict[str, Any]]:
+    """The same for `--json`."""
+    return [
+        {
+            "step": line.step,
+            "what": line.what,
+            "samples": line.samples,
+            "rate_per_s": line.rate,
+            "seconds": line.seconds,
+        }
+        for line in budget
+    ]

@@ -1,0 +1,111 @@
+"""The steps of a run in their order, each done once: a stage, a round of DAgger, or a stage again after one."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from tools.train.exported import export_artifacts
+from tools.train.job import StageJob
+from tools.train.network_file import weights_before
+from tools.train.recipe import STAGES, Recipe
+from tools.train.run_dir import RunDir, RunDirError
+
+ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
+DISTRIBUTED: Final = ("encoder", "sft", "imitate")
+"""Stages that torchrun may run in several processes."""
+
+StageRun = Callable[[StageJob], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage, or round number `round` of DAgger; imitation after that round has its number too."""
+
+    stage: str
+    round: int = 0
+
+    @property
+    def name(self) -> str:
+        """For people, and for a round's folder."""
+        return f"{self.stage}-{self.round}" if self.round else self.stage
+
+
+def steps_of(command: str, recipe: Recipe) -> list[Step]:
+    """What a command does, in order."""
+    rounds = [
+        step
+        for number in range(1, recipe.dagger.rounds + 1)
+        for step in (Step("dagger", number), Step("imitate", number))
+    ]
+    if command == "dagger":
+        return rounds
+    if command != "all":
+        return [Step(command)]
+    steps: list[Step] = []
+    for stage in ALL:
+        steps += rounds if stage == "dagger" else [Step(stage)]
+    return steps
+
+
+def retired(run_dir: RunDir) -> int:
+    """How many imitations were kept aside for another one after a round of DAgger."""
+    number = 0
+    while run_dir.begun(f"imitate-{number}"):
+        number += 1
+    return number
+
+
+def is_done(run_dir: RunDir, step: Step) -> bool:
+    """Whether a step has finished."""
+    if step.stage == "dagger":
+        return run_dir.result(step.name) is not None
+    if step.stage == "imitate" and step.round != (now := retired(run_dir)):
+        return step.round < now
+    return run_dir.result(step.stage) is not None
+
+
+def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
+    """Raise RunDirError where a step would write over what is there."""
+    where = step.name if step.stage == "dagger" else step.stage
+    if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
+        raise RunDirError(f"{run_dir.out}: its drives are another run's (--from); set dagger.rounds=0")
+    again = step.stage == "imitate" and step.round > retired(run_dir)
+    if run_dir.begun(where) and not resume and not again:
+        raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
+
+
+def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | None = None) -> dict[str, Any]:
+    """Do one step and record its result; raises what its stage raises."""
+    if step.stage == "dagger":
+        result = _round(job, step)
+        if job.ranks.first:
+            job.run_dir.finish(step.name, result)
+        return result
+    if step.stage == "imitate" and step.round > retired(job.run_dir):
+        # The drives have become more: imitation begins again on all of them, and what it was is kept.
+        job.run_dir.retire("imitate", f"imitate-{step.round - 1}")
+        job = replace(job, resume=False)
+    result = (stage_run or module_run)(step.stage)(job)
+    if job.ranks.first:
+        job.run_dir.finish(step.stage, result)
+    return result
+
+
+def module_run(stage: str) -> StageRun:
+    """The function of a stage's module."""
+    run: StageRun = importlib.import_module(STAGES[stage][0]).run
+    return run
+
+
+def _round(job: StageJob, step: Step) -> dict[str, Any]:
+    from tools.train.dagger import run_round
+
+    weights = weights_before(job.run_dir.out, "rl")
+    if weights is None or weights.parent.name != "imitate":
+        raise RunDirError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
+    folder = job.run_dir.stage(step.name)
+    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
+    return run_round(job, artifacts, step.round)

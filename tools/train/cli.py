@@ -1,0 +1,266 @@
+"""`edge-train`: from nothing to weights that navigate, stage by stage or all at once."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from edge.artifact_files import ArtifactError
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    check_result_target,
+    write_result,
+)
+from export.progress import duration, peak_rss_bytes
+from tools.benchmark_runs import RunsError
+from tools.train import budget, chain
+from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
+from tools.train.curves import draw_curves
+from tools.train.distributed import Ranks, ranks_of_environment
+from tools.train.exported import ExportError
+from tools.train.job import StageJob, StopFlag
+from tools.train.model_card import write_card
+from tools.train.network_file import START, import_start
+from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
+from tools.train.run_dir import RunDir
+from tools.train.show import progress_for
+
+COMMAND: Final = "edge-train"
+COMMANDS: Final = (*chain.ALL, "all", "card")
+BORROWED: Final = ("collect", "encoder", "sft")
+"""What --from takes of another run: everything that does not depend on the action expert."""
+PACKAGES: Final = ("calib.", "edge.", "export.", "sim_hil.", "tools.")
+
+EXAMPLES: Final = """examples:
+  edge-train all --preset nano --out out/nano-run --dry-run        what it would do, and how long that takes
+  edge-train all --preset nano --out out/nano-run                  everything; Ctrl-C ends it, --resume goes on
+  edge-train collect --preset nano --out out/run                   one stage after the other
+  edge-train sft --out out/run --set sft.epochs=12
+  torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
+  edge-train imitate --out out/run --delay-profile orin.latency.json
+  edge-train all --from out/run --set model.action.latency_aware=false --set dagger.rounds=0 --out out/no-latency
+  edge-train card --out out/run --scores out/bench/result.json     model card with the benchmark's scores
+
+stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
+under delay), dagger (the policy drives, the expert relabels, imitation again), rl (PPO), evaluate (in scenes like
+training's that no stage has seen)
+exit codes: 0 done, 1 an export or an episode failed, 2 bad arguments or input, 3 refused (artifacts), 130 interrupted
+"""
+
+
+class UsageError(ValueError):
+    """Arguments that do not go together."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line of `edge-train`."""
+    p = argparse.ArgumentParser(
+        COMMAND, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("command", choices=COMMANDS, metavar="STAGE", help=", ".join(COMMANDS))
+    which = p.add_mutually_exclusive_group()
+    which.add_argument(
+        "--preset", metavar="NAME", help=f"recipe: {', '.join(recipe_names())} (default: the run's, or nano)"
+    )
+    which.add_argument("--recipe", type=Path, metavar="FILE.toml", help="a recipe of your own")
+    p.add_argument(
+        "--set", dest="settings", metavar="KEY=VALUE", action="append", default=[],
+        help="change a number: seed, STAGE.field or model.SECTION.field; repeatable",
+    )  # fmt: skip
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder of the run")
+    p.add_argument("--resume", action="store_true", help="go on with a stage that was begun; skip what is done")
+    p.add_argument("--from", dest="base", type=Path, metavar="DIR", help=f"use {', '.join(BORROWED)} of another run")
+    p.add_argument(
+        "--checkpoint", type=Path, metavar="PATH", action="append", default=[],
+        help="begin with these weights, such as a backbone's (as edge-export reads them); repeatable",
+    )  # fmt: skip
+    p.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where networks are trained (default: cpu)")
+    p.add_argument("--delay-profile", type=Path, metavar="FILE", help="imitate under these delays (edge-calib latency)")
+    p.add_argument(
+        "--scores", type=Path, metavar="FILE", action="append", default=[], help="card: edge-bench's result.json"
+    )
+    p.add_argument("--dry-run", action="store_true", help="print the plan with its budget and do nothing")
+    p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    started_ns = time.monotonic_ns()
+    try:
+        result = _main(args)
+        result["peak_rss_bytes"] = peak_rss_bytes()
+        result["wall_s"] = round((time.monotonic_ns() - started_ns) / 1e9, 3)
+        if int(os.environ.get("RANK", "0")) == 0:
+            write_result(args.json, result)
+    except KeyboardInterrupt:
+        again = "; go on with --resume" if args.out is not None else ""
+        return _fail(EXIT_INTERRUPTED, f"interrupted, what is finished stays{again}")
+    except (ExportError, RunsError) as error:
+        return _fail(EXIT_CHECK_FAILED, str(error))
+    except ArtifactError as error:
+        return _fail(EXIT_REFUSED, str(error))
+    except OSError as error:
+        return _fail(EXIT_BAD_INPUT, str(error))
+    except Exception as error:  # every stage has errors of its own; those of others are raised again
+        if not is_ours(error):
+            raise
+        return _fail(EXIT_BAD_INPUT, str(error))
+    return EXIT_DONE
+
+
+def is_ours(error: Exception) -> bool:
+    """Whether it is one of this repository's errors, whose text is the one line to show."""
+    return type(error).__module__.startswith(PACKAGES)
+
+
+def _main(args: argparse.Namespace) -> dict[str, Any]:
+    check_result_target(args.json)
+    recipe = _recipe(args)
+    steps = steps_of(args.command, recipe) if args.command != "card" else []
+    if args.dry_run:
+        plan = budget.budget_of(recipe, steps, args.device)
+        sys.stderr.write("\n".join(budget.lines_of(recipe, steps, plan, args.device)) + "\n")
+        return {"command": args.command, "recipe": recipe.name, "budget": budget.as_json(plan)}
+    if args.out is None:
+        raise UsageError("--out is missing: expected the folder of the run, e.g. --out out/run")
+    if args.command == "card":
+        return {"command": "card", "card": str(write_card(RunDir(args.out), recipe, args.scores))}
+    if args.scores:
+        raise UsageError("--scores belongs to card")
+    if args.base is not None and args.checkpoint:
+        raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
+    _check_device(args.device)
+    with ranks_of_environment(args.device) as ranks:
+        return _train(args, recipe, steps, ranks)
+
+
+def _recipe(args: argparse.Namespace) -> Recipe:
+    """The recipe that was named, else that of the run in --out or of the run it is taken from, else nano."""
+    settings = list(args.settings)
+    if args.delay_profile is not None:
+        from edge.latency_profile import load_profile
+
+        load_profile(args.delay_profile)
+        settings.append(f"imitate.delays.profile={args.delay_profile.absolute()}")
+    there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
+    found = next((path for path in there if path.is_file()), None)
+    if args.preset is not None and args.preset not in recipe_names():
+        raise UsageError(f"--preset {args.preset}: expected one of {', '.join(recipe_names())}; a file is a --recipe")
+    if args.recipe is not None and args.recipe.suffix != ".toml":
+        raise UsageError(f"--recipe {args.recipe}: expected a file that ends in .toml")
+    if args.command == "card" and found is None:
+        raise UsageError("card: expected --out to be the folder of a run")
+    return load_recipe(str(args.preset or args.recipe or found or "nano"), settings)
+
+
+def _check_device(device: str) -> None:
+    import torch
+
+    kind, _, number = device.partition(":")
+    if kind not in ("cpu", "cuda") or (number and not number.isdecimal()) or (kind == "cpu" and number):
+        raise UsageError(f"--device {device}: expected cpu, cuda or cuda:N")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise UsageError(f"--device {device}: there is no such device here, or torch is built without it")
+    if kind == "cpu":
+        torch.use_deterministic_algorithms(True)
+        # Nobody reads what was never written; filling it only costs time.
+        torch.utils.deterministic.fill_uninitialized_memory = False
+
+
+def _train(args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], ranks: Ranks) -> dict[str, Any]:
+    if ranks.world > 1 and args.command not in chain.DISTRIBUTED:
+        raise UsageError(f"{args.command}: runs in one process; torchrun is for {', '.join(chain.DISTRIBUTED)}")
+    run_dir = RunDir(args.out)
+    if ranks.first:
+        run_dir = RunDir.open(args.out, recipe)
+        if args.base is not None:
+            run_dir.borrow(RunDir(args.base), BORROWED, recipe)
+        if args.checkpoint and not run_dir.begun(START):
+            import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
+    ranks.barrier()
+    results: dict[str, Any] = {}
+    with stop_flag() as stop:
+        for step in steps:
+            if is_done(run_dir, step):
+                _say(ranks, f"{step.name}: done before")
+                results[step.name] = run_dir.result(step.name if step.stage == "dagger" else step.stage)
+                continue
+            if stop.asked:
+                raise KeyboardInterrupt
+            may_begin(run_dir, step, args.resume)
+            results[step.name] = _step(args, recipe, run_dir, step, ranks, stop)
+    if ranks.first and run_dir.model_path.is_file():
+        write_card(run_dir, recipe)
+    return {"command": args.command, "recipe": recipe.name, "out": str(args.out), "stages": results}
+
+
+def _step(
+    args: argparse.Namespace, recipe: Recipe, run_dir: RunDir, step: Step, ranks: Ranks, stop: StopFlag
+) -> dict[str, Any]:
+    started_ns = time.monotonic_ns()
+    with progress_for(step.name, quiet=not ranks.first) as progress:
+        job = StageJob(
+            recipe=recipe,
+            run_dir=run_dir,
+            resume=args.resume,
+            device=args.device,
+            progress=progress,
+            seed=stage_seed(recipe, step.stage),
+            ranks=ranks,
+            stop=stop,
+        )
+        result = run_step(job, step)
+    took_s = (time.monotonic_ns() - started_ns) / 1e9
+    if ranks.first:
+        draw_curves(run_dir)
+    _say(ranks, f"{step.name}: done in {duration(took_s)}")
+    return result
+
+
+@contextmanager
+def stop_flag() -> Iterator[StopFlag]:
+    """Set by the first Ctrl-C or SIGTERM, for a stage to end with a checkpoint; the second ends it at once."""
+    flag = StopFlag()
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        if flag.asked:
+            raise KeyboardInterrupt
+        flag.ask()
+        sys.stderr.write(f"{COMMAND}: ending at the next step, with a checkpoint; once more ends it at once\n")
+
+    before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {
+        number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield flag
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say(ranks: Ranks, line: str) -> None:
+    if ranks.first:
+        sys.stderr.write(f"{COMMAND}: {line}\n")
+
+
+def _fail(code: int, line: str) -> int:
+    sys.stderr.write(f"{COMMAND}: {line}\n")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

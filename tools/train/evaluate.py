@@ -1,0 +1,108 @@
+"""The last stage: the exported model drives episodes in training's kind of scenes that it has never seen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from tools.train.job import StageJob
+
+STAGE: Final = "evaluate"
+SUITE: Final = "training.toml"
+
+
+class EvaluateError(ValueError):
+    """Nothing to evaluate; one line."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Which episodes are driven, and how slow reasoning is in them."""
+
+    episodes: int = 60
+    scenario_seed: int = 9001
+    """Of `tools.train.scenarios`: layouts that no other stage draws."""
+    kinds: Mapping[str, float] = field(default_factory=dict)
+    """Shares of the kinds of scenes; empty: those of `tools.train.scenarios`."""
+    latency_s: float = 2.0
+    drift: str = "none"
+    jobs: int = 0
+    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.episodes <= 10_000 and 0 <= self.scenario_seed <= 9_999 and 0 <= self.jobs <= 1024):
+            raise ValueError("expected 1 to 10000 episodes, a scenario_seed of 0 to 9999 and 0 to 1024 jobs")
+        if not 0 <= self.latency_s <= 60 or self.drift not in ("none", "typical", "severe"):
+            raise ValueError("expected latency_s from 0 to 60 and drift none, typical or severe")
+
+
+def run(job: StageJob) -> dict[str, Any]:
+    """Export the run's newest weights, drive, and return the benchmark's summary; resumes by itself.
+
+    Raises EvaluateError, ExportError, RunsError, ScenarioError, StoreError.
+    """
+    from sim_hil.benchmark.conditions import Conditions, PolicySpec
+    from sim_hil.benchmark.episode import load_suite
+    from sim_hil.benchmark.jobs import RunWatcher
+    from sim_hil.benchmark.latency import LatencyProfile
+    from sim_hil.benchmark.results import EpisodeResult
+    from sim_hil.benchmark.summary import summarise
+    from tools.benchmark_runs import run_episodes
+    from tools.train.exported import export_artifacts
+    from tools.train.network_file import weights_before
+
+    config = job.recipe.evaluate or EvaluateConfig()
+    weights = weights_before(job.run_dir.out, STAGE)
+    if weights is None:
+        raise EvaluateError(f"{job.run_dir.out}: no weights to evaluate; run imitate first")
+    folder = job.run_dir.stage(STAGE)
+    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
+    suite = write_suite(folder, config)
+    conditions = Conditions(
+        PolicySpec("artifacts", str(artifacts.absolute())),
+        mode="async",
+        latency=LatencyProfile.constant(config.latency_s),
+        drift=config.drift,
+    )
+    reached: list[bool] = []
+
+    def finished(result: EpisodeResult) -> None:
+        reached.append(result.success)
+        job.progress.update(len(reached), config.episodes, success=sum(reached) / len(reached))
+
+    results = run_episodes(
+        str(suite),
+        load_suite(suite),
+        conditions,
+        folder / "run",
+        jobs=config.jobs or len(os.sched_getaffinity(0)),
+        stopped=job.should_stop,
+        watcher=RunWatcher(finished=finished),
+    )
+    # By kind of scene: the layouts themselves are of no interest.
+    by_kind = [replace(result, scene=Path(result.scene).stem.split("-")[0]) for result in results]
+    return {"weights": weights.parent.name, "latency_s": config.latency_s, "summary": summarise(by_kind)}
+
+
+def write_suite(folder: Path, config: EvaluateConfig) -> Path:
+    """The episodes as a suite's file, with their scenes beside it; the same numbers give the same files."""
+    from sim_hil.benchmark.episode import suite_to_toml
+    from sim_hil.scene import scene_to_toml
+    from tools.train.scenarios import SHARES, training_episodes
+
+    path = folder / SUITE
+    scenes = folder / "scenes"
+    scenes.mkdir(parents=True, exist_ok=True)
+    episodes = []
+    kinds = config.kinds or SHARES
+    for scenario in training_episodes(config.scenario_seed, config.episodes, kinds):
+        scene = scenes / f"{scenario.scene.name}.toml"
+        if not scene.exists():
+            scene.write_text(scene_to_toml(scenario.scene), encoding="utf-8")
+        episodes.append(replace(scenario.episode, scene=str(scene.absolute())))
+    path.write_text(suite_to_toml("training", 1, episodes), encoding="utf-8")
+    return path

@@ -1,0 +1,170 @@
+"""The model card: what the weights are, what they were made of, how well they do, and what they are not for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from safetensors import safe_open
+
+from edge.cli import write_whole
+from export.model.network import PARTS
+from tools.train.chain import retired
+from tools.train.drive import file_sha256
+from tools.train.recipe import STAGES, Recipe
+from tools.train.run_dir import VERSIONS, RunDir
+
+NAME: Final = "MODEL_CARD.md"
+LIMITS: Final = """\
+* It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
+  does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
+* It knows the words of its instruction grammar and of its landmarks, in English. Others it may ignore.
+* It is no safety function. Fences, the emergency stop and a person who watches are; so are the supervisor's limits and
+  the bridge's deadman, which hold whatever it does.
+* Speeds, camera height and field of view are those of the simulated Go2 and Carter.
+"""
+
+
+class CardError(ValueError):
+    """Nothing to write a card about; one line."""
+
+
+def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> Path:
+    """Write the card beside the run's weights. `scores` are results of edge-bench. Raises CardError, OSError."""
+    if not run_dir.model_path.is_file():
+        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+    path = run_dir.out / NAME
+    write_whole(path, card(run_dir, recipe, [score(each) for each in scores]))
+    return path
+
+
+def card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Mapping[str, Any]] = ()) -> str:
+    """The card's text; the same run gives the same text."""
+    results = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
+    blocks = [
+        f"# {recipe.name}: weights for tic-vla-edge\n",
+        _network(run_dir, recipe),
+        "## Scores\n\n" + _scores(results.get("evaluate"), scores),
+        "## Data\n\n" + _data(run_dir, results.get("collect")),
+        "## Training\n\n" + _training(run_dir, recipe, results),
+        "## Limits\n\n" + LIMITS,
+    ]
+    return "\n".join(blocks)
+
+
+def score(path: Path) -> dict[str, Any]:
+    """Conditions and summary of a benchmark's result file; raises CardError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CardError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
+
+
+def parameters(weights: Path) -> dict[str, int]:
+    """Number of weights of each part of the network."""
+    counts = dict.fromkeys(PARTS, 0)
+    with safe_open(str(weights), framework="pt") as file:
+        for name in file.keys():  # noqa: SIM118 — not a mapping
+            shape = file.get_slice(name).get_shape()
+            count = 1
+            for size in shape:
+                count *= size
+            counts[name.split(".")[0]] += count
+    return counts
+
+
+def _network(run_dir: RunDir, recipe: Recipe) -> str:
+    counts = parameters(run_dir.model_path)
+    size = run_dir.model_path.stat().st_size
+    named = {
+        "vision": "vision encoder",
+        "language": "language model",
+        "action": "action expert",
+        "value": "value network",
+    }
+    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items())
+    return (
+        f"Network `{recipe.model.name}`: camera pictures, odometry and an instruction in plain words become motion.\n"
+        f"Licence: Apache-2.0, as the repository. No weights of anybody else are in it.\n\n"
+        f"`{run_dir.model_path.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(run_dir.model_path)}`\n\n"
+        f"| part | weights |\n|---|---:|\n{rows}\n| all | {sum(counts.values()):,} |\n"
+    )
+
+
+def _scores(evaluation: Mapping[str, Any] | None, scores: Sequence[Mapping[str, Any]]) -> str:
+    rows = []
+    for each in scores:
+        told = each["conditions"]
+        latency = each["latency"].get("profile") or "none"
+        where = f"{Path(each['suite']).stem}, {told['clock']}, {told['mode']}, latency {latency}, drift {told['drift']}"
+        rows.append(_row(where, each["summary"]))
+    if evaluation is not None:
+        where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
+        rows.append(_row(where, evaluation["summary"]))
+    if not rows:
+        return "Not measured yet.\n"
+    head = "| episodes of | n | SR % | SPL % | CR % | NE m |\n|---|---:|---:|---:|---:|---:|\n"
+    note = "\nMeasured; in brackets bootstrap intervals of 95 % over tasks and their episodes.\n"
+    return head + "\n".join(rows) + "\n" + note
+
+
+def _row(where: str, summary: Mapping[str, Any]) -> str:
+    cells = [where, str(summary["episodes"])]
+    for name in ("sr", "spl", "cr", "ne_m"):
+        interval = summary.get(f"{name}_ci95")
+        shown = "" if interval is None else f" ({interval[0]:.1f} to {interval[1]:.1f})"
+        cells.append(f"{summary[name]:.1f}{shown}" if summary[name] is not None else "–")
+    return f"| {' | '.join(cells)} |"
+
+
+def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
+    if collected is None:
+        return "None was collected by this run.\n"
+    rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
+    lines = [
+        "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
+        "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
+        "which a test holds. No recording of a person or a place is in it.",
+        "",
+        *_facts(collected),
+    ]
+    for number, result in enumerate(rounds, 1):
+        if result is not None:
+            lines += [
+                "",
+                f"Round {number} of DAgger, driven by the policy, relabelled by the expert:",
+                "",
+                *_facts(result),
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any]) -> str:
+    versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
+    packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
+    lines = [
+        f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
+        f"made with `edge-train all --recipe recipe.toml`. Python {versions['python']}, {packages}.",
+    ]
+    for name in ("encoder", "sft", "imitate", "rl"):
+        if name in results:
+            again = retired(run_dir) if name == "imitate" else 0
+            after = f" (after {again} rounds of DAgger)" if again else ""
+            lines += ["", f"### {name}{after}", "", *_facts(results[name])]
+    return "\n".join(lines) + "\n"
+
+
+def _facts(result: Mapping[str, Any], under: str = "") -> list[str]:
+    """One line a number; long lists are left out."""
+    lines = []
+    for key, value in sorted(result.items()):
+        if isinstance(value, Mapping):
+            lines += _facts(value, f"{under}{key}.")
+        elif isinstance(value, float):
+            lines.append(f"* {under}{key}: {value:.6g}")
+        elif isinstance(value, str | int) or value is None:
+            lines.append(f"* {under}{key}: {'–' if value is None else value}")
+    return lines
