@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -26,6 +27,7 @@ from tools.train.scenarios import Scenario
 Array = NDArray[np.float64]
 
 _SPACING_M: Final = 0.1
+_REACH_M: Final = 15.0
 _TURNED_M: Final = 1.0  # whoever is still in the corridor that a turn leaves has not turned until so far beyond it
 _BEYOND_M: Final = 0.3
 _ASIDE_M: Final = 2.0  # to the side of where one should have turned, in the corridor's going on
@@ -75,8 +77,8 @@ class RouteProgress:
         return (len(self._points) - 1 - self._place(pose)) * _SPACING_M + self._strayed(pose)
 
     def strayed_m(self, pose: SE2) -> float:
-        """How far one must walk to be on the told way, m; inf where one cannot."""
-        row, column = self._grid.free_cell(pose.x_m, pose.y_m)
+        """How far one must walk to be on the told way, m; far from it only about so."""
+        row, column = self._grid.cell(pose.x_m, pose.y_m)
         return float(self._gap_m[row, column])
 
     def _strayed(self, pose: SE2) -> float:
@@ -84,8 +86,8 @@ class RouteProgress:
         return max(0.0, self.strayed_m(pose) - 1.0)
 
     def _place(self, pose: SE2) -> int:
-        row, column = self._grid.free_cell(pose.x_m, pose.y_m)
-        return max(0, int(self._nearest[row, column]))
+        row, column = self._grid.cell(pose.x_m, pose.y_m)
+        return int(self._nearest[row, column])
 
     def _step_at(self, pose: SE2) -> int:
         """Index of the step that is next; their number on the last leg."""
@@ -159,21 +161,24 @@ def _dense(path: tuple[Vec2, ...]) -> Array:
 
 
 def _nearest_points(grid: NavGrid, points: Array) -> tuple[NDArray[np.int64], Array]:
-    """[rows, columns] each: index of the point of a way that is nearest by walking (-1: none), and how far it is, m."""
+    """[rows, columns] each: index of the point of a way that is nearest by walking, and how far it is, m.
+
+    Of cells that are not free, or too far to walk, those of the nearest cell that is not.
+    """
     ids, source, target, length = links(grid.free, grid.resolution_m)
-    cells = [grid.free_cell(float(x), float(y)) for x, y in points]
     first: dict[int, int] = {}
-    for index, (row, column) in enumerate(cells):
-        first.setdefault(int(ids[row, column]), index)
+    for index, (x, y) in enumerate(points):
+        first.setdefault(int(ids[grid.free_cell(float(x), float(y))]), index)
     count = int(grid.free.sum())
     graph = csr_matrix((length, (source, target)), shape=(count, count))
     gaps, _, sources = dijkstra(
-        graph, directed=False, indices=list(first), min_only=True, return_predecessors=True
+        graph, directed=False, indices=list(first), min_only=True, return_predecessors=True, limit=_REACH_M
     )  # fmt: skip
-    which = np.full(count + 1, -1, np.int64)
-    which[list(first)] = list(first.values())
-    nearest = np.full(grid.shape, -1, np.int64)
-    nearest[grid.free] = which[np.where(sources < 0, count, sources)]
-    gap = np.full(grid.shape, np.inf)
-    gap[grid.free] = gaps
-    return nearest, gap
+    index_of = np.zeros(count, np.int64)
+    index_of[list(first)] = list(first.values())
+    reached, nearest, gap = np.zeros(grid.shape, bool), np.zeros(grid.shape, np.int64), np.zeros(grid.shape)
+    reached[grid.free] = np.isfinite(gaps)
+    nearest[reached] = index_of[sources[np.isfinite(gaps)]]
+    gap[reached] = gaps[np.isfinite(gaps)]
+    away, (rows, columns) = distance_transform_edt(~reached, return_indices=True)
+    return nearest[rows, columns], gap[rows, columns] + away * grid.resolution_m

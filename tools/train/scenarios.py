@@ -6,11 +6,11 @@ that workers may share them out by their numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import hypot, isfinite
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from sim_hil.benchmark.episode import ROBOTS, Episode
 from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import WordingError, is_held_out, wordings
 from sim_hil.benchmark.route import RouteError, Told
-from sim_hil.benchmark.sights import named_landmarks, worst_leak, wrong_bends
+from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.tasks import Task, make_task, sample_task
 from sim_hil.layouts import RESERVED_BELOW, LayoutError, is_reserved
 from sim_hil.scene import Scene
@@ -36,6 +36,7 @@ MAX_SEED: Final = 9_999
 _GROUPS: Final = 100_000  # layouts of one seed
 _LAYOUT_TRIES: Final = 4
 _DRAWS: Final = 60  # for one task
+_LEAST_WAY_M: Final = 1.0  # of the straight line, before the goal has been reached
 _LEAST_LEG_M: Final = 2.0
 # Length of the way, m, and how often: the suite's tasks are 9..35 m indoors and 30..80 m outdoors.
 _INDOORS: Final = (((4.0, 12.0), 0.30), ((9.0, 22.0), 0.40), ((18.0, 36.0), 0.30))
@@ -49,6 +50,8 @@ _CROWDS: Final = {
 # A task is kept the more readily the more there is to learn from it: nothing to do, turns, turns to be counted.
 _KEEP: Final = (0.25, 0.75, 1.0)
 _TAG = 43
+
+_T = TypeVar("_T")
 
 
 class ScenarioError(ValueError):
@@ -192,6 +195,9 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
         if any(untrue(text, task.told) for text in texts):
             why = "a wording is not true of it"
             continue
+        if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.told)):
+            why = "something that is named is nowhere seen well"
+            continue
         shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
         if not isfinite(shortest_m):
             why = f"the {robot} cannot get there"
@@ -225,7 +231,7 @@ def _episode(
 def _draw(site: Site, rng: np.random.Generator) -> Task:
     if site.kind == CORRIDOR and rng.uniform() < 0.6:
         # As the demo begins, give or take a step.
-        x, y, turn = rng.uniform((-0.5, -0.5, -0.3), (4.0, 0.5, 0.3))
+        x, y, turn = (float(value) for value in rng.uniform((-0.5, -0.5, -0.3), (4.0, 0.5, 0.3)))
         thing = next(thing for thing in site.scene.objects if thing.label == "vending machine")
         return make_task(site.scene, site.grid, (round(x, 2), round(y, 2), round(turn, 3)), thing)
     length_m = _at(float(rng.uniform()), _BANDS.get(site.kind, _OUTDOORS if site.outdoors else _INDOORS))
@@ -233,10 +239,11 @@ def _draw(site: Site, rng: np.random.Generator) -> Task:
 
 
 def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
-    told = task.told
-    if told.length_m <= site.threshold_m + 1.0 or any(
-        step.before_m < _LEAST_LEG_M for step in told.steps if step.before_kind != "room"
-    ):
+    """Whether it is worth training on, and sound as the benchmark's validator means it."""
+    told, (x, y) = task.told, task.goal
+    if hypot(x - task.start[0], y - task.start[1]) < site.threshold_m + _LEAST_WAY_M:
+        return False
+    if any(step.before_m < _LEAST_LEG_M for step in told.steps if step.before_kind != "room"):
         return False
     worth = 0 if not told.steps else 2 if any(step.ordinal > 1 for step in told.steps) else 1
     if site.kind != CORRIDOR and rng.uniform() >= _KEEP[worth]:
@@ -244,7 +251,7 @@ def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
     return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(told, task.path)
 
 
-def _at(place: float, choices: Any) -> Any:
+def _at(place: float, choices: Sequence[tuple[_T, float]]) -> _T:
     """The choice at a place in [0, 1) of (choice, share) pairs laid end to end."""
     left = place * sum(share for _, share in choices)
     for choice, share in choices:
