@@ -86,7 +86,8 @@ def parser() -> argparse.ArgumentParser:
         "--random-weights",
         type=int,
         metavar="SEED",
-        help="untrained weights of this seed (default: 0), or for an action expert that no --checkpoint has",
+        help="untrained weights of this seed (default: the weights that ship, else 0), or for an action expert that no "
+        "--checkpoint has",
     )
     p.add_argument("--save-weights", type=Path, metavar="PATH", help="also write the weights as safetensors")
     p.add_argument("--calibration", metavar="NAME", help="calibration set, folder:PATH or video:PATH")

@@ -15,6 +15,7 @@ from export.checkpoint.sources import open_source
 from export.model.config import TicVlaConfig
 from export.model.network import PARTS, build
 from export.model.weights import WeightsInfo
+from export.shipped import shipped_weights
 from export.stages import file_sha256
 from export.target import Target
 from export.task_samples import check_clips
@@ -25,12 +26,17 @@ DIRECTORY_FILES = ("config.json", "tokenizer.json")
 
 
 class WeightSource:
-    """Checkpoints, or a seed; the network is in memory only between `get` and `release`."""
+    """Checkpoints, or a seed, or neither: the weights that ship, if there are some, else a seed.
+
+    The network is in memory only between `get` and `release`.
+    """
 
     def __init__(self, config: TicVlaConfig, checkpoints: Sequence[Path], seed: int | None) -> None:
         if seed is not None and not 0 <= seed < 2**63:
             raise CheckpointError(f"--random-weights {seed}: expected a seed between 0 and 2^63 - 1")
         self.config = config
+        if seed is None and not checkpoints and (shipped := shipped_weights(config)) is not None:
+            checkpoints = (shipped,)
         self._checkpoints = tuple(checkpoints)
         self._seed = DEFAULT_SEED if seed is None and not checkpoints else seed
         self._loaded: LoadedCheckpoint | None = None

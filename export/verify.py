@@ -15,6 +15,7 @@ from export.model.config import ModelConfigError, TicVlaConfig
 from export.model.config_file import config_for, config_from_dict, with_overrides
 from export.model.weights import WeightsError
 from export.settings import model_settings, target_settings
+from export.shipped import shipped_weights
 from export.target import Target, TargetError, list_targets, load_target, parse_target, with_settings
 
 WHOLLY_RANDOM = re.compile(r"random seed (\d{1,19})")
@@ -45,9 +46,12 @@ def job_of(
     random = WHOLLY_RANDOM.fullmatch(origin)
     filled = FILLED.search(origin)
     if seed is None and not checkpoints:
-        if random is None:
+        if random is None and (shipped := shipped_weights(config)) is not None:
+            checkpoints = (shipped,)
+        elif random is None:
             raise WeightsError(f"{directory}: was made from {origin}; give that with --checkpoint PATH")
-        seed = int(random[1])
+        else:
+            seed = int(random[1])
     elif seed is None and filled is not None:
         seed = int(filled[1])
     found = load_calibration(calibration or name)

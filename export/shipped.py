@@ -1,0 +1,35 @@
+"""Trained weights that come with the package: what a network is exported with when nobody names others."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Final
+
+from safetensors import SafetensorError, safe_open
+
+from export.checkpoint.coverage import CheckpointError
+from export.model.config import TicVlaConfig
+
+FOLDER: Final = Path(__file__).with_name("weights")
+SECTIONS: Final = ("vision", "language", "action")
+"""Of the network: what is exported."""
+
+
+def shipped_weights(config: TicVlaConfig, folder: Path = FOLDER) -> Path | None:
+    """The file for this very network; None if there is none. Raises CheckpointError for one that cannot be read.
+
+    A network of that name with changed numbers (`--set model.…`) has none: it would have to be trained.
+    """
+    path = folder / f"{config.name}.safetensors"
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            said = json.loads((file.metadata() or {})["config"])
+        ours = json.loads(json.dumps(config.to_dict()))
+        return path if all(said[section] == ours[section] for section in SECTIONS) else None
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}: the shipped weights cannot be read ({error}); install the package again"
+        ) from error
