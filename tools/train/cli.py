@@ -31,7 +31,7 @@ from tools.train.curves import draw_curves
 from tools.train.distributed import Ranks, ranks_of_environment
 from tools.train.exported import ExportError
 from tools.train.job import StageJob, StopFlag
-from tools.train.model_card import write_card
+from tools.train.model_card import ship, write_card
 from tools.train.network_file import START, import_start
 from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.run_dir import RunDir
@@ -51,7 +51,7 @@ EXAMPLES: Final = """examples:
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
   edge-train imitate --out out/run --delay-profile orin.latency.json
   edge-train all --from out/run --set model.action.latency_aware=false --set dagger.rounds=0 --out out/no-latency
-  edge-train card --out out/run --scores out/bench/result.json     model card with the benchmark's scores
+  edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to give away
 
 stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
 under delay), dagger (the policy drives, the expert relabels, imitation again), rl (PPO), evaluate (in scenes like
@@ -91,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--scores", type=Path, metavar="FILE", action="append", default=[], help="card: edge-bench's result.json"
     )
+    p.add_argument("--ship", type=Path, metavar="DIR", help="card: also write the weights there as they are given away")
     p.add_argument("--dry-run", action="store_true", help="print the plan with its budget and do nothing")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
@@ -138,9 +139,11 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     if args.out is None:
         raise UsageError("--out is missing: expected the folder of the run, e.g. --out out/run")
     if args.command == "card":
-        return {"command": "card", "card": str(write_card(RunDir(args.out), recipe, args.scores))}
-    if args.scores:
-        raise UsageError("--scores belongs to card")
+        run_dir = RunDir(args.out)
+        shipped = None if args.ship is None else str(ship(run_dir, recipe, args.ship, args.scores))
+        return {"command": "card", "card": str(write_card(run_dir, recipe, args.scores)), "shipped": shipped}
+    if args.scores or args.ship:
+        raise UsageError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
         raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
     _check_device(args.device)

@@ -11,8 +11,10 @@ from safetensors import safe_open
 
 from edge.cli import write_whole
 from export.model.network import PARTS
+from export.model.weights import WeightsInfo, save_weights
 from tools.train.chain import retired
 from tools.train.drive import file_sha256
+from tools.train.network_file import START, read_network
 from tools.train.recipe import STAGES, Recipe
 from tools.train.run_dir import VERSIONS, RunDir
 
@@ -36,16 +38,33 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
     if not run_dir.model_path.is_file():
         raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     path = run_dir.out / NAME
-    write_whole(path, card(run_dir, recipe, [score(each) for each in scores]))
+    write_whole(path, card(run_dir, recipe, run_dir.model_path, [score(each) for each in scores]))
     return path
 
 
-def card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Mapping[str, Any]] = ()) -> str:
+def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
+    """Write the run's weights as they are given away, with their card: float16, without what only training needs.
+
+    Returns the weights' path. Raises CardError, NetworkFileError, OSError.
+    """
+    if not run_dir.model_path.is_file():
+        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+    with safe_open(str(run_dir.model_path), framework="pt") as file:
+        said = file.metadata()
+    model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
+    path = folder / f"{recipe.model.name}.safetensors"
+    info = WeightsInfo(trained=said["trained"] == "true", origin=f"{said['origin']}, float16")
+    save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
+    write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
+    return path
+
+
+def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, Any]] = ()) -> str:
     """The card's text; the same run gives the same text."""
     results = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
     blocks = [
         f"# {recipe.name}: weights for tic-vla-edge\n",
-        _network(run_dir, recipe),
+        _network(weights, recipe, run_dir.begun(START)),
         "## Scores\n\n" + _scores(results.get("evaluate"), scores),
         "## Data\n\n" + _data(run_dir, results.get("collect")),
         "## Training\n\n" + _training(run_dir, recipe, results),
@@ -76,20 +95,24 @@ def parameters(weights: Path) -> dict[str, int]:
     return counts
 
 
-def _network(run_dir: RunDir, recipe: Recipe) -> str:
-    counts = parameters(run_dir.model_path)
-    size = run_dir.model_path.stat().st_size
+def _network(weights: Path, recipe: Recipe, others: bool) -> str:
+    counts, size = parameters(weights), weights.stat().st_size
     named = {
         "vision": "vision encoder",
         "language": "language model",
         "action": "action expert",
         "value": "value network",
     }
-    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items())
+    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
+    theirs = (
+        "It began with weights of others (`--checkpoint`), whose licence holds for it."
+        if others
+        else "Licence: Apache-2.0, as the repository. No weights of anybody else are in it."
+    )
     return (
         f"Network `{recipe.model.name}`: camera pictures, odometry and an instruction in plain words become motion.\n"
-        f"Licence: Apache-2.0, as the repository. No weights of anybody else are in it.\n\n"
-        f"`{run_dir.model_path.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(run_dir.model_path)}`\n\n"
+        f"{theirs}\n\n"
+        f"`{weights.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(weights)}`\n\n"
         f"| part | weights |\n|---|---:|\n{rows}\n| all | {sum(counts.values()):,} |\n"
     )
 
