@@ -7,6 +7,7 @@ apart, simplified by splitting at the farthest point (Ramer, Douglas and Peucker
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
@@ -74,7 +75,9 @@ def _distances(
     square = float(along @ along)
     # Nothing to be along: a segment shorter than any odometry tells.
     share = np.clip((xy - a) @ along / square, 0.0, 1.0) if square > 1e-12 else np.zeros(len(xy))
-    return np.hypot(*(xy - a - share[:, None] * along).T)
+    apart = xy - a - share[:, None] * along
+    distances: npt.NDArray[np.float64] = np.hypot(apart[:, 0], apart[:, 1])
+    return distances
 
 
 class PathMemory:
@@ -103,7 +106,7 @@ class PathMemory:
             return
         self._due_ns = stamp_ns + PERIOD_NS
         point = (T_odom_base.x_m, T_odom_base.y_m)
-        if self._points and np.hypot(point[0] - self._points[-1][0], point[1] - self._points[-1][1]) < MOVED_M:
+        if self._points and math.dist(point, self._points[-1]) < MOVED_M:
             return
         self._points.append(point)
         if len(self._points) >= CAPACITY:
@@ -128,7 +131,8 @@ def _told(T_base_point: SE2) -> Point:
 
 def way_of(poses: Iterable[tuple[int, SE2]]) -> Way:
     """The way of (stamp ns, `T_odom_base`) since an instruction began, oldest first, as told at the last of them."""
-    memory, newest = PathMemory(), None
+    memory = PathMemory()
+    newest: SE2 | None = None
     for stamp_ns, newest in poses:
         memory.put(stamp_ns, newest)
     return () if newest is None else memory.way(newest)

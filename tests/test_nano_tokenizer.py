@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import statistics
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ from export.model.tokenizer import FARTHEST_M, NANO_TOKENIZER, train, word_lists
 from export.target import list_targets, load_target
 from sim_hil.benchmark.episode import load_suite
 from sim_hil.benchmark.instruction_words import AREAS, NOUNS, ORDINALS
-from sim_hil.benchmark.route import COLOUR_WORDS
+from sim_hil.benchmark.instructions import wordings
+from sim_hil.benchmark.route import COLOUR_WORDS, Passed, Step, Told
 from sim_hil.scene import load_scene, scene_names
 from tools.train import trace_words
 
@@ -52,6 +54,34 @@ def instructions() -> list[str]:
 def test_every_word_of_the_suite_s_instructions_is_one_token() -> None:
     words = {word for text in instructions() for word in re.findall(r"[A-Za-z]+", text)}
     assert len(words) > 100 and in_pieces(words) == []
+
+
+WAYS = (
+    ("corridor", "corridor"), ("corridor", "main aisle"), ("aisle", "aisle"), ("sidewalk", "sidewalk"),
+    ("room", "office"), ("lobby", "elevator lobby"), ("plaza", "plaza"), ("yard", "loading area"), ("crossing", "zebra crossing"),
+)  # fmt: skip
+
+
+def tolds() -> Iterator[Told]:
+    """Ways with every kind of step, on either side, counted, at an end and at a landmark, and with none."""
+    near, past = (Passed("bench 1", "blue bench", "left"),), (Passed("sofa 1", "sofa", "right"),)
+    for (kind, name), side, (ordinal, at_end, by) in itertools.product(
+        WAYS, ("left", "right", "straight"), ((2, False, near), (0, True, ()), (0, False, near))
+    ):
+        if kind in ("room", "crossing") and not ordinal:
+            continue
+        step = Step(side, kind, name, ordinal, at_end, by, past, "corridor", "corridor", 9.0, (0.0, 0.0))
+        end = ("desk 1", "red desk", "desk", "left", True, kind, name, 9.0, past)
+        yield Told((step,), *end, leaves_room=False, length_m=30.0)
+    yield Told((), *end, leaves_room=False, length_m=9.0)
+    leaving = Step("left", "corridor", "corridor", 0, False, (), (), "room", "office", 3.0, (0.0, 0.0))
+    yield Told((leaving,), *end, leaves_room=True, length_m=9.0)
+
+
+def test_every_word_of_the_grammar_of_training_is_one_token() -> None:
+    texts = [text for seed, told in enumerate(tolds()) for text in wordings(told, 12, seed, held_out=False)]
+    words = {word for text in texts for word in re.findall(r"[A-Za-z]+", text)}
+    assert len(texts) > 500 and len(words) > 100 and in_pieces(words) == []
 
 
 def test_everything_that_can_be_named_is_one_token_a_word() -> None:
@@ -101,8 +131,9 @@ def test_the_aspects_names_are_one_token_at_the_start_of_a_line() -> None:
 
 def test_the_words_of_the_file_are_one_token_each_but_for_everyday_ones() -> None:
     lists = word_lists()
-    everyday = set(lists.pop("everyday"))
+    everyday, starts = set(lists.pop("everyday")), lists.pop("line_starts")
     assert in_pieces({word for words in lists.values() for word in words}) == []
+    assert [tokens(start) for start in starts] == [1] * len(starts)
     assert len(in_pieces(everyday)) < len(everyday)
 
 
