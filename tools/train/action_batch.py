@@ -1,0 +1,151 @@
+"""The action expert over many frames at once, some of which share a semantic state: `ActionExpert.forward`'s numbers.
+
+A semantic state costs more than the rest of a sample, so frames that act on one state share its keys and values. States
+differ in length: they are padded on the right and the padding is masked, which leaves every row what it is alone. What
+is dropped out comes with the batch instead of from a generator of the network's own, so that a sample is the same in
+whatever batch, process or resumed run it comes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+
+from export.model.action import ActionExpert, CrossAttentionLayer
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Group:
+    """g frames of one drive that act on one semantic state.
+
+    `visual_tokens` f16 [g, N, D] of each frame; `state` [g, 3] vx m/s, vy m/s, wz rad/s; `latency` [g, 4] dt s, dx m,
+    dy m, dtheta rad; `guidance` [1, T, kv_dim] K‖V that all share, or waypoints [g, 3, 2] m, each in its frame;
+    `goal` [g, 2] m in the robot's frame, which only a point-goal policy may see; `keep_guidance` [1 or g, T] and
+    `keep_state` [g] are False where training drops a token. The label: `target` [g, steps, 3] x m, y m, theta rad
+    (not wrapped) in the robot's frame, of which `known` [g, steps].
+    """
+
+    visual_tokens: NDArray[np.float16]
+    state: Array
+    latency: Array
+    guidance: NDArray[np.floating]
+    goal: Array
+    keep_guidance: NDArray[np.bool_]
+    keep_state: NDArray[np.bool_]
+    target: Array
+    known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ActionBatch:
+    """Groups of equally many frames on a device, B frames in all; as `Group`, with [B] for [g] and padded guidance."""
+
+    visual_tokens: Tensor
+    state: Tensor
+    latency: Tensor
+    guidance: Tensor
+    """[S, T, width] float, zeros behind each state's end; B is a multiple of S."""
+    real: Tensor
+    """[S, T] bool: what of `guidance` is not padding."""
+    goal: Tensor
+    keep_guidance: Tensor
+    keep_state: Tensor
+    target: Tensor
+    known: Tensor
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+
+def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
+    """Groups of one size as a batch; a frame's place is its group's times the size, plus its own in it."""
+    longest = max(group.guidance.shape[1] for group in groups)
+
+    def joined(name: str) -> Tensor:
+        return torch.from_numpy(np.concatenate([getattr(group, name) for group in groups])).to(device)
+
+    def padded(name: str) -> Tensor:
+        arrays = [getattr(group, name) for group in groups]
+        rows = sum(len(array) for array in arrays)
+        whole = np.zeros((rows, longest, *arrays[0].shape[2:]), arrays[0].dtype)
+        at = 0
+        for array in arrays:
+            whole[at : at + len(array), : array.shape[1]] = array
+            at += len(array)
+        return torch.from_numpy(whole).to(device)
+
+    lengths = torch.tensor([group.guidance.shape[1] for group in groups for _ in group.guidance], device=device)
+    return ActionBatch(
+        visual_tokens=joined("visual_tokens").float(),
+        state=joined("state"),
+        latency=joined("latency"),
+        guidance=padded("guidance").float(),
+        real=torch.arange(longest, device=device) < lengths[:, None],
+        goal=joined("goal"),
+        keep_guidance=padded("keep_guidance"),
+        keep_state=joined("keep_state"),
+        target=joined("target"),
+        known=joined("known"),
+    )
+
+
+def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
+    """Planned trajectories [B, steps, 3] (x m, y m, theta rad) in each frame's robot frame, by the network's layers.
+
+    The network is in evaluation mode: its own dropout is the batch's here.
+    """
+    semantic = action.semantic_tokens(batch.guidance) * batch.keep_guidance[..., None]
+    now = action.now_tokens(batch.visual_tokens, batch.state, batch.latency)
+    now = torch.cat([now[:, :-2], now[:, -2:-1] * batch.keep_state[:, None, None], now[:, -1:]], dim=1)
+    x = action.queries.expand(len(batch), -1, -1)
+    for key_value, layer in zip(action.key_values, action.layers, strict=True):
+        assert isinstance(layer, CrossAttentionLayer)
+        x = _layer(layer, x, key_value(now), key_value(semantic), batch.real)
+    out = action.out(action.head(action.norm(x))).float()
+    if action.config.action.parameterisation == "increments":
+        return torch.cumsum(out, dim=1)
+    return torch.cat([out[..., :2], torch.cumsum(out[..., 2:], dim=1)], dim=-1)
+
+
+def _layer(
+    layer: CrossAttentionLayer, x: Tensor, now: tuple[Tensor, Tensor], semantic: tuple[Tensor, Tensor], real: Tensor
+) -> Tensor:
+    """`CrossAttentionLayer.forward` with keys and values of S states that B/S frames each share."""
+    batch, steps, _ = x.shape
+    states, heads, tokens, width = semantic[0].shape
+    share = batch // states
+    q = layer.q(layer.norm1(x)).unflatten(-1, (heads, width)).transpose(1, 2) * width**-0.5
+    q_shared = _shared(q, share)
+    scores_now = _shared(q @ now[0].transpose(2, 3), share)
+    scores = (q_shared @ semantic[0].transpose(2, 3)).masked_fill(~real[:, None, None], float("-inf"))
+    weights = torch.softmax(torch.cat([scores_now, scores], dim=-1).float(), dim=-1).to(q.dtype)
+    seen = _own(weights[..., :-tokens], share) @ now[1]
+    meant = _own(weights[..., -tokens:] @ semantic[1], share)
+    attended = (seen + meant).transpose(1, 2).reshape(batch, steps, heads * width)
+    x = x + layer.o(attended)
+    return x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))
+
+
+def _shared(x: Tensor, share: int) -> Tensor:
+    """[S·share, heads, steps, d] → [S, heads, share·steps, d]: frames of one state as rows of one product."""
+    return x.unflatten(0, (-1, share)).transpose(1, 2).flatten(2, 3)
+
+
+def _own(x: Tensor, share: int) -> Tensor:
+    """The inverse of `_shared`."""
+    return x.unflatten(2, (share, -1)).transpose(1, 2).flatten(0, 1)
+
+
+def smooth_l1(planned: Tensor, batch: ActionBatch, *, beta: float, heading_weight: float) -> Tensor:
+    """Equation 4 for every frame [B]: steps that are not known count as met; the heading's error counts by weight."""
+    terms = F.smooth_l1_loss(planned.float(), batch.target, reduction="none", beta=beta)
+    terms = terms * terms.new_tensor([1.0, 1.0, heading_weight])
+    return (terms.sum(-1) * batch.known).mean(1)
