@@ -58,7 +58,8 @@ def test_every_word_of_the_suite_s_instructions_is_one_token() -> None:
 
 WAYS = (
     ("corridor", "corridor"), ("corridor", "main aisle"), ("aisle", "aisle"), ("sidewalk", "sidewalk"),
-    ("room", "office"), ("lobby", "elevator lobby"), ("plaza", "plaza"), ("yard", "loading area"), ("crossing", "zebra crossing"),
+    ("room", "office"), ("lobby", "elevator lobby"), ("plaza", "plaza"), ("yard", "loading area"),
+    ("crossing", "zebra crossing"),
 )  # fmt: skip
 
 
