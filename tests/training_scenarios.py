@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario, scenario_group
 from tools.train.sites import KINDS
 
@@ -20,3 +21,9 @@ def scenarios(kind: str) -> tuple[Scenario, ...]:
 def all_scenarios() -> tuple[Scenario, ...]:
     """Those of every kind."""
     return tuple(scenario for kind in KINDS for scenario in scenarios(kind))
+
+
+@cache
+def progress_of(scenario: Scenario) -> RouteProgress:
+    """Worked out once for each."""
+    return RouteProgress(scenario)
