@@ -36,7 +36,7 @@ class KvConfig:
     """States of each anchor, each with words and a `before` of its own."""
     own_share: float = 0.0
     """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
-    max_new_tokens: int = 160
+    max_new_tokens: int = 96
     """Of its own texts."""
     every: int = TRACE_EVERY
     """Frames between two anchors."""
@@ -114,57 +114,71 @@ def build_kv_cache(
     return KvCache(place)
 
 
+@dataclass(frozen=True)
+class _Wanted:
+    """One state before it is computed."""
+
+    anchor: Anchor
+    number: int
+    drawn: Drawn
+    own: bool
+    prompt: tuple[int, ...]
+    answer: tuple[int, ...]
+    """The true one; empty where the model is to say its own."""
+
+    @property
+    def tokens(self) -> int:
+        """That go in at once."""
+        return len(self.prompt) + len(self.answer)
+
+
 def _states(
     network: TicVla, prompts: Prompts, tokens: FrameTokens, anchors: Sequence[Anchor], config: KvConfig, seed: int
 ) -> list[Made]:
     """All states of one drive by frame and draw; made in batches of about one length."""
-    wanted: list[tuple[Anchor, int, Drawn, bool]] = []
-    for anchor in anchors:
-        for number in range(config.draws):
-            # Of the state's own: what it is made with does not depend on which others are made.
-            rng = np.random.default_rng((seed, _TAG, crc32(anchor.drive_id.encode()), anchor.k, number))
-            own = bool(rng.uniform() < config.own_share)
-            wanted.append((anchor, number, draw(anchor, config.words, rng), own))
+    wanted = [_wanted(prompts, anchor, n, config, seed) for anchor in anchors for n in range(config.draws)]
     made: list[Made] = []
     for own in (False, True):
-        rows = [(each, prompts.of(each[0], each[2])) for each in wanted if each[3] is own]
-        rows.sort(key=lambda row: len(row[1][0]) + len(row[1][1]))
-        for start in range(0, len(rows), config.batch):
-            made += _batch(network, prompts, tokens, rows[start : start + config.batch], own, config.max_new_tokens)
+        some = sorted((each for each in wanted if each.own is own), key=lambda each: each.tokens)
+        for start in range(0, len(some), config.batch):
+            made += _batch(network, prompts, tokens, some[start : start + config.batch], config.max_new_tokens)
     return sorted(made, key=lambda state: (state.k, state.draw))
+
+
+def _wanted(prompts: Prompts, anchor: Anchor, number: int, config: KvConfig, seed: int) -> _Wanted:
+    """Drawn from a generator of its own: what a state is made with does not depend on which others are made."""
+    rng = np.random.default_rng((seed, _TAG, crc32(anchor.drive_id.encode()), anchor.k, number))
+    own = bool(rng.uniform() < config.own_share)
+    drawn = draw(anchor, config.words, rng)
+    prompt, answer = prompts.of(anchor, drawn)
+    return _Wanted(anchor, number, drawn, own, prompt, () if own else answer)
 
 
 @torch.no_grad()
 def _batch(
-    network: TicVla,
-    prompts: Prompts,
-    tokens: FrameTokens,
-    rows: Sequence[tuple[tuple[Anchor, int, Drawn, bool], tuple[tuple[int, ...], tuple[int, ...]]]],
-    own: bool,
-    max_new_tokens: int,
+    network: TicVla, prompts: Prompts, tokens: FrameTokens, wanted: Sequence[_Wanted], max_new_tokens: int
 ) -> list[Made]:
+    """States that are all of true texts, or all of the model's own."""
     language = network.language
-    batch = collate(
-        [
-            Row(prompt, () if own else answer, frames_of(tokens, anchor.drive_id, anchor.frames))
-            for (anchor, *_), (prompt, answer) in rows
-        ],
-        img_context_id=language.config.img_context_id,
-        device=language.embed.weight.device,
-    )
-    if own:
+    rows = [
+        Row(each.prompt, each.answer, frames_of(tokens, each.anchor.drive_id, each.anchor.frames)) for each in wanted
+    ]
+    image_id, device = language.config.img_context_id, language.embed.weight.device
+    batch = collate(rows, img_context_id=image_id, device=device)
+    if wanted[0].own:
         said = decode(language, batch, max_new_tokens)
-        states = [each.last_layer_kv for each in said]
-        answers = [each.ids for each in said]
+        states, texts = [each.last_layer_kv for each in said], [each.ids for each in said]
     else:
+        # The token that ends an answer is not fed: a generation stops before it.
         kv = run(language, batch.input_ids, batch.visual_tokens, None).last_layer_kv
         states = [kv[i, :length] for i, length in enumerate(batch.lengths.tolist())]
-        answers = [answer[:-1] for _, (_, answer) in rows]
+        texts = [each.answer[:-1] for each in wanted]
     made: list[Made] = []
-    for ((anchor, number, drawn, _), (prompt, _)), state, answer in zip(rows, states, answers, strict=True):
+    for each, state, ids in zip(wanted, states, texts, strict=True):
         half = state.to(torch.float16).cpu().numpy()
         if not np.isfinite(half).all():
-            raise KvCacheError(f"drive {anchor.drive_id}, frame {anchor.k}: keys or values beyond what float16 holds")
-        text = (WAYPOINTS_START if drawn.waypoints_only else "") + prompts.text(answer)
-        made.append(Made(anchor.k, number, half, len(prompt), own, text))
+            where = f"drive {each.anchor.drive_id}, frame {each.anchor.k}"
+            raise KvCacheError(f"{where}: keys or values beyond what float16 holds; train the language model again")
+        text = (WAYPOINTS_START if each.drawn.waypoints_only else "") + prompts.text(ids)
+        made.append(Made(each.anchor.k, each.number, half, len(each.prompt), each.own, text))
     return made

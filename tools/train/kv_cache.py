@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from tools.train.language_batch import Halves
 
 FORMAT: Final = 1
 INDEX: Final = "kv.json"
+_MAX_OPEN: Final = 256  # a mapped file takes one of a process's descriptors, of which there may be 1024
 
 
 class KvCacheError(ValueError):
@@ -69,7 +71,7 @@ class _Place:
 
 
 class KvCache:
-    """Read access; `at` costs no copy."""
+    """Read access; what is read is mapped from the file, not copied."""
 
     def __init__(self, folder: Path) -> None:
         """Open a folder that `build_kv_cache` has made. Raises KvCacheError."""
@@ -86,7 +88,8 @@ class KvCache:
             if isinstance(error, KvCacheError):
                 raise
             raise KvCacheError(f"{folder}: no cache of keys and values ({error!r}); build it first") from error
-        self._files: dict[str, tuple[Halves, dict[tuple[int, int], _Place]]] = {}
+        self._indices: dict[str, dict[tuple[int, int], _Place]] = {}
+        self._maps: OrderedDict[str, Halves] = OrderedDict()
 
     def has(self, drive_id: str, sha256: str) -> bool:
         """Whether this drive, with this hash of its file, is in the cache."""
@@ -96,26 +99,37 @@ class KvCache:
             return False
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Frames of a drive that there is a state for, ascending."""
-        return tuple(sorted({k for k, _ in self._open(drive_id)[1]}))
+        """Frames of a drive that there is a state for, ascending. Raises KvCacheError for a drive that is not there."""
+        return tuple(sorted({k for k, _ in self._index(drive_id)}))
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
         """The state of the generation whose newest frame is k. Raises KvCacheError where there is none."""
-        rows, places = self._open(drive_id)
-        place = places.get((k, draw))
+        place = self._index(drive_id).get((k, draw))
         if place is None:
             raise KvCacheError(f"drive {drive_id}: no state of frame {k}, draw {draw}")
-        return CachedState(rows[place.start : place.start + place.tokens], place.prompt_tokens, place.text, place.own)
+        rows = self._map(drive_id)[place.start : place.start + place.tokens]
+        return CachedState(rows, place.prompt_tokens, place.text, place.own)
 
-    def _open(self, drive_id: str) -> tuple[Halves, dict[tuple[int, int], _Place]]:
-        if drive_id not in self._files:
+    def _index(self, drive_id: str) -> dict[tuple[int, int], _Place]:
+        if drive_id not in self._indices:
             places = [_Place(**place) for place in _read(self.folder, drive_id)["states"]]
-            rows = np.load(_npy(self.folder, drive_id), mmap_mode="r", allow_pickle=False)
-            whole = sum(place.tokens for place in places)
-            if rows.dtype != np.float16 or rows.shape != (whole, self.kv_dim):
-                raise KvCacheError(f"{_npy(self.folder, drive_id)}: expected f16 ({whole}, {self.kv_dim}); delete it")
-            self._files[drive_id] = (rows, {(place.k, place.draw): place for place in places})
-        return self._files[drive_id]
+            self._indices[drive_id] = {(place.k, place.draw): place for place in places}
+        return self._indices[drive_id]
+
+    def _map(self, drive_id: str) -> Halves:
+        if drive_id not in self._maps:
+            path, wanted = _npy(self.folder, drive_id), sum(each.tokens for each in self._index(drive_id).values())
+            try:
+                rows: Halves = np.load(path, mmap_mode="r", allow_pickle=False)
+            except (OSError, ValueError) as error:
+                raise KvCacheError(f"{path}: not readable ({error}); delete it and build it again") from error
+            if rows.dtype != np.float16 or rows.shape != (wanted, self.kv_dim):
+                raise KvCacheError(f"{path}: expected f16 {(wanted, self.kv_dim)}, found {rows.dtype} {rows.shape}")
+            self._maps[drive_id] = rows
+            if len(self._maps) > _MAX_OPEN:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(drive_id)
+        return self._maps[drive_id]
 
 
 def begin(folder: Path, *, key: str, kv_dim: int, draws: int) -> None:

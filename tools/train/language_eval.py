@@ -38,7 +38,7 @@ class EvalConfig:
     """Drives along which the model hears only itself."""
     gap_s: float = 2.0
     """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
-    max_new_tokens: int = 160
+    max_new_tokens: int = 96
     batch: int = 48
 
     def __post_init__(self) -> None:
@@ -49,9 +49,14 @@ class EvalConfig:
 
 
 class Score:
-    """Adds up answers; `numbers` are shares and means over them."""
+    """Adds up answers; `numbers` are shares and means over them.
 
-    def __init__(self) -> None:
+    A change is an anchor whose progress is not what it was at the generation before: there, repeating does not help.
+    """
+
+    def __init__(self, gap_s: float) -> None:
+        """`gap_s`: how long before it the last generation looked."""
+        self._gap_s = gap_s
         self._count: Counter[str] = Counter()
         self._errors_m: list[list[float]] = []
 
@@ -64,7 +69,9 @@ class Score:
         found["waypoints"] += waypoints is not None
         found["progress"] += progress is not None
         found["progress right"] += progress == anchor.progress
-        found["turn right"] += progress is not None and progress.step == anchor.progress.step
+        if anchor.before(self._gap_s) not in (None, anchor.progress):
+            found["changes"] += 1
+            found["change right"] += progress == anchor.progress
         true_side = side_of(anchor.reasoning)
         if true_side is not None:
             found["sides"] += 1
@@ -86,13 +93,19 @@ class Score:
             "waypoints_parsable": _share(n["waypoints"], n["answers"]),
             "progress_parsable": _share(n["progress"], n["answers"]),
             "progress_right": _share(n["progress right"], n["answers"]),
-            "turn_right": _share(n["turn right"], n["answers"]),
+            "change_right": _share(n["change right"], n["changes"]),
+            "changes": n["changes"],
             "side_right": _share(n["side right"], n["sides"]),
             "sides": n["sides"],
             "landmark_precision": _share(n["landmarks right"], n["landmarks said"]),
             "landmark_recall": _share(n["landmarks right"], n["landmarks there"]),
             "waypoint_error_m": [float(mean) for mean in errors.mean(0)] if len(errors) else None,
         }
+
+    def points(self) -> dict[str, Any]:
+        """Those of `numbers` that an answer without reasoning has."""
+        numbers = self.numbers()
+        return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
 
 
 def evaluate(
@@ -114,10 +127,10 @@ def evaluate(
         drawn = [
             Drawn(wording, anchor.before(config.gap_s), only) for anchor, wording in zip(some, wordings, strict=True)
         ]
-        score = Score()
+        score = Score(config.gap_s)
         for anchor, text in zip(some, speaker.say(list(zip(some, drawn, strict=True))), strict=True):
             score.add(text, anchor)
-        scores[name] = score.numbers()
+        scores[name] = score.points() if only else score.numbers()
     ids = sorted({anchor.drive_id for anchor in anchors})
     chosen = {ids[int(i)] for i in rng.permutation(len(ids))[: config.drives]}
     scores["own"] = closed_loop(speaker, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
@@ -162,7 +175,7 @@ def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: 
             drives.setdefault(anchor.drive_id, []).append(anchor)
     wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
     before: dict[str, Progress | None] = dict.fromkeys(drives)
-    score = Score()
+    score = Score(gap_s)
     for step in range(max((len(each) for each in drives.values()), default=0)):
         now = [each[step] for each in drives.values() if step < len(each)]
         drawn = [Drawn(wording[anchor.drive_id], before[anchor.drive_id]) for anchor in now]

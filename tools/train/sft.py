@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -29,6 +29,7 @@ from tools.train.language_batch import FrameTokens, LanguageBatch, Row, buckets,
 from tools.train.language_eval import EvalConfig, evaluate
 from tools.train.network_file import finish_network, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
+from tools.train.tokens import TokenCache
 
 STAGE: Final = "sft"
 _DRAWS, _ORDER, _HELD = 0x5F71, 0x5F72, 0x5F73
@@ -100,13 +101,17 @@ class Samples:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Train on the run's data set; leaves the network with its new language model. Raises SftError, DriveError."""
-    from tools.train.tokens import TokenCache
+    """Train on the run's data set; leaves the network with its new language model.
 
+    Raises SftError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
+    """
     dataset = Dataset.open(job.run_dir.stage("collect"))
-    network = start_network(job, STAGE).to(job.device)
+    network = start_network(job, STAGE)
     tokens = TokenCache(dataset, network.vision)
-    result = fit(job, network, dataset, tokens)
+    if tokens.missing():
+        job.progress.say("encoding the drives' frames")
+    tokens.build(device=job.device, ranks=job.ranks, progress=job.progress)
+    result = fit(job, network.to(job.device), dataset, tokens)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
@@ -126,54 +131,50 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, tokens: FrameTokens) -
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
     optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
-    state = _State(job, network, optimiser, _key(config, dataset, content, network))
-    held_loss = state.load()
-    loss = float("nan")
+    state = _State(job, network, optimiser, _key(job, config, dataset, content, network))
+    numbers = state.load()
     questions = _held(held, config, job.seed)
     while optimiser.step_count < total:
         epoch, within = divmod(optimiser.step_count, per_epoch)
         samples = data.draw(np.random.default_rng((job.seed, _DRAWS, epoch)))
         order = buckets([len(each) for each in samples], config.batch, np.random.default_rng((job.seed, _ORDER, epoch)))
         for chosen in order[within:]:
-            loss = _learn(job, network, optimiser, data, [samples[i] for i in chosen])
+            lr = optimiser.lr
+            numbers["loss"] = _learn(job, network, optimiser, data, [samples[i] for i in chosen])
             step = optimiser.step_count
+            line = {"loss": numbers["loss"], "lr": lr}
+            if questions and step % per_epoch == 0:
+                line["held_loss"] = numbers["held_loss"] = mean_loss(job, network, held, questions)
             if job.ranks.first:
-                job.run_dir.log(STAGE, step, loss=loss, lr=optimiser.lr)
-            job.progress.update(step, total, loss=loss, held_loss=held_loss)
-            if job.should_stop():
-                state.save(held_loss)
+                job.run_dir.log(STAGE, step, **line)
+            job.progress.update(step, total, **numbers)
+            stopping = job.should_stop()
+            if stopping or step % config.checkpoint_steps == 0 or step % per_epoch == 0:
+                state.save(numbers)
+            if stopping:
                 raise KeyboardInterrupt
-            if step % config.checkpoint_steps == 0 and step % per_epoch:
-                state.save(held_loss)
-        held_loss = mean_loss(job, network, held, questions)
-        if job.ranks.first and questions:
-            job.run_dir.log(STAGE, optimiser.step_count, held_loss=held_loss)
-        state.save(held_loss)
     result: dict[str, Any] = {
         "steps": total,
         "anchors": len(data.anchors),
         "held_anchors": len(held.anchors),
-        "loss": loss,
-        "held_loss": held_loss,
+        **numbers,
     }
     if job.ranks.first and held.anchors:
-        result["held_out"] = evaluate(network.language, prompts, tokens, held.anchors, config.evaluate, seed=job.seed)
+        result["held_out"] = evaluate(language, prompts, tokens, held.anchors, config.evaluate, seed=job.seed)
     return result
 
 
 def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence[Sample]) -> float:
-    """Equation 3 over given samples, in batches shared by the ranks; NaN where there are none."""
+    """Equation 3 over given samples (one or more), in batches shared by the ranks."""
     config = _config(job)
     order = sorted(range(len(questions)), key=lambda i: (len(questions[i]), i))
     batches = [order[at : at + config.batch] for at in range(0, len(order), config.batch)]
-    total, count = 0.0, 0
+    total = 0.0
     with torch.no_grad(), autocast(job.device, config.optim.bf16):
         for chosen in batches[job.ranks.rank :: job.ranks.world]:
             batch = _batch(job, network, data, [questions[i] for i in chosen])
             total += float(row_losses(network.language, batch).sum())
-            count += len(chosen)
-    whole = job.ranks.sum(count)
-    return job.ranks.sum(total) / whole if whole else float("nan")
+    return job.ranks.sum(total) / len(questions)
 
 
 def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, samples: Sequence[Sample]) -> float:
@@ -214,20 +215,21 @@ def _config(job: StageJob) -> SftConfig:
     return job.recipe.sft
 
 
-def _key(config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla) -> str:
+def _key(job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla) -> str:
     """What a checkpoint must have been made with to be gone on from."""
     made = {
+        "seed": job.seed,
         "config": asdict(config),
         "dataset": dataset.sha256,
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
-        "network": network.config.to_dict(),
+        "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 
 
 class _State:
-    """The stage's checkpoint: weights, moments, step."""
+    """The stage's checkpoint: weights, moments, step and the last numbers."""
 
     def __init__(self, job: StageJob, network: TicVla, optimiser: Optimiser, key: str) -> None:
         self._job = job
@@ -236,24 +238,27 @@ class _State:
         self._key = key
         self._path: Path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
 
-    def save(self, held_loss: float) -> None:
+    def save(self, numbers: Mapping[str, float]) -> None:
         """Written by the first rank alone: all have the same."""
         if self._job.ranks.first:
             weights = checkpoint.with_prefix("language", self._network.language.state_dict())
-            meta = {"key": self._key, "step": self._optimiser.step_count, "held_loss": held_loss}
+            meta = {"key": self._key, "step": self._optimiser.step_count, "numbers": dict(numbers)}
             checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
 
-    def load(self) -> float:
-        """Go on if asked to and able to; gives the last held-out loss. Raises SftError for another run's."""
+    def load(self) -> dict[str, float]:
+        """Go on if asked to and able to; gives the last numbers. Raises SftError for another run's checkpoint."""
         if not (self._job.resume and self._path.exists()):
-            if self._job.ranks.first:
-                self._job.run_dir.rewind(STAGE, -1)
-            return float("nan")
+            self._rewind(-1)
+            return {}
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
             raise SftError(f"{self._path}: of other data, another encoder or another recipe; delete it to begin anew")
         self._network.language.load_state_dict(checkpoint.under("language", tensors))
         self._optimiser.restore(tensors)
+        self._rewind(int(meta["step"]))
+        return dict(meta["numbers"])
+
+    def _rewind(self, step: int) -> None:
         if self._job.ranks.first:
-            self._job.run_dir.rewind(STAGE, int(meta["step"]))
-        return float(meta["held_loss"])
+            self._job.run_dir.rewind(STAGE, step)
+        self._job.ranks.barrier()
