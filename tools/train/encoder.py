@@ -1,7 +1,7 @@
 """Stage 0: the vision encoder learns to see what a navigator needs, from pictures whose truth the simulator knows.
 
-Linear heads on its tokens tell class, distance, colour and heading of what each cell shows, how far the floor is free in
-each direction and what it leads into. The heads are thrown away; the encoder is frozen from here on.
+Linear heads on its tokens tell class, distance, colour and heading of what each cell shows, how far the floor is free
+in each direction and what it leads into. The heads are thrown away; the encoder is frozen from here on.
 
 Which pictures are in a batch and how each is changed is a pure function of seed, epoch and number, so a run that was
 ended goes on exactly, and any number of ranks learns from the same batches.
@@ -28,7 +28,7 @@ from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.augment import AugmentConfig, augmented
 from tools.train.distributed import BatchOrder
-from tools.train.encoder_data import FrameSet, FramesConfig, Shard, fill, frames_sha256, made, plan
+from tools.train.encoder_data import FramesConfig, FrameSet, Shard, fill, frames_sha256, made, plan
 from tools.train.encoder_heads import Balance, EncoderHeads, as_tensors, losses, total
 from tools.train.encoder_labels import COLUMNS, PIXELS
 from tools.train.encoder_score import Fixed, Score, decide
