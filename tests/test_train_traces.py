@@ -216,7 +216,7 @@ def test_only_the_nearest_two_are_spoken_of_and_many_are_many() -> None:
 
 def test_what_somebody_hides_is_not_spoken_of() -> None:
     scenario = scenarios(CORRIDOR)[0]
-    thing = next(thing for thing in scenario.scene.objects if thing.label == "fire extinguisher")
+    thing = next(thing for thing in scenario.scene.objects if thing.label == "vending machine")
     pose = SE2(thing.position_m[0] - 6.0, 0.0, 0.0)
     left_m = 1.6 * thing.position_m[1] / 6.0
     tracer = _tracer(scenario)

@@ -43,7 +43,6 @@ class RouteProgress:
     def __init__(self, scenario: Scenario) -> None:
         self._scene, self._steps = scenario.scene, scenario.told.steps
         self._points = _dense(scenario.task.path)
-        self._along = np.arange(len(self._points)) * _SPACING_M
         self._grid = scenario.site.grid
         self._nearest, self._gap_m = _nearest_points(self._grid, self._points)
         self._at = [self._index_near(step.at) for step in self._steps]
@@ -52,7 +51,7 @@ class RouteProgress:
     @property
     def length_m(self) -> float:
         """Of the told way."""
-        return float(self._along[-1])
+        return (len(self._points) - 1) * _SPACING_M
 
     def at(self, pose: SE2) -> Progress:
         """Which turn is next, and how many openings of its kind were passed on its side since the turn before."""
@@ -106,7 +105,7 @@ class RouteProgress:
     def _overshot(self, index: int, pose: SE2) -> bool:
         """Whether one went straight on past a turn, across the corridor that it leads into."""
         step = self._steps[index]
-        if not step.counted:
+        if not step.ordinal:
             return False
         frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
         area = self._scene.area_at(*xy)
@@ -116,7 +115,7 @@ class RouteProgress:
 
     def _passed(self, index: int, pose: SE2) -> int:
         step = self._steps[index]
-        if not step.counted:
+        if not step.ordinal:
             return 0
         frame = Frame(step.ahead)
         area = self._scene.area_at(pose.x_m, pose.y_m)

@@ -34,6 +34,7 @@ _BODY_M: Final = (0.35, 0.5, 1.7)  # a person: depth, width, height
 _WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
 _WAIT_FOR_M: Final = 2.5
 _BACK_M: Final = -0.3  # who means to be so far behind itself in three seconds turns round
+_ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go on
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
 
 
@@ -63,9 +64,10 @@ class Tracer:
         left_m = self.progress.to_next_m(pose)
         ahead = any(gap < _WAIT_FOR_M and _side(pose, people[index]) == "ahead" for index, gap in crowd)
         plan = words.stop(left_m) if step is None else words.turn(step.side, step.kind, left_m)
-        if (step is not None and 0 < step.ordinal <= progress.passed) or (plan_xy and plan_xy[0][0] < _BACK_M):
+        x_m, y_m = (_ON_M, 0.0) if plan_xy is None else plan_xy[0][:2]
+        if (step is not None and 0 < step.ordinal <= progress.passed) or x_m < _BACK_M:
             plan = words.TURN_BACK
-        elif ahead and plan_xy and hypot(*plan_xy[0][:2]) < _WAIT_M:
+        elif ahead and hypot(x_m, y_m) < _WAIT_M:
             plan = words.WAIT + plan
         motion = [
             words.person(_side(pose, people[index]), gap, _way(pose, people[index], velocities[index]))
