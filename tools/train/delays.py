@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 LONGEST_S: Final = 60.0
 _MOST_TIMES: Final = 1000  # of a profile: more are stood for by as many of their order statistics
+_ROUNDING: Final = 1e-12
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,8 @@ class Delays:
 
     @property
     def beyond(self) -> Array:
-        """[J]: chance that Δt is more than j tenths of a second."""
-        return np.maximum(1.0 - np.cumsum(self.mass), 0.0)
+        """[J]: chance that Δt is more than j tenths of a second; exactly 0 where there is none."""
+        return np.append(np.cumsum(self.mass[:0:-1])[::-1], 0.0)
 
     @property
     def mean_s(self) -> float:
@@ -110,5 +111,6 @@ def _edges(longest_s: float) -> Array:
 
 def _of_cdf(reached: Array) -> Delays:
     """From the chance to be below each upper edge; the last one is 1 but for rounding."""
-    mass = np.maximum(np.diff(reached, prepend=0.0), 0.0)
+    mass = np.diff(reached, prepend=0.0)
+    mass[mass < _ROUNDING] = 0.0
     return Delays(mass / mass.sum())
