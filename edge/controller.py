@@ -93,7 +93,7 @@ def limit_share(speed_mps: float, yaw_rate_radps: float, limits: LimitsConfig, s
     return scale / max(scale, speed_mps / limits.vx_max_mps, abs(yaw_rate_radps) / limits.wz_max_radps, 1e-9)
 
 
-def _grow(value: float, goal: float, step: float) -> float:
+def grown(value: float, goal: float, step: float) -> float:
     """`goal`, with its magnitude at most `step` above that of `value`: speeding up is limited, slowing down is not."""
     reached = abs(value) if value * goal > 0 else 0.0
     return math.copysign(min(abs(goal), reached + step), goal)
@@ -124,8 +124,8 @@ class Controller:
         speed, yaw_rate = arc_to(target, TARGET_TIME_S)
         limits = self._config.limits
         share = limit_share(speed, yaw_rate, limits, inputs.speed_scale)
-        self._vx_mps = _grow(self._vx_mps, speed * share, limits.accel_mps2 * elapsed_s)
-        self._wz_radps = _grow(self._wz_radps, yaw_rate * share, limits.alpha_radps2 * elapsed_s)
+        self._vx_mps = grown(self._vx_mps, speed * share, limits.accel_mps2 * elapsed_s)
+        self._wz_radps = grown(self._wz_radps, yaw_rate * share, limits.alpha_radps2 * elapsed_s)
         return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
 
     def halt(self, reason: str) -> VelocityCommand:

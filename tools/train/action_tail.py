@@ -1,0 +1,108 @@
+"""The action expert cut before its last cross-attention layer: what reinforcement learning trains, and what it keeps.
+
+Paper, appendix D: "we finetune only the final cross-attention Transformer layer and the MLP decoder". All before it is
+frozen, so its output is computed once in a rollout and reused in every epoch of the optimisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+
+from export.model.action import ActionExpert, CrossAttentionLayer
+
+
+class ActionTailError(ValueError):
+    """An action expert that cannot be cut so; one line."""
+
+
+def check_tail(expert: ActionExpert) -> None:
+    """Raise ActionTailError unless the expert's last layer and head alone make a trajectory (head `query`)."""
+    head = getattr(expert.config.action, "head", "query")
+    if head != "query":
+        raise ActionTailError(f"action.head {head!r}: reinforcement learning trains the query head; imitate is its end")
+    if expert.config.action.semantic_interface == "waypoints":
+        raise ActionTailError(
+            "semantic_interface 'waypoints': reinforcement learning needs kv or values-only, fixed by a generation"
+        )
+
+
+def tail_parameters(expert: ActionExpert) -> dict[str, torch.nn.Parameter]:
+    """Name → parameter of the last cross-attention layer, its keys and values, and the head, in the expert's names."""
+    last = len(expert.layers) - 1
+    trained = (f"layers.{last}.", f"key_values.{last}.", "norm.", "head.", "out.")
+    return {name: each for name, each in expert.named_parameters() if name.startswith(trained)}
+
+
+def freeze_all_but_tail(expert: ActionExpert) -> None:
+    """Only the tail's parameters keep gradients."""
+    trained = tail_parameters(expert)
+    for name, each in expert.named_parameters():
+        each.requires_grad_(name in trained)
+
+
+def load_tail(expert: ActionExpert, tensors: Mapping[str, Tensor]) -> None:
+    """Give the tail other weights; raises ActionTailError unless they are exactly the tail's."""
+    wanted = tail_parameters(expert)
+    if set(tensors) != set(wanted):
+        odd = sorted(set(tensors) ^ set(wanted))[0]
+        raise ActionTailError(f"weights of the last layer and the head: {odd} is missing or unknown")
+    with torch.no_grad():
+        for name, each in wanted.items():
+            each.copy_(tensors[name])
+
+
+def semantic_of(expert: ActionExpert, last_layer_kv: Tensor) -> Tensor:
+    """Semantic tokens [1, T, hidden] of a generation's K‖V [1, T, kv_dim]; frozen, once a generation."""
+    with torch.no_grad():
+        return expert.semantic_tokens(last_layer_kv)
+
+
+def now_of(expert: ActionExpert, visual_tokens: Tensor, state: Tensor, latency: Tensor) -> Tensor:
+    """Tokens of the present [B, N + 2, hidden]; frozen."""
+    with torch.no_grad():
+        return expert.now_tokens(visual_tokens, state, latency)
+
+
+def prefix(expert: ActionExpert, now: Tensor, semantic: Tensor) -> Tensor:
+    """The queries [B, steps, hidden] before the last layer; frozen. All of the batch have T semantic tokens."""
+    with torch.no_grad():
+        x = expert.queries.expand(now.shape[0], -1, -1)
+        pairs = list(zip(expert.key_values, expert.layers, strict=True))
+        for key_value, layer in pairs[:-1]:
+            keys, values = key_value(torch.cat([now, semantic], dim=1))
+            x = layer(x, keys, values)
+        return x
+
+
+def tail(expert: ActionExpert, x: Tensor, now: Tensor, semantic: Tensor, real: Tensor | None = None) -> Tensor:
+    """Trajectory [B, steps, 3] from the queries before the last layer; `real` [B, T] is False at padded tokens."""
+    c = expert.config.action
+    tokens = torch.cat([now, semantic], dim=1)
+    keys, values = expert.key_values[-1](tokens)
+    mask = None
+    if real is not None:
+        mask = torch.cat([real.new_ones(now.shape[:2]), real], dim=1)[:, None, None, :]
+    out = expert.out(expert.head(expert.norm(_cross(expert.layers[-1], x, keys, values, mask))))
+    if c.parameterisation == "increments":
+        return torch.cumsum(out, dim=1)
+    return torch.cat([out[..., :2], torch.cumsum(out[..., 2:], dim=1)], dim=-1)
+
+
+def padded(sequences: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Sequences [T_i, h] as one batch [B, T, h] padded with zeros, and which tokens are real [B, T]."""
+    lengths = torch.tensor([len(each) for each in sequences])
+    batch = torch.nn.utils.rnn.pad_sequence(list(sequences), batch_first=True)
+    return batch, torch.arange(batch.shape[1])[None] < lengths[:, None]
+
+
+def _cross(layer: CrossAttentionLayer, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+    """`CrossAttentionLayer.forward`, with padded keys left out."""
+    n, t, d = x.shape
+    q = layer.q(layer.norm1(x)).reshape(n, t, layer.heads, d // layer.heads).transpose(1, 2)
+    attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)
+    x = x + layer.o(attended.transpose(1, 2).reshape(n, t, d))
+    return x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))

@@ -1,0 +1,175 @@
+"""What a rollout keeps of the steps it has driven: everything the optimisation needs, the frozen parts computed once.
+
+One safetensors file a job, over S steps of E episodes and G generations: no pickle between processes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+FORMAT: Final = "tic-vla-edge-rollout/1"
+GOAL_SCALE_M: Final = 10.0
+GOAL_FARTHEST_M: Final = 40.0
+
+Floats = npt.NDArray[np.float32]
+
+
+class RolloutError(ValueError):
+    """A rollout that is not whole; one line."""
+
+
+@dataclass(frozen=True)
+class EpisodeEnd:
+    """How one driven episode came out. `terminal`: reached or fallen; otherwise it was cut off."""
+
+    id: str
+    kind: str
+    people: int
+    steps: int
+    end: str
+    terminal: bool
+    success: bool
+    collided: bool
+    reward: float
+    spl: float
+    time_s: float
+
+
+@dataclass
+class EpisodeSteps:
+    """One episode while it is driven; a step is one control period that had a semantic state to act by."""
+
+    visual: list[Floats] = field(default_factory=list)
+    """[N, D] a step."""
+    queries: list[Floats] = field(default_factory=list)
+    """[steps, hidden] a step, before the last layer."""
+    state: list[tuple[float, ...]] = field(default_factory=list)
+    latency: list[tuple[float, ...]] = field(default_factory=list)
+    goal: list[tuple[float, float]] = field(default_factory=list)
+    action: list[tuple[float, float]] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)
+    generation: list[int] = field(default_factory=list)
+    """Index into `semantic`."""
+    semantic: list[Floats] = field(default_factory=list)
+    """[T, hidden] a generation."""
+    after_visual: Floats | None = None
+    after_state: tuple[float, ...] = (0.0, 0.0, 0.0)
+    after_goal: tuple[float, float] = (0.0, 0.0)
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+
+def goal_features(x_m: float, y_m: float) -> tuple[float, float]:
+    """A goal in the robot frame as the value network is told it: clipped to 40 m, in tens of metres."""
+    distance = float(np.hypot(x_m, y_m))
+    share = min(1.0, GOAL_FARTHEST_M / max(distance, 1e-9)) / GOAL_SCALE_M
+    return (x_m * share, y_m * share)
+
+
+def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> None:
+    """Write a job's episodes in one rename; episodes without a step are kept by their end alone."""
+    driven = [steps for steps, _ in episodes if len(steps)]
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    if driven:
+        arrays = {
+            "visual": np.stack([each for steps in driven for each in steps.visual]).astype(np.float32),
+            "queries": np.stack([each for steps in driven for each in steps.queries]).astype(np.float32),
+            "state": _rows(driven, "state"),
+            "latency": _rows(driven, "latency"),
+            "goal": _rows(driven, "goal"),
+            "action": _rows(driven, "action"),
+            "reward": np.array([each for steps in driven for each in steps.reward], dtype=np.float32),
+            "generation": _generations(driven),
+            "semantic": np.concatenate([each for steps in driven for each in steps.semantic]).astype(np.float32),
+            "semantic_end": np.cumsum([len(each) for steps in driven for each in steps.semantic]).astype(np.int64),
+            "after_visual": np.stack([_after(steps) for steps in driven]).astype(np.float32),
+            "after_state": np.array([steps.after_state for steps in driven], dtype=np.float32),
+            "after_goal": np.array([steps.after_goal for steps in driven], dtype=np.float32),
+        }
+    ends = [asdict(end) for _, end in episodes]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    save_file(arrays, str(partial), metadata={"format": FORMAT, "ends": json.dumps(ends)})
+    partial.replace(path)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """All steps of one iteration, episodes one after the other. Shapes as in `EpisodeSteps`, stacked over S steps."""
+
+    arrays: dict[str, npt.NDArray[Any]]
+    semantic: tuple[Floats, ...]
+    ends: tuple[EpisodeEnd, ...]
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return len(self.arrays["reward"]) if self.arrays else 0
+
+    def episodes(self) -> Iterator[tuple[slice, int, EpisodeEnd]]:
+        """Steps of each driven episode, its number in `after_*`, and how it ended."""
+        start = number = 0
+        for end in self.ends:
+            if end.steps:
+                yield slice(start, start + end.steps), number, end
+                start, number = start + end.steps, number + 1
+
+
+def read(paths: Sequence[Path]) -> Rollout:
+    """The jobs' files as one rollout, in the order given. Raises RolloutError, OSError."""
+    parts: list[dict[str, npt.NDArray[Any]]] = []
+    semantic: list[Floats] = []
+    ends: list[EpisodeEnd] = []
+    for path in paths:
+        arrays, found = _read(path)
+        ends += found
+        if not arrays:
+            continue
+        rows = np.split(arrays.pop("semantic"), arrays.pop("semantic_end")[:-1])
+        arrays["generation"] = arrays["generation"] + len(semantic)
+        semantic += rows
+        parts.append(arrays)
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+    if joined and sum(end.steps for end in ends) != len(joined["reward"]):
+        raise RolloutError(f"rollout {paths[0].parent}: its episodes and its steps do not agree")
+    return Rollout(joined, tuple(semantic), tuple(ends))
+
+
+def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], list[EpisodeEnd]]:
+    try:
+        with safe_open(str(path), framework="np") as file:
+            header = file.metadata() or {}
+            if header.get("format") != FORMAT:
+                raise RolloutError(f"rollout {path}: expected format {FORMAT}, found {header.get('format')}")
+            ends = [EpisodeEnd(**end) for end in json.loads(header["ends"])]
+            return {name: file.get_tensor(name) for name in file.keys()}, ends  # noqa: SIM118 — not a mapping
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, RolloutError):
+            raise
+        raise RolloutError(f"rollout {path}: not whole ({error})") from error
+
+
+def _rows(driven: Sequence[EpisodeSteps], name: str) -> Floats:
+    return np.array([row for steps in driven for row in getattr(steps, name)], dtype=np.float32)
+
+
+def _generations(driven: Sequence[EpisodeSteps]) -> npt.NDArray[np.int64]:
+    numbers, before = [], 0
+    for steps in driven:
+        numbers += [before + number for number in steps.generation]
+        before += len(steps.semantic)
+    return np.array(numbers, dtype=np.int64)
+
+
+def _after(steps: EpisodeSteps) -> Floats:
+    return steps.visual[-1] if steps.after_visual is None else steps.after_visual
