@@ -38,7 +38,7 @@ _NS: Final = 1_000_000_000
 class DrawConfig:
     """What is drawn for each sample."""
 
-    waypoints_only: float = 0.25
+    waypoints_only: float = 0.2
     """Share of answers that are waypoints without reasoning."""
     before_min_s: float = 0.3
     before_max_s: float = 6.0

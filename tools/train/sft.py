@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw
-from tools.train.drive import Dataset
+from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
 from tools.train.language_batch import FrameTokens, LanguageBatch, Row, buckets, collate, frames_of, row_losses
@@ -31,7 +31,11 @@ from tools.train.network_file import finish_network, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
 from tools.train.tokens import TokenCache
 
+if TYPE_CHECKING:
+    from tools.train.recipe import Recipe
+
 STAGE: Final = "sft"
+PLANNED_DRIVE_S: Final = 30.0
 _DRAWS, _ORDER, _HELD = 0x5F71, 0x5F72, 0x5F73
 
 
@@ -98,6 +102,13 @@ class Samples:
     def _frames(self, index: int) -> tuple[npt.NDArray[np.float16], ...]:
         anchor = self.anchors[index]
         return frames_of(self._tokens, anchor.drive_id, anchor.frames)
+
+
+def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
+    """(what, how many, which measured rate) before there are drives: they are planned to be 30 s long."""
+    config, collect = recipe.sft or SftConfig(), recipe.collect
+    seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
+    return [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", seconds * config.epochs, "sft")]
 
 
 def run(job: StageJob) -> dict[str, Any]:
