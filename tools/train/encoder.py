@@ -167,7 +167,7 @@ class _Pupil:
         order = BatchOrder(len(data), config.batch, config.epochs, job.seed)
         job.ranks.copy_parameters(self._parameters)
         optimiser = Optimiser(self._parameters, config.optim, order.steps, job.ranks)
-        held_loss, loss = self._load(optimiser), float("nan")
+        loss, held_loss = self._load(optimiser)
         look = np.sort(job.rng(_LOOK).permutation(len(held))[: config.look_frames])
         with _Batches(job, data, order, config.augment, self._px) as batches:
             while optimiser.step_count < order.steps:
@@ -181,10 +181,10 @@ class _Pupil:
                     job.run_dir.log(STAGE, step, held_loss=held_loss, **_watched(score))
                 job.progress.update(step, order.steps, loss=loss, held_loss=held_loss)
                 if job.should_stop():
-                    self._save(optimiser, held_loss)
+                    self._save(optimiser, loss, held_loss)
                     raise KeyboardInterrupt
                 if step % config.checkpoint_steps == 0 or step == order.steps:
-                    self._save(optimiser, held_loss)
+                    self._save(optimiser, loss, held_loss)
         return {"steps": order.steps, "loss": loss}
 
     @torch.no_grad()
@@ -212,22 +212,22 @@ class _Pupil:
         optimiser.step(count)
         return job.ranks.mean(value, count)
 
-    def _save(self, optimiser: Optimiser, held_loss: float) -> None:
+    def _save(self, optimiser: Optimiser, loss: float, held_loss: float) -> None:
         if self._job.ranks.first:
             weights = {
                 **checkpoint.with_prefix("vision", self._vision.state_dict()),
                 **checkpoint.with_prefix("heads", self._heads.state_dict()),
             }
-            meta = {"key": self._key, "step": optimiser.step_count, "held_loss": held_loss}
+            meta = {"key": self._key, "step": optimiser.step_count, "loss": loss, "held_loss": held_loss}
             checkpoint.save(self._path, {**weights, **optimiser.tensors()}, meta)
 
-    def _load(self, optimiser: Optimiser) -> float:
-        """Go on if asked to and able to; gives the last held-out loss. Raises EncoderError for another run's."""
+    def _load(self, optimiser: Optimiser) -> tuple[float, float]:
+        """Go on if asked to and able to; the last loss and that of held-out pictures. Raises EncoderError."""
         job = self._job
         if not (job.resume and self._path.exists()):
             if job.ranks.first:
                 job.run_dir.rewind(STAGE, -1)
-            return float("nan")
+            return float("nan"), float("nan")
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
             raise EncoderError(f"{self._path}: of other pictures or another recipe; delete it to begin anew")
@@ -236,7 +236,7 @@ class _Pupil:
         optimiser.restore(tensors)
         if job.ranks.first:
             job.run_dir.rewind(STAGE, int(meta["step"]))
-        return float(meta["held_loss"])
+        return float(meta["loss"]), float(meta["held_loss"])
 
 
 class _Batches:

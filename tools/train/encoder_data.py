@@ -24,7 +24,7 @@ from edge.cli import write_whole
 from export.typed import build, plain
 from sim_hil.benchmark.episode import ROBOTS
 from tools.train.augment import Picture, decoded
-from tools.train.drive import VAL_EVERY, file_sha256
+from tools.train.drive import file_sha256
 from tools.train.encoder_labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
 from tools.train.job import StageProgress
 from tools.train.sites import CORRIDOR, KINDS, OUTDOORS
@@ -32,7 +32,11 @@ from tools.train.workers import Told, Workers
 
 FORMAT: Final = 1
 WORKER: Final = "tools.train.encoder_worker"
-_FIRST_LAYOUT: Final = 10_000_000  # times VAL_EVERY: far above the seeds that drives are recorded in
+FIRST_LAYOUT: Final = 10_000_000_000
+"""Of layouts that pictures are taken in: above every seed that drives are recorded in (`tools.train.scenarios`)."""
+MOST_SCENES: Final = 50_000
+"""Of each sort; where a layout cannot be built, the one so many further on is taken."""
+_OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts
 _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
 _OUTDOORS_LEAST: Final = 20  # people
@@ -74,6 +78,8 @@ class FramesConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.count <= 10_000_000 and 0 <= self.held <= 1_000_000 and 1 <= self.per_scene <= 100_000):
             raise ValueError("expected count up to 10000000, held up to 1000000 and per_scene from 1 to 100000")
+        if max(self.count, self.held) > MOST_SCENES * self.per_scene:
+            raise ValueError(f"expected {MOST_SCENES} scenes at most; set per_scene higher")
         if not self.kinds or not set(self.kinds) <= set(KINDS):
             raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {', '.join(self.kinds) or 'none'}")
         if self.held and set(self.kinds) <= {CORRIDOR}:
@@ -143,14 +149,13 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
     kinds = [kind for kind in config.kinds if not (held and kind == CORRIDOR)]
     left = config.held if held else config.count
     # Held-out pictures come from many layouts: they tell more about new ones than many pictures of one.
-    per_scene = min(config.per_scene, max(1, -(-left // (2 * len(set(kinds)))))) if held else config.per_scene
+    per_scene = min(config.per_scene, max(1, -(-left // (4 * len(set(kinds)))))) if held else config.per_scene
     shards: list[Shard] = []
     while left > 0:
         number = len(shards)
         rng = np.random.default_rng((seed, _TAG, int(held), number))
-        kind = kinds[number % len(kinds)]
-        place = VAL_EVERY - 1 if held else number % (VAL_EVERY - 1)
-        layout_seed = VAL_EVERY * (_FIRST_LAYOUT + (seed % 1_000) * 100_000 + number) + place
+        kind = kinds[(number + number // len(kinds)) % len(kinds)]
+        layout_seed = FIRST_LAYOUT + seed % 1_000 * _OF_A_SEED + (_HELD_FROM if held else 0) + number
         frames = min(per_scene, left)
         robot, people = ROBOTS[int(rng.integers(len(ROBOTS)))], _people(config, kind, rng)
         name = f"{'held' if held else 'train'}-{number:04d}-{kind}-{robot}"

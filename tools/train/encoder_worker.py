@@ -22,8 +22,8 @@ from sim_hil.layouts import LayoutError
 from sim_hil.people import UPDATE_HZ, People, appearances
 from sim_hil.scene import Scene
 from tools.train.augment import encoded
-from tools.train.drive import PICTURE_PX, VAL_EVERY
-from tools.train.encoder_data import WORKER, Shard, finish, path_of
+from tools.train.drive import PICTURE_PX
+from tools.train.encoder_data import MOST_SCENES, WORKER, Shard, finish, path_of
 from tools.train.encoder_ids import IdWorld, view_of
 from tools.train.encoder_labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder_poses import Poses, body_state
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 
 _TAG: Final = 0xE0C1
 _LAYOUT_TRIES: Final = 8
-_NEXT_LAYOUT: Final = 50_000 * VAL_EVERY  # held-out layouts stay held out
 _SAY_EVERY: Final = 50
 _THINNED_SHARE: Final = 0.5  # of moments in which some of the people are not there
 _AWAY_M: Final = -1e5
@@ -127,7 +126,7 @@ def _site(shard: Shard) -> Site:
     why = ""
     for attempt in range(_LAYOUT_TRIES):
         try:
-            return Site(shard.kind, shard.layout_seed + attempt * _NEXT_LAYOUT)
+            return Site(shard.kind, shard.layout_seed + attempt * MOST_SCENES)
         except LayoutError as error:
             why = str(error)
     raise LayoutError(f"{shard.name}: no sound layout in {_LAYOUT_TRIES}; the last: {why}")
