@@ -140,12 +140,24 @@ def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recip
     kinds = {name: stage_config(name) for name in STAGES} | {"dagger": DaggerConfig}
     for setting in overrides:
         _set(content, kinds, setting)
-    stages = {name: build(kind, content.get(name, {}), f"[{name}]") for name, kind in kinds.items()}
+    stages = {name: build(kind, filled(kind(), content.get(name, {})), f"[{name}]") for name, kind in kinds.items()}
     model = with_overrides(_model(content.get("model")), model_settings(overrides))
     name, seed = content.get("name"), content.get("seed")
     if not isinstance(name, str) or type(seed) is not int:
         raise RecipeError(f"expected name, a text, and seed, a whole number; found {name!r} and {seed!r}")
     return Recipe(name, seed, model, **stages)
+
+
+def filled(default: object, table: object) -> object:
+    """A table over the numbers of `default`, nested tables too: `optim.lr` alone changes nothing else."""
+    if not isinstance(table, Mapping):
+        return table
+    whole = {**plain(default), **table}
+    for name, value in table.items():
+        own = getattr(default, str(name), None)
+        if dataclasses.is_dataclass(own):
+            whole[name] = filled(own, value)
+    return whole
 
 
 def stage_seed(recipe: Recipe, stage: str) -> int:
