@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.model.action import ActionExpert, CrossAttentionLayer
+from export.model.action import ActionExpert
+from export.model.heads import integrated
 
 
 class ActionTailError(ValueError):
@@ -86,10 +86,8 @@ def tail(expert: ActionExpert, x: Tensor, now: Tensor, semantic: Tensor, real: T
     mask = None
     if real is not None:
         mask = torch.cat([real.new_ones(now.shape[:2]), real], dim=1)[:, None, None, :]
-    out = expert.out(expert.head(expert.norm(_cross(expert.layers[-1], x, keys, values, mask))))
-    if c.parameterisation == "increments":
-        return torch.cumsum(out, dim=1)
-    return torch.cat([out[..., :2], torch.cumsum(out[..., 2:], dim=1)], dim=-1)
+    out = expert.out(expert.head(expert.norm(expert.layers[-1](x, keys, values, mask))))
+    return integrated(out, c.parameterisation)
 
 
 def padded(sequences: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -97,12 +95,3 @@ def padded(sequences: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     lengths = torch.tensor([len(each) for each in sequences])
     batch = torch.nn.utils.rnn.pad_sequence(list(sequences), batch_first=True)
     return batch, torch.arange(batch.shape[1])[None] < lengths[:, None]
-
-
-def _cross(layer: CrossAttentionLayer, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """`CrossAttentionLayer.forward`, with padded keys left out."""
-    n, t, d = x.shape
-    q = layer.q(layer.norm1(x)).reshape(n, t, layer.heads, d // layer.heads).transpose(1, 2)
-    attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)
-    x = x + layer.o(attended.transpose(1, 2).reshape(n, t, d))
-    return x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))

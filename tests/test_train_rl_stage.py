@@ -1,0 +1,119 @@
+"""The stage of reinforcement learning around made-up rollouts: what it logs, keeps, takes back and resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from export.model.network import TicVla
+from tests.test_train_rl_tail import _config, _episode, _network
+from tools.train import rollout
+from tools.train.job import StageJob, StopFlag
+from tools.train.network_file import finish_network
+from tools.train.ppo import PpoConfig
+from tools.train.recipe import Recipe
+from tools.train.rl import STAGE, RlConfig, RlError, improve, run
+from tools.train.rl_worker import RolloutOrder
+from tools.train.run_dir import RunDir
+
+PPO = PpoConfig(batch=4, epochs=2, action_lr=1e-3, value_lr=1e-3)
+
+
+def _job(out: Path, config: RlConfig, *, resume: bool = False, stop: StopFlag | None = None) -> StageJob:
+    recipe = Recipe("test", 0, _config(), rl=config)
+    return StageJob(recipe, RunDir.open(out, recipe), resume=resume, seed=7, stop=stop or StopFlag())
+
+
+def _imitated(job: StageJob) -> Path:
+    return finish_network(job, "imitate", _network())
+
+
+def _driver(network: TicVla, success: Callable[[int], bool], stop: tuple[StopFlag, int] | None = None) -> Any:
+    """Rollouts by the number of the call; evaluations succeed as `success` of their iteration says."""
+    calls = 0
+
+    def drive(order: RolloutOrder, **_: Any) -> rollout.Rollout:
+        nonlocal calls
+        calls += 1
+        if stop is not None and calls == stop[1]:
+            raise KeyboardInterrupt
+        folder = Path(order.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        iteration = int(folder.name.split("-")[-1])
+        steps, end = _episode(network, 8, order.seed % 97, reward=0.3)
+        if not order.explore:
+            end = rollout.EpisodeEnd(**{**vars(end), "success": success(iteration)})
+        rollout.save(folder / "0.safetensors", [(steps, end)])
+        return rollout.read([folder / "0.safetensors"])
+
+    return drive
+
+
+def _improved(out: Path, config: RlConfig, drive: Any, *, resume: bool = False) -> tuple[TicVla, dict[str, Any]]:
+    job = _job(out, config, resume=resume)
+    before = _imitated(job)
+    network = _network()
+    return network, improve(job, network, before, out / "artifacts", drive)
+
+
+def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) -> None:
+    config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
+    _, result = _improved(tmp_path, config, _driver(_network(), lambda _: True))
+    lines = [line for line in RunDir(tmp_path).lines() if line["stage"] == STAGE]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
+    assert ["eval_success" in line for line in lines] == [False, True, False, True]
+    assert result["iterations"] == 4 and result["steps"] == 32
+
+
+def test_a_run_that_was_ended_goes_on_exactly(tmp_path: Path) -> None:
+    config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=1, ppo=PPO, fall_back=1.0)
+    whole, result = _improved(tmp_path / "whole", config, _driver(_network(), lambda k: k == 4))
+    with pytest.raises(KeyboardInterrupt):
+        _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k == 4, (StopFlag(), 4)))
+    parts, again = _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k == 4), resume=True)
+    assert again == result
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, parts.state_dict()[name]), name
+
+
+def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
+    config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
+    network, result = _improved(tmp_path, config, _driver(_network(), lambda k: k == 0))
+    assert result["best"] == result["before"]
+    began = _network().state_dict()
+    tails = [name for name in began if name.startswith(("action.layers.2.", "action.head.", "action.out."))]
+    assert tails and all(torch.equal(network.state_dict()[name], began[name]) for name in tails)
+    (last,) = [line for line in RunDir(tmp_path).lines() if line["step"] == 2]
+    assert last["fell_back"] == 1.0
+
+
+def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> None:
+    config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
+    _improved(tmp_path, config, _driver(_network(), lambda _: True))
+    (tmp_path / "recipe.toml").unlink()
+    for path in ("imitate/result.json", "rl/result.json"):
+        (tmp_path / path).unlink(missing_ok=True)
+    other = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, reward_scale=0.5)
+    job = StageJob(Recipe("test", 0, _config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
+    with pytest.raises(RlError, match="another recipe"):
+        improve(job, _network(), tmp_path / "imitate" / "model.safetensors", tmp_path, _driver(_network(), bool))
+
+
+def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
+    with pytest.raises(RlError, match="run imitate first"):
+        run(_job(tmp_path, RlConfig()))
+
+
+def test_kinds_of_scenes_take_turns() -> None:
+    config = RlConfig(rotate_every=2, rotation=("office", "hospital"))
+    assert [next(iter(config.kinds(i))) for i in range(5)] == ["office", "office", "hospital", "hospital", "office"]
+    assert set(RlConfig(rotate_every=0).kinds(3)) == {"office", "hospital", "warehouse"}
+
+
+def test_delays_have_the_mean_that_was_asked_for() -> None:
+    times = RlConfig(mean_delay_s=5.0).generation_s()
+    assert sum(times) / len(times) == pytest.approx(5.0) and (min(times), max(times)) == (0.0, 10.0)
