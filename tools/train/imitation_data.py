@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from edge.geometry import SE2
 from edge.guidance import waypoints_now
+from edge.reasoning_text import Waypoints
 from export.model.config import TicVlaConfig
 from tools.train.action_batch import Group
 from tools.train.delays import Delays
@@ -88,9 +89,11 @@ class SampleConfig:
             raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
 
     def undisturbed(self) -> SampleConfig:
-        """The same with every frame alike and nothing disturbed: what is evaluated on."""
+        """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
         even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
-        return replace(self, cut_text=0.0, offset_noise_m_per_m=0.0, offset_noise_deg_per_m=0.0, weights=even)
+        return replace(
+            self, cut_text=0.0, standing_start=0.0, offset_noise_m_per_m=0.0, offset_noise_deg_per_m=0.0, weights=even
+        )
 
 
 @dataclass(frozen=True)
@@ -307,6 +310,10 @@ class Samples:
             target=drive.target[ks],
             known=np.arange(drive.target.shape[1]) < drive.known[ks][:, None],
         )
+
+    def said(self, chosen: Chosen) -> Waypoints | None:
+        """Waypoints of the state that a choice acts on, m in the anchor's robot frame; None where it has none."""
+        return self._cache.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
 
     def draw(self, rng: np.random.Generator) -> Group:
         """Choose and take."""
