@@ -210,6 +210,8 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
         raise RecipeError(f"{where}: unknown key; {near(section, [*kinds, 'seed', 'model'])} as STAGE.field")
     kind: Any = kinds[section]
     table = content.setdefault(section, {})
+    if not isinstance(table, dict):
+        raise RecipeError(f"[{section}]: expected a table, found {table!r}")
     for name in path[:-1]:
         kind = field_types(kind).get(name) if dataclasses.is_dataclass(kind) else None
         table[name] = dict(table.get(name, {}))
