@@ -165,7 +165,7 @@ def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
 
 
 def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None) -> Recorded:
-    count = kept_frames(np.array(frames.pose), outcome, None if plan.pupil else first_collision)
+    count = kept_frames(np.array(frames.pose), outcome, first_collision, pupil=plan.pupil)
     if count < LEAST_FRAMES:
         raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before trouble ({outcome})")
     if not plan.pupil and max(off_way_m(point, plan.path) for point in np.array(frames.pose)[:count, :2]) > plan.off_m:
@@ -189,14 +189,15 @@ def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, firs
     return Recorded(outcome, collided, arrays, traces)
 
 
-def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | None) -> int:
+def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | None, *, pupil: bool = False) -> int:
     """How many frames of a drive are learned from: those before its trouble; `pose` [N, 3].
 
-    `first_collision`: the frame by which it had collided, None if it never did or that is no trouble.
+    `first_collision`: the frame by which it had collided, if it did. A pupil's trouble is what it learns from, but for
+    a fall, out of which nobody drives.
     """
-    count = len(pose)
-    if outcome == "fell":
-        count -= _BEFORE_CRASH
+    count = len(pose) - (_BEFORE_CRASH if outcome == "fell" else 0)
+    if pupil:
+        return max(count, 0)
     if outcome == "timeout":  # the time it stood at the end, waiting for what never came
         gaps = np.hypot(*(pose[:, :2] - pose[-1, :2]).T)
         count = min(count, int(np.max(np.flatnonzero(gaps > _STUCK_M), initial=-1)) + 1 + RATE_HZ)

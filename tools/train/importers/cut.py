@@ -32,6 +32,7 @@ PICTURE_GAP_S: Final = 0.25  # an instant without a picture so new lies in a hol
 POSE_GAP_S: Final = 0.25  # and so does one between two poses further apart than this
 QUALITY: Final = 90
 THRESHOLD_M: Final = 1.5
+_ROUNDING: Final = 1e-4  # of an instant: stamps since 1970 in seconds are exact to a quarter of a microsecond
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ def pieces(recording: Recording) -> list[Piece]:
     """The recording at 10 Hz, cut at its holes. No instant is given a picture that was taken after it."""
     stamps, poses = recording.stamps_s, recording.poses
     start, end = max(stamps[0], poses[0, 0]), min(stamps[-1], poses[-1, 0])
-    times = start + np.arange(max(0, int(np.floor((end - start) * RATE_HZ + 1e-6)) + 1)) / RATE_HZ
-    picture = np.searchsorted(stamps, times + 1e-6, side="right") - 1
+    times = start + np.arange(max(0, int(np.floor((end - start) * RATE_HZ + _ROUNDING)) + 1)) / RATE_HZ
+    picture = np.searchsorted(stamps, times + _ROUNDING / RATE_HZ, side="right") - 1
     after = np.clip(np.searchsorted(poses[:, 0], times), 1, len(poses) - 1)
     whole = (times - stamps[picture] <= PICTURE_GAP_S) & (poses[after, 0] - poses[after - 1, 0] <= POSE_GAP_S)
     heading = np.unwrap(poses[:, 3])
