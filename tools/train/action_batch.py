@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.model.action import ActionExpert, CrossAttentionLayer
+from export.model.action import ActionExpert
+from export.model.attention import CrossAttentionLayer, KeyValue
+from export.model.heads import integrated
 
 Array = NDArray[np.float32]
 
@@ -97,22 +99,70 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
     )
 
 
-def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
-    """Planned trajectories [B, steps, 3] (x m, y m, theta rad) in each frame's robot frame, by the network's layers.
+@dataclass(frozen=True)
+class SharedTrunk:
+    """`export.model.action.Trunk` over S semantic states, each of which B/S frames in a row share."""
 
-    The network is in evaluation mode: its own dropout is the batch's here.
-    """
+    layers: tuple[CrossAttentionLayer, ...]
+    key_values: tuple[KeyValue, ...]
+    now: tuple[tuple[Tensor, Tensor], ...]
+    """Keys and values of the present, of each layer, [B, heads, N + 2, d]."""
+    semantic: tuple[tuple[Tensor, Tensor], ...]
+    """Of the semantic states, [S, heads, T, d]."""
+    real: Tensor
+    """[S, T] bool, False at padding."""
+
+    @property
+    def batch(self) -> int:
+        """B."""
+        return len(self.now[0][0])
+
+    def __call__(self, x: Tensor, *, among: bool = False) -> Tensor:
+        """Tokens [B, steps, hidden] through all layers; `among`: they also attend to one another."""
+        for layer, key_value, now, semantic in zip(self.layers, self.key_values, self.now, self.semantic, strict=True):
+            if among:
+                own = key_value(layer.norm1(x))
+                now = (torch.cat([now[0], own[0]], dim=2), torch.cat([now[1], own[1]], dim=2))
+            x = _layer(layer, x, now, semantic, self.real)
+        return x
+
+
+def trunk(action: ActionExpert, batch: ActionBatch) -> SharedTrunk:
+    """The network's layers over a batch. The network is in evaluation mode: what is dropped out is the batch's."""
+    if action.training:
+        raise ValueError("the action expert must be in evaluation mode: it would drop out tokens by itself")
     semantic = action.semantic_tokens(batch.guidance) * batch.keep_guidance[..., None]
     now = action.now_tokens(batch.visual_tokens, batch.state, batch.latency)
+    # The last two are the robot's state and the latency.
     now = torch.cat([now[:, :-2], now[:, -2:-1] * batch.keep_state[:, None, None], now[:, -1:]], dim=1)
-    x = action.queries.expand(len(batch), -1, -1)
-    for key_value, layer in zip(action.key_values, action.layers, strict=True):
-        assert isinstance(layer, CrossAttentionLayer)
-        x = _layer(layer, x, key_value(now), key_value(semantic), batch.real)
-    out = action.out(action.head(action.norm(x))).float()
-    if action.config.action.parameterisation == "increments":
-        return torch.cumsum(out, dim=1)
-    return torch.cat([out[..., :2], torch.cumsum(out[..., 2:], dim=1)], dim=-1)
+    key_values = tuple(action.key_values)
+    return SharedTrunk(
+        layers=tuple(action.layers),
+        key_values=key_values,
+        now=tuple(key_value(now) for key_value in key_values),
+        semantic=tuple(key_value(semantic) for key_value in key_values),
+        real=batch.real,
+    )
+
+
+def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
+    """Planned trajectories [B, steps, 3] (x m, y m, theta rad), each in its frame's robot frame."""
+    layers = trunk(action, batch)
+    if action.config.action.head != "query":
+        return action.plan(layers)
+    found = action.head(action.norm(layers(action.queries.expand(len(batch), -1, -1))))
+    # Summed in float32 whatever the network computes in: thirty steps of bfloat16 would add up to centimetres.
+    return integrated(action.out(found).float(), action.config.action.parameterisation)
+
+
+def errors(
+    action: ActionExpert, batch: ActionBatch, generator: torch.Generator, *, beta: float, heading_weight: float
+) -> Tensor:
+    """What training makes small, for every frame [B]: equation 4, or what another head than `query` learns by."""
+    if action.config.action.head == "query":
+        return smooth_l1(plan(action, batch), batch, beta=beta, heading_weight=heading_weight)
+    terms = action.errors(trunk(action, batch), batch.target, generator)
+    return (terms.sum(-1) * batch.known).mean(1)
 
 
 def _layer(
