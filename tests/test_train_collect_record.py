@@ -156,18 +156,29 @@ def _poses(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack((x, 0 * x, 0 * x), axis=1)
 
 
-def test_who_waits_for_less_or_creeps_on_is_not_hopeless() -> None:
-    assert not is_hopeless(_poses(np.zeros(150)), WAY)
-    assert not is_hopeless(_poses(np.arange(200) * 0.004), WAY)
-    assert is_hopeless(_poses(np.arange(200) * 0.003), WAY)
+def _plan(*, pupil: bool) -> DrivePlan:
+    return DrivePlan(corridor_episode(), load_scene("corridor"), WAY, Look(), "none", pupil=pupil)
 
 
-def test_who_is_six_metres_off_the_way_is_hopeless_at_once() -> None:
-    assert not is_hopeless(np.array(((3.0, 5.9, 0.0),)), WAY)
-    assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), WAY)
+def test_a_pupil_that_waits_for_less_or_creeps_on_is_not_hopeless() -> None:
+    plan = _plan(pupil=True)
+    assert not is_hopeless(_poses(np.zeros(150)), plan)
+    assert not is_hopeless(_poses(np.arange(200) * 0.004), plan)
+    assert is_hopeless(_poses(np.arange(200) * 0.003), plan)
 
 
-@pytest.mark.parametrize(
+def test_the_expert_may_wait_for_longer_but_not_for_ever() -> None:
+    plan = _plan(pupil=False)
+    assert not is_hopeless(_poses(np.zeros(400)), plan)
+    assert is_hopeless(_poses(np.zeros(401)), plan)
+
+
+def test_a_pupil_six_metres_off_the_way_is_hopeless_at_once() -> None:
+    assert not is_hopeless(np.array(((3.0, 5.9, 0.0),)), _plan(pupil=True))
+    assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), _plan(pupil=True))
+
+
+.mark.parametrize(
     ("point", "gap"), [((3.0, 2.0), 2.0), ((-3.0, 4.0), 5.0), ((9.0, 0.0), 3.0), ((6.0, 0.0), 0.0)]
 )
 def test_the_distance_to_a_way_is_to_its_nearest_point(point: tuple[float, float], gap: float) -> None:
@@ -192,7 +203,8 @@ def test_the_two_seconds_before_a_fall_or_a_collision_are_not_kept() -> None:
 
 def test_of_a_timeout_the_waiting_at_its_end_is_not_kept() -> None:
     waited = np.vstack((WALK, np.repeat(WALK[-1:], 200, axis=0)))
-    assert kept_frames(waited, "timeout", None) == pytest.approx(104, abs=2)
+    for outcome in ("timeout", "cut"):
+        assert kept_frames(waited, outcome, None) == pytest.approx(104, abs=2)
 
 
 def test_a_pupils_collisions_are_kept_and_its_falls_are_not() -> None:

@@ -8,10 +8,16 @@ from tools.train.collect_config import CollectConfig
 
 if TYPE_CHECKING:
     from tools.train.job import StageJob
+    from tools.train.recipe import Recipe
 
-__all__ = ["CollectConfig", "run"]
+__all__ = ["CollectConfig", "budget", "run"]
 
 PREFIX = "e"
+
+
+def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
+    """What is to be done: drives, by the throughput of one process for each core."""
+    return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "expert-drive")]
 
 
 def run(job: StageJob) -> dict[str, Any]:

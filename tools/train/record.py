@@ -27,7 +27,8 @@ Tell = Callable[[EpisodeWorld, NDArray[np.float64]], Mapping[str, Any]]
 
 LEAST_FRAMES: Final = 30  # a shorter drive teaches nothing
 _BEFORE_CRASH: Final = 20  # frames: what led to a collision or a fall is not to be learned
-_STUCK_FRAMES: Final = 150
+_PUPIL_STUCK_S: Final = 15.0
+_EXPERT_STUCK_S: Final = 40.0  # it may wait for people; for longer than this there is nothing to see
 _STUCK_M: Final = 0.5
 _OFF_M: Final = 6.0
 
@@ -109,7 +110,7 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
                 world.step(command)
                 if first_collision is None and world.collided:
                     first_collision = len(frames.pose)
-                if plan.pupil and not world.done and is_hopeless(np.array(frames.pose), plan.path):
+                if not world.done and is_hopeless(np.array(frames.pose), plan):
                     world.stop()
         finally:
             expert.close()
@@ -144,13 +145,14 @@ def _keep(
     frames.by.append(by)
 
 
-def is_hopeless(pose: NDArray[np.float64], path: NDArray[np.float64]) -> bool:
-    """Whether it has gone 6 m from the way ([n, 2] m), or has stayed within 0.5 m for 15 s; `pose` [N, 3] so far."""
-    if off_way_m(pose[-1, :2], path) > _OFF_M:
+def is_hopeless(pose: NDArray[np.float64], plan: DrivePlan) -> bool:
+    """Whether a drive is to be cut; `pose` [N, 3] so far: it has stayed within 0.5 m, or a pupil is 6 m off the way."""
+    if plan.pupil and off_way_m(pose[-1, :2], plan.path) > _OFF_M:
         return True
-    if len(pose) <= _STUCK_FRAMES:
+    frames = round((_PUPIL_STUCK_S if plan.pupil else _EXPERT_STUCK_S) * RATE_HZ)
+    if len(pose) <= frames:
         return False
-    lately = pose[-_STUCK_FRAMES:, :2]
+    lately = pose[-frames:, :2]
     return float(np.max(np.hypot(*(lately - lately[0]).T))) < _STUCK_M
 
 
@@ -167,7 +169,8 @@ def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
 def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None) -> Recorded:
     count = kept_frames(np.array(frames.pose), outcome, first_collision, pupil=plan.pupil)
     if count < LEAST_FRAMES:
-        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before trouble ({outcome})")
+        trouble = outcome if first_collision is None or plan.pupil else "collided"
+        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before trouble ({trouble})")
     if not plan.pupil and max(off_way_m(point, plan.path) for point in np.array(frames.pose)[:count, :2]) > plan.off_m:
         raise NothingToLearnError("it left the way that it was told")
     pose, by = np.array(frames.pose)[:count], np.array(frames.by, np.uint8)[:count]
@@ -198,7 +201,7 @@ def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | 
     count = len(pose) - (_BEFORE_CRASH if outcome == "fell" else 0)
     if pupil:
         return max(count, 0)
-    if outcome == "timeout":  # the time it stood at the end, waiting for what never came
+    if outcome in ("timeout", "cut"):  # the time it stood at the end, waiting for what never came
         gaps = np.hypot(*(pose[:, :2] - pose[-1, :2]).T)
         count = min(count, int(np.max(np.flatnonzero(gaps > _STUCK_M), initial=-1)) + 1 + RATE_HZ)
     if first_collision is not None:

@@ -13,6 +13,7 @@ import selectors
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,6 +25,8 @@ import cv2
 from sim_hil.benchmark.worker_process import SINGLE_THREADED, end_with_parent
 
 GRACE_S: Final = 2.0
+SILENT_S: Final = 3600.0
+"""A worker that says nothing for so long hangs."""
 _TAIL_CHARS: Final = 400
 _GREETING: Final = "pybullet build time"  # of every process that loads the engine
 _EXIT_POLL_S: Final = 0.05
@@ -46,6 +49,7 @@ class _Worker:
     process: subprocess.Popen[bytes]
     lines: IO[bytes]
     log: Path
+    heard_ns: int
     buffer: bytearray = field(default_factory=bytearray)
     at_end: bool = False
 
@@ -89,7 +93,7 @@ class Workers:
         finally:
             os.close(writing)
         os.set_blocking(reading, False)
-        worker = _Worker(key, process, os.fdopen(reading, "rb", buffering=0), log)
+        worker = _Worker(key, process, os.fdopen(reading, "rb", buffering=0), log, time.monotonic_ns())
         self._running[key] = worker
         self._selector.register(worker.lines, selectors.EVENT_READ, worker)
         stdin = process.stdin
@@ -107,6 +111,8 @@ class Workers:
         for key, _ in self._selector.select(timeout_s):
             told += self._read(key.data)
         for worker in list(self._running.values()):
+            if time.monotonic_ns() - worker.heard_ns > SILENT_S * 1e9:
+                worker.process.kill()
             if worker.process.poll() is not None:
                 told += self._read(worker)
                 told.append(self._finish(worker))
@@ -129,6 +135,7 @@ class Workers:
     def _read(self, worker: _Worker) -> list[Told]:
         while not worker.at_end and (data := worker.lines.read(1 << 16)) is not None:  # None: nothing yet
             worker.buffer += data
+            worker.heard_ns = time.monotonic_ns()
             if not data:  # a pipe at its end is always readable
                 worker.at_end = True
                 self._selector.unregister(worker.lines)
