@@ -178,7 +178,7 @@ def test_a_pupil_six_metres_off_the_way_is_hopeless_at_once() -> None:
     assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), _plan(pupil=True))
 
 
-.mark.parametrize(
+@pytest.mark.parametrize(
     ("point", "gap"), [((3.0, 2.0), 2.0), ((-3.0, 4.0), 5.0), ((9.0, 0.0), 3.0), ((6.0, 0.0), 0.0)]
 )
 def test_the_distance_to_a_way_is_to_its_nearest_point(point: tuple[float, float], gap: float) -> None:

@@ -16,8 +16,8 @@ PREFIX = "e"
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """What is to be done: drives, by the throughput of one process for each core."""
-    return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "expert-drive")]
+    """What is to be done: drives, by the throughput of all processes together."""
+    return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "drive")]
 
 
 def run(job: StageJob) -> dict[str, Any]:
