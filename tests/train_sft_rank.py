@@ -16,6 +16,7 @@ from tools.train.distributed import ranks_of_environment
 from tools.train.drive import Dataset
 from tools.train.job import StageJob
 from tools.train.language_eval import EvalConfig
+from tools.train.mirror import Views
 from tools.train.optim import OptimConfig
 from tools.train.recipe import Recipe
 from tools.train.run_dir import RunDir
@@ -42,7 +43,7 @@ def sft_job(out: Path, config: SftConfig = CONFIG, **options: Any) -> StageJob:
 def trained(dataset: Dataset, job: StageJob) -> tuple[TicVla, dict[str, Any]]:
     """The network after `fit`, and its result."""
     network = build(tiny_model(), 1)
-    return network, fit(job, network, dataset, MadeUpTokens())
+    return network, fit(job, network, dataset, Views(MadeUpTokens(), MadeUpTokens(10)))
 
 
 def main() -> None:

@@ -25,8 +25,10 @@ from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw
 from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
-from tools.train.language_batch import FrameTokens, LanguageBatch, Row, buckets, collate, frames_of, row_losses
+from tools.train.language_batch import LanguageBatch, Row, buckets, collate, row_losses
 from tools.train.language_eval import EvalConfig, evaluate
+from tools.train.mirror import FOLDER as MIRRORED
+from tools.train.mirror import MirroredDataset, Views, mirrored
 from tools.train.network_file import finish_network, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
 from tools.train.tokens import TokenCache
@@ -51,6 +53,8 @@ class SftConfig:
     batch: int = 32
     """Samples of all ranks together."""
     words: DrawConfig = field(default_factory=DrawConfig)
+    mirrored: float = 0.5
+    """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
     optim: OptimConfig = field(default_factory=lambda: OptimConfig(lr=1e-3, warmup_steps=200))
     """The paper's 2e-5 (Table 8) is for a language model that can speak; ours begins from nothing."""
     held_anchors: int = 512
@@ -62,13 +66,16 @@ class SftConfig:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, self.checkpoint_steps) < 1 or self.held_anchors < 0:
             raise ValueError("expected epochs, batch and checkpoint_steps from 1 on and held_anchors from 0 on")
+        if not 0 <= self.mirrored <= 1:
+            raise ValueError(f"expected mirrored to be a share from 0 to 1, found {self.mirrored}")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One drawn question and answer as ids, int32, and the anchor whose frames it is about."""
+    """One drawn question and answer as ids, int32, and the anchor that it is about, as it is or in the mirror."""
 
     anchor: int
+    in_mirror: bool
     prompt: npt.NDArray[np.int32]
     answer: npt.NDArray[np.int32]
 
@@ -79,29 +86,36 @@ class Sample:
 class Samples:
     """What can be drawn from the anchors of some drives."""
 
-    def __init__(self, anchors: Sequence[Anchor], prompts: Prompts, tokens: FrameTokens, words: DrawConfig) -> None:
+    def __init__(
+        self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0
+    ) -> None:
+        """`mirrored`: share of samples that are of the mirrored drive."""
         self.anchors = tuple(anchors)
         self._prompts = prompts
-        self._tokens = tokens
+        self._views = views
         self._words = words
+        self._mirrored = mirrored
 
     def draw(self, rng: np.random.Generator) -> list[Sample]:
         """One sample of every anchor."""
         drawn: list[Sample] = []
         for index, anchor in enumerate(self.anchors):
-            prompt, answer = self._prompts.of(anchor, draw(anchor, self._words, rng))
-            drawn.append(Sample(index, np.array(prompt, np.int32), np.array(answer, np.int32)))
+            in_mirror = bool(rng.uniform() < self._mirrored)
+            asked = mirrored(anchor) if in_mirror else anchor
+            prompt, answer = self._prompts.of(asked, draw(asked, self._words, rng))
+            drawn.append(Sample(index, in_mirror, np.array(prompt, np.int32), np.array(answer, np.int32)))
         return drawn
 
     def rows(self, samples: Sequence[Sample]) -> list[Row]:
         """The same with their frames' tokens."""
         return [
-            Row(tuple(each.prompt.tolist()), tuple(each.answer.tolist()), self._frames(each.anchor)) for each in samples
+            Row(
+                tuple(each.prompt.tolist()),
+                tuple(each.answer.tolist()),
+                self._views.of(self.anchors[each.anchor], in_mirror=each.in_mirror),
+            )
+            for each in samples
         ]
-
-    def _frames(self, index: int) -> tuple[npt.NDArray[np.float16], ...]:
-        anchor = self.anchors[index]
-        return frames_of(self._tokens, anchor.drive_id, anchor.frames)
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
@@ -116,26 +130,35 @@ def run(job: StageJob) -> dict[str, Any]:
 
     Raises SftError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
     """
+    config = _config(job)
     dataset = Dataset.open(job.run_dir.stage("collect"))
     network = start_network(job, STAGE)
-    tokens = TokenCache(dataset, network.vision)
-    if tokens.missing():
-        job.progress.say("encoding the drives' frames")
-    tokens.build(device=job.device, ranks=job.ranks, progress=job.progress)
-    result = fit(job, network.to(job.device), dataset, tokens)
+    plain = TokenCache(dataset, network.vision)
+    mirror: TokenCache | None = None
+    _encode(job, plain, dataset.ids)
+    if config.mirrored > 0:
+        mirror = TokenCache(MirroredDataset.of(dataset), network.vision, dataset.folder / MIRRORED)
+        _encode(job, mirror, dataset.train)
+    result = fit(job, network.to(job.device), dataset, Views(plain, mirror))
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
     return result
 
 
-def fit(job: StageJob, network: TicVla, dataset: Dataset, tokens: FrameTokens) -> dict[str, Any]:
+def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
+    if tokens.missing(ids):
+        job.progress.say("encoding frames")
+    tokens.build(ids, device=job.device, ranks=job.ranks, progress=job.progress)
+
+
+def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[str, Any]:
     """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is."""
     config, language = _config(job), network.language
     content = tokenizer_for(network.config, None)
     prompts = Prompts(Tokenizer.from_buffer(content), network.config)
-    data = Samples(list(_anchors(dataset, dataset.train)), prompts, tokens, config.words)
-    held = Samples(list(_anchors(dataset, dataset.val)), prompts, tokens, config.words)
+    data = Samples(list(_anchors(dataset, dataset.train)), prompts, views, config.words, config.mirrored)
+    held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
         raise SftError(f"{dataset.folder}: no anchors with reasoning to learn from; collect drives first")
     per_epoch = -(-len(data.anchors) // config.batch)
@@ -171,7 +194,7 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, tokens: FrameTokens) -
         **numbers,
     }
     if job.ranks.first and held.anchors:
-        result["held_out"] = evaluate(language, prompts, tokens, held.anchors, config.evaluate, seed=job.seed)
+        result["held_out"] = evaluate(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
     return result
 
 
