@@ -10,10 +10,10 @@ A sample's inputs are of frame k and before; only its label is of the future.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import hypot, radians
-from typing import Final
+from math import radians
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,43 +24,16 @@ from edge.reasoning_text import Waypoints
 from export.model.config import TicVlaConfig
 from tools.train.action_batch import Group
 from tools.train.delays import Delays
-from tools.train.drive import EXPERT, FUTURE_STEPS, RATE_HZ, Drive
-from tools.train.kv_cache import CachedState, KvCache
+from tools.train.drive import RATE_HZ
+from tools.train.drive_frames import DriveFrames, WeightConfig
+from tools.train.kv_cache import CachedState
 from tools.train.language_batch import FrameTokens
-from tools.train.trace_words import NOBODY
 
 Array = NDArray[np.float64]
-
-LEAST_KNOWN: Final = RATE_HZ  # steps: a label that ends before the controller's target, 1 s ahead, says too little
-TURN_RAD: Final = 0.5
-_LABEL_STEPS: Final = 30
-_STANDS: Final = 0.1  # m/s and rad/s
 
 
 class SampleError(ValueError):
     """Drives that give no samples, or a network that cannot learn from them; one line."""
-
-
-@dataclass(frozen=True)
-class WeightConfig:
-    """How often frames are drawn, as factors on an ordinary one's chance; those that hold are multiplied."""
-
-    turn: float = 2.0
-    """Its label turns by more than 0.5 rad within 3 s."""
-    people: float = 2.0
-    """Somebody is in view within 6 m."""
-    goal: float = 2.0
-    goal_m: float = 4.0
-    """The goal is nearer than this."""
-    recovery: float = 1.5
-    """Something other than the expert commands within the next 5 s, so that the label leads back."""
-    policy: float = 1.0
-    """Its drive is a policy's (DAgger)."""
-
-    def __post_init__(self) -> None:
-        factors = (self.turn, self.people, self.goal, self.recovery, self.policy)
-        if not all(0 < factor <= 100 for factor in factors) or not 0 <= self.goal_m <= 100:
-            raise ValueError("expected factors above 0, up to 100, and goal_m from 0 to 100")
 
 
 @dataclass(frozen=True)
@@ -96,87 +69,19 @@ class SampleConfig:
         )
 
 
-@dataclass(frozen=True)
-class DriveFrames:
-    """What samples need of a drive, but for tokens and states; N frames."""
+class States(Protocol):
+    """Semantic states of drives, as `KvCache` has them."""
 
-    id: str
-    pose_odom: Array
-    """[N, 3] x m, y m, theta rad."""
-    way_m: Array
-    """[N]: driven since the first frame, by odometry."""
-    state: NDArray[np.float32]
-    """[N, 3]."""
-    goal: NDArray[np.float32]
-    """[N, 2]: where the goal is, m in the robot's frame; for point-goal policies alone."""
-    target: NDArray[np.float32]
-    """[N, steps, 3]: the label; headings are not wrapped."""
-    known: NDArray[np.int16]
-    """[N]: steps of the label that are real."""
-    weight: Array
-    """[N]: chance to be drawn, not normalised; 0 where too little of the label is known."""
+    draws: int
+    """States of each anchor."""
 
-    def __len__(self) -> int:
-        return len(self.state)
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """Frames that have a state, evenly spaced."""
+        ...
 
-    @property
-    def stood(self) -> bool:
-        """Whether the robot stands in its first frame, so that it may have stood there before."""
-        return bool(hypot(*self.state[0, :2]) < _STANDS and abs(self.state[0, 2]) < _STANDS)
-
-    @staticmethod
-    def of(drive: Drive, steps: int, weights: WeightConfig) -> DriveFrames:
-        """Of a drive whose pictures need not be loaded. Raises SampleError for more steps than a label has."""
-        if not LEAST_KNOWN <= steps <= FUTURE_STEPS:
-            raise SampleError(f"action.steps: expected {LEAST_KNOWN} to {FUTURE_STEPS}, found {steps}")
-        future = drive.future.astype(np.float64)
-        # A pose's heading is within half a turn; a plan's is the sum of its steps and may go beyond.
-        start = np.zeros((len(drive), 1))
-        future[..., 2] = np.unwrap(np.concatenate([start, future[..., 2]], axis=1), axis=1)[:, 1:]
-        moved = np.hypot(*np.diff(drive.pose_odom[:, :2], axis=0, prepend=drive.pose_odom[:1, :2]).T)
-        away = np.array(drive.about.goal_xy) - drive.pose[:, :2]
-        c, s = np.cos(drive.pose[:, 2]), np.sin(drive.pose[:, 2])
-        goal = np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
-        return DriveFrames(
-            id=drive.id,
-            pose_odom=drive.pose_odom,
-            way_m=np.cumsum(moved),
-            state=drive.state,
-            goal=goal.astype(np.float32),
-            target=future[:, :steps].astype(np.float32),
-            known=drive.future_steps,
-            weight=_weights(drive, future, goal, weights),
-        )
-
-    def offset(self, anchor: int, k: int) -> SE2:
-        """The motion from frame `anchor` to frame k as odometry tells it, in the robot's frame at `anchor`."""
-        T_odom_anchor, T_odom_base = (SE2(*map(float, self.pose_odom[i])) for i in (anchor, k))
-        return T_odom_anchor.inverse() @ T_odom_base
-
-
-def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> Array:
-    known = np.arange(_LABEL_STEPS) < drive.future_steps[:, None]
-    turns = np.max(np.abs(future[:, :_LABEL_STEPS, 2]) * known, axis=1) > TURN_RAD
-    near = np.hypot(*goal.T) < config.goal_m
-    people = np.zeros(len(drive), bool)
-    for k in range(len(drive)):
-        trace = drive.trace_at(k)
-        people[k] = trace is not None and trace["motion"] != NOBODY
-    others = np.append(np.cumsum(drive.by != EXPERT), 0)
-    until = np.minimum(np.arange(len(drive)) + FUTURE_STEPS, len(drive)) - 1
-    # Of the frames k .. k + 49; the 0 that was appended is what stands before frame 0.
-    led_back = others[until] > others[np.arange(len(drive)) - 1]
-    weight = np.ones(len(drive))
-    for holds, factor in (
-        (turns, config.turn),
-        (people, config.people),
-        (near, config.goal),
-        (led_back, config.recovery),
-        (drive.about.driver.startswith("policy:"), config.policy),
-    ):
-        weight[np.broadcast_to(holds, weight.shape)] *= factor
-    weight[drive.future_steps < LEAST_KNOWN] = 0.0
-    return weight
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The state of a generation whose newest frame is k."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -196,7 +101,7 @@ class Samples:
         self,
         drives: Iterable[DriveFrames],
         tokens: FrameTokens,
-        cache: KvCache,
+        states: States,
         delays: Delays,
         config: SampleConfig,
         model: TicVlaConfig,
@@ -208,7 +113,7 @@ class Samples:
             raise SampleError(f"action.step_s: labels are 0.1 s apart, found {model.action.step_s:g}")
         self.drives = tuple(drives)
         self.config = config
-        self._tokens, self._cache, self._delays = tokens, cache, delays
+        self._tokens, self._states, self._delays = tokens, states, delays
         self._by_waypoints = model.action.semantic_interface == "waypoints"
         self._drop_kv, self._drop_state = (model.action.kv_dropout, model.action.state_dropout) if drop else (0.0, 0.0)
         # Frames of one state that are all the same age are all the same frame.
@@ -232,12 +137,12 @@ class Samples:
 
     def _anchors(self, drive_id: str) -> tuple[int, ...]:
         """Frames with states that can guide: a text without waypoints cannot, where they are the guidance."""
-        anchors = self._cache.anchors(drive_id)
+        anchors = self._states.anchors(drive_id)
         if not self._by_waypoints:
             return anchors
-        draws = range(self._cache.draws)
+        draws = range(self._states.draws)
         return tuple(
-            k for k in anchors if all(self._cache.at(drive_id, k, draw).waypoints is not None for draw in draws)
+            k for k in anchors if all(self._states.at(drive_id, k, draw).waypoints is not None for draw in draws)
         )
 
     def _chances(self, drive: DriveFrames) -> tuple[Array, dict[int, float], float]:
@@ -247,7 +152,7 @@ class Samples:
         if not anchors:
             return np.zeros(len(drive)), {}, 0.0
         # One state stands for as many tenths of a second as there are up to the next one.
-        every = anchors[1] - anchors[0] if len(anchors) > 1 else RATE_HZ
+        every = int(np.diff(anchors).min()) if len(anchors) > 1 else RATE_HZ
         met = np.zeros(len(drive))
         for anchor in anchors:
             span = met[anchor : anchor + len(mass)]
@@ -287,7 +192,7 @@ class Samples:
         which, cut, end = rng.uniform(size=3)
         noise = rng.standard_normal((count, 3))
         keep_state = rng.uniform(size=count) >= self._drop_state
-        state = self._cache.at(drive.id, chosen.anchor, int(which * self._cache.draws))
+        state = self._states.at(drive.id, chosen.anchor, int(which * self._states.draws))
         ks = list(chosen.ks)
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
         latency = [(age / RATE_HZ, *offset.as_tuple()) for age, offset in zip(chosen.ages, offsets, strict=True)]
@@ -313,7 +218,7 @@ class Samples:
 
     def said(self, chosen: Chosen) -> Waypoints | None:
         """Waypoints of the state that a choice acts on, m in the anchor's robot frame; None where it has none."""
-        return self._cache.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
+        return self._states.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
 
     def draw(self, rng: np.random.Generator) -> Group:
         """Choose and take."""
@@ -341,3 +246,22 @@ class Samples:
 def _pick(upto: Array, uniform: float) -> int:
     """Index drawn by cumulated chances; `uniform` in [0, 1). One that has no chance is never drawn."""
     return int(np.searchsorted(upto, uniform * upto[-1], side="right"))
+
+
+class NoStates:
+    """In a cache's place for a policy that is told nothing: every frame has a state, of one token without content."""
+
+    draws = 1
+
+    def __init__(self, frames: Mapping[str, int], width: int) -> None:
+        """`frames`: how many each drive has."""
+        self._frames = frames
+        self._state = CachedState(np.zeros((1, width), np.float16), 1, "", own=False)
+
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """All frames."""
+        return tuple(range(self._frames[drive_id]))
+
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The same for every frame."""
+        return self._state

@@ -1,0 +1,104 @@
+"""What imitation trains: the action expert, or the point-goal network that the paper compares it with."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from export.model.action import ActionExpert
+from tools.train import action_batch
+from tools.train.action_batch import ActionBatch
+from tools.train.drive_frames import DriveFrames
+from tools.train.point_goal_net import PointGoalNet
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Equation 4, of the query head and of the point-goal network: smooth L1 of the integrated poses."""
+
+    beta: float = 1.0
+    """Below this error it is quadratic, m and rad; torch's own value, the paper names none."""
+    heading_weight: float = 1.0
+    """Of an error of one radian beside one of a metre."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
+            raise ValueError("expected beta above 0 and heading_weight from 0 on, both up to 100")
+
+
+class Pupil(ABC):
+    """A policy that learns from batches."""
+
+    module: nn.Module
+    """What learns: all of its parameters."""
+    hears: bool
+    """Whether it is given semantic states."""
+
+    @abstractmethod
+    def plan(self, batch: ActionBatch) -> Tensor:
+        """Trajectories [B, steps, 3]."""
+
+    @abstractmethod
+    def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
+        """What is made small, for every frame [B]."""
+
+    @abstractmethod
+    def begin(self, drives: Iterable[DriveFrames]) -> None:
+        """Look at all drives once before the first step."""
+
+
+class ExpertPupil(Pupil):
+    """The action expert, by any of its heads."""
+
+    hears = True
+
+    def __init__(self, action: ActionExpert, loss: LossConfig) -> None:
+        self.module = self._action = action.eval()
+        self._loss = loss
+
+    def plan(self, batch: ActionBatch) -> Tensor:
+        """By the network's layers, with what the batch drops out."""
+        return action_batch.plan(self._action, batch)
+
+    def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
+        """Equation 4; a diffusion's or a flow's own objective (paper appendix D)."""
+        loss = self._loss
+        return action_batch.errors(
+            self._action, batch, generator, beta=loss.beta, heading_weight=loss.heading_weight
+        )  # fmt: skip
+
+    def begin(self, drives: Iterable[DriveFrames]) -> None:
+        """Heads that work on normalised actions take mean and deviation from the labels."""
+        if self._action.scale is None:
+            return
+        labels = [(torch.from_numpy(drive.target), torch.from_numpy(drive.known)) for drive in drives]
+        target = torch.cat([each for each, _ in labels])
+        known = torch.cat([each for _, each in labels])[:, None] > torch.arange(target.shape[1])
+        device = next(self._action.parameters()).device
+        self._action.fit_actions(target.to(device), known.to(device))
+
+
+class PointGoalPupil(Pupil):
+    """Behaviour cloning of the paper's point-goal baseline; the state is dropped out as the action expert's is."""
+
+    hears = False
+
+    def __init__(self, network: PointGoalNet, loss: LossConfig) -> None:
+        self.module = self._network = network
+        self._loss = loss
+
+    def plan(self, batch: ActionBatch) -> Tensor:
+        """From picture, state and goal alone."""
+        return self._network(batch.visual_tokens, batch.state * batch.keep_state[:, None], batch.goal)
+
+    def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
+        """Equation 4."""
+        loss = self._loss
+        return action_batch.smooth_l1(self.plan(batch), batch, beta=loss.beta, heading_weight=loss.heading_weight)
+
+    def begin(self, drives: Iterable[DriveFrames]) -> None:
+        """There is nothing to be looked at."""
