@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from export.model.network import TicVla
-from tests.test_train_rl_tail import _config, _episode, _network
+from tests.test_train_rl_tail import LIMITS, _config, _episode, _network
 from tools.train import rollout
 from tools.train.job import StageJob, StopFlag
 from tools.train.network_file import finish_network
 from tools.train.ppo import PpoConfig
 from tools.train.recipe import Recipe
 from tools.train.rl import STAGE, RlConfig, RlError, improve, run
+from tools.train.rl_learners import TailLearner
 from tools.train.rl_worker import RolloutOrder
 from tools.train.run_dir import RunDir
 
@@ -57,7 +58,8 @@ def _improved(out: Path, config: RlConfig, drive: Any, *, resume: bool = False) 
     job = _job(out, config, resume=resume)
     before = _imitated(job)
     network = _network()
-    return network, improve(job, network, before, out / "artifacts", drive)
+    learner = TailLearner(network, LIMITS, config.log_std)
+    return network, improve(job, learner, before, out / "artifacts", drive)
 
 
 def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) -> None:
@@ -100,7 +102,13 @@ def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> No
     other = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, reward_scale=0.5)
     job = StageJob(Recipe("test", 0, _config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
     with pytest.raises(RlError, match="another recipe"):
-        improve(job, _network(), tmp_path / "imitate" / "model.safetensors", tmp_path, _driver(_network(), bool))
+        improve(
+            job,
+            TailLearner(_network(), LIMITS, other.log_std),
+            tmp_path / "imitate" / "model.safetensors",
+            tmp_path,
+            _driver(_network(), bool),
+        )
 
 
 def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from tools.train.action_tail import (
 from tools.train.command_policy import CommandLimits, command_mean
 from tools.train.ppo import PpoConfig, PpoOptimiser
 from tools.train.rollout import EpisodeEnd, EpisodeSteps
-from tools.train.tail_learner import TailLearner
+from tools.train.rl_learners import TailLearner
 
 LIMITS = CommandLimits(1.0, 1.0)
 

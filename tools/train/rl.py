@@ -18,23 +18,26 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from export.model.network import TicVla, initialise
+from export.model.network import initialise
 from sim_hil.benchmark.latency import load_profile
 from sim_hil.benchmark.policies import robot_config
 from tools.train import checkpoint
-from tools.train.action_tail import check_tail, load_tail, tail_parameters
+from tools.train.action_tail import check_tail
 from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
 from tools.train.exported import export_artifacts
 from tools.train.job import StageJob
 from tools.train.network_file import finish_network, read_network, weights_before
+from tools.train.point_goal_net import build_point_goal, save_point_goal
 from tools.train.ppo import PpoConfig, PpoOptimiser
+from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
 from tools.train.rl_worker import RolloutOrder
 from tools.train.rollout import Rollout
 from tools.train.scenarios import SHARES
-from tools.train.tail_learner import TailLearner
 from tools.train.vector_env import drive
 
 STAGE: Final = "rl"
+POLICIES: Final = ("action", "point-goal")
+POINT_GOAL_FILE: Final = "point_goal.safetensors"
 _SCENES, _EVALUATION_SCENES = 9003, 9002  # seeds of scenarios that no other stage draws
 _DELAYS: Final = 41
 
@@ -47,6 +50,8 @@ class RlError(ValueError):
 class RlConfig:
     """Online reinforcement learning of the last layer and the head."""
 
+    policy: str = "action"
+    """What is trained: the action expert's last layer and head, or the paper's `point-goal` baseline from nothing."""
     iterations: int = 50
     episodes: int = 12
     """Whole episodes of one iteration; with some 250 steps each, 3,000 steps (the paper: 1,024)."""
@@ -79,6 +84,8 @@ class RlConfig:
 
     def __post_init__(self) -> None:
         counts = (self.iterations, self.episodes, self.episodes_per_job, self.evaluate_every, self.evaluate_episodes)
+        if self.policy not in POLICIES:
+            raise ValueError(f"policy {self.policy!r}: expected one of {', '.join(POLICIES)}")
         if min(counts) < 1 or min(self.rotate_every, self.tasks, self.warmup_iterations, self.jobs) < 0:
             raise ValueError("expected counts of 1 or more, and rotate_every, tasks, warmup_iterations, jobs from 0 on")
         if len(self.log_std) != 2 or not all(LOG_STD_RANGE[0] <= v <= LOG_STD_RANGE[1] for v in self.log_std):
@@ -133,28 +140,33 @@ def run(job: StageJob) -> dict[str, Any]:
         raise RlError(
             "torchrun: reinforcement learning shares its work among processes itself (rl.jobs); start it alone"
         )
+    config = job.recipe.rl or RlConfig()
     before = weights_before(job.run_dir.out, STAGE)
     if before is None:
         raise RlError(f"{job.run_dir.out}: no policy to improve; run imitate first")
-    network = read_network(before, job.recipe.model, job.recipe.seed)
-    check_tail(network.action)
+    network = read_network(before, job.recipe.model, job.recipe.seed).to(job.device)
+    bounds = robot_config().limits
+    limits = CommandLimits(bounds.vx_max_mps, bounds.wz_max_radps)
+    initialise(network, job.seed, ("value",))
     folder = job.run_dir.stage(STAGE)
+    if config.policy == "point-goal":
+        net = build_point_goal(job.recipe.model, job.generator("point-goal")).to(job.device)
+        result = improve(job, PointGoalLearner(network, net, limits, config.log_std), before, None)
+        save_point_goal(net, folder / POINT_GOAL_FILE, f"edge-train {job.recipe.name}, seed {job.recipe.seed}, rl")
+        return result
+    check_tail(network.action)
     artifacts = export_artifacts(before, job.recipe.model, folder / "artifacts", job.progress.say)
-    result = improve(job, network, before, artifacts)
+    learner = TailLearner(network, limits, config.log_std, imitation=config.imitation)
+    result = improve(job, learner, before, artifacts)
     finish_network(job, STAGE, network)
     return result
 
 
-def improve(job: StageJob, network: TicVla, before: Path, artifacts: Path, drive: Drive = drive) -> dict[str, Any]:
-    """Train `network.action`'s tail and `network.value` in place; gives first, best and last scores."""
+def improve(
+    job: StageJob, learner: Learner, before: Path, artifacts: Path | None, drive: Drive = drive
+) -> dict[str, Any]:
+    """Train the learner's policy and value network in place; gives first and best scores. Ends with the best."""
     config = job.recipe.rl or RlConfig()
-    initialise(network, job.seed, ("value",))
-    network.to(job.device)
-    limits = robot_config().limits
-    learner = TailLearner(
-        network, CommandLimits(limits.vx_max_mps, limits.wz_max_radps), config.log_std, imitation=config.imitation
-    )
-    learner.log_std.data = learner.log_std.data.to(job.device)
     state = _State(job, learner, PpoOptimiser(learner, config.ppo), before)
     orders = _Orders(job, config, before, artifacts)
     state.load()
@@ -164,8 +176,7 @@ def improve(job: StageJob, network: TicVla, before: Path, artifacts: Path, drive
         state.save()
     while state.iteration < config.iterations:
         iteration = state.iteration
-        policy = state.write_policy()
-        order = orders.training(iteration, policy)
+        order = orders.training(iteration, state.write_policy())
         rollout = drive(order, jobs=config.jobs, per_job=config.episodes_per_job, stopped=job.should_stop)
         numbers = _learn(job, config, learner, state, rollout)
         shutil.rmtree(order.out, ignore_errors=True)
@@ -188,7 +199,7 @@ def improve(job: StageJob, network: TicVla, before: Path, artifacts: Path, drive
     }
 
 
-def _learn(job: StageJob, config: RlConfig, learner: TailLearner, state: _State, rollout: Rollout) -> dict[str, float]:
+def _learn(job: StageJob, config: RlConfig, learner: Learner, state: _State, rollout: Rollout) -> dict[str, float]:
     ends = rollout.ends
     numbers = {
         "success": float(np.mean([end.success for end in ends])),
@@ -227,7 +238,7 @@ class _Orders:
     job: StageJob
     config: RlConfig
     before: Path
-    artifacts: Path
+    artifacts: Path | None
 
     def training(self, iteration: int, policy: Path) -> RolloutOrder:
         """Exploring, on the iteration's scenarios."""
@@ -249,7 +260,7 @@ class _Orders:
         *, explore: bool,
     ) -> RolloutOrder:  # fmt: skip
         return RolloutOrder(
-            artifacts=str(self.artifacts.absolute()),
+            artifacts="" if self.artifacts is None else str(self.artifacts.absolute()),
             network=str(self.before.absolute()),
             model=self.job.recipe.model.to_dict(),
             network_seed=self.job.recipe.seed,
@@ -267,9 +278,9 @@ class _Orders:
 
 
 class _State:
-    """The stage's checkpoint: tail, value network, exploration, moments, the best policy so far."""
+    """The stage's checkpoint: policy, value network, exploration, moments, the best policy so far."""
 
-    def __init__(self, job: StageJob, learner: TailLearner, optimiser: PpoOptimiser, before: Path) -> None:
+    def __init__(self, job: StageJob, learner: Learner, optimiser: PpoOptimiser, before: Path) -> None:
         self._job, self._learner, self.optimiser = job, learner, optimiser
         folder = job.run_dir.stage(STAGE)
         self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
@@ -282,25 +293,19 @@ class _State:
         self.best: Score | None = None
         self._best: dict[str, torch.Tensor] = {}
 
-    def _tail(self) -> dict[str, torch.Tensor]:
-        tensors = {
-            name: each.detach().cpu().clone() for name, each in tail_parameters(self._learner.network.action).items()
-        }
-        return tensors
-
     def write_policy(self) -> Path:
         """What workers drive with now."""
         log_std = [float(v) for v in self._learner.log_std.detach().clamp(*LOG_STD_RANGE)]
-        checkpoint.save(self._policy, self._tail(), {"log_std": log_std})
+        checkpoint.save(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
         return self._policy
 
     def keep_best(self) -> None:
         """The policy as it is now is the best."""
-        self._best = self._tail()
+        self._best = self._learner.policy_tensors()
 
     def take_best(self) -> None:
         """Go back to the best policy."""
-        load_tail(self._learner.network.action, self._best)
+        self._learner.load_policy(self._best)
 
     def judge(self, score: Score, fall_back: float) -> bool:
         """Keep a better policy; take the best up again when it has fallen too far, which is what is returned."""
@@ -317,7 +322,7 @@ class _State:
         """After every iteration."""
         learner, optimiser = self._learner, self.optimiser
         tensors = {
-            **checkpoint.with_prefix("tail", self._tail()),
+            **checkpoint.with_prefix("policy", learner.policy_tensors()),
             **checkpoint.with_prefix("best", self._best),
             **checkpoint.with_prefix("value", learner.network.value.state_dict()),
             **checkpoint.with_prefix("actor", checkpoint.optimiser_tensors(optimiser.actor)),
@@ -338,7 +343,7 @@ class _State:
         if meta["key"] != self._key:
             raise RlError(f"{self._path}: of another policy or another recipe; delete it to begin anew")
         learner, optimiser = self._learner, self.optimiser
-        load_tail(learner.network.action, checkpoint.under("tail", tensors))
+        learner.load_policy(checkpoint.under("policy", tensors))
         self._best = checkpoint.under("best", tensors)
         learner.network.value.load_state_dict(checkpoint.under("value", tensors))
         checkpoint.restore_optimiser(optimiser.actor, checkpoint.under("actor", tensors))

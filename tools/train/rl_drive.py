@@ -1,24 +1,19 @@
-"""One episode of Algorithm 2: delayed semantics, a Gaussian around the trajectory's command, the paper's reward."""
+"""One episode of Algorithm 2: a Gaussian around the policy's command, the paper's reward, every step kept."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
-import torch
+import numpy.typing as npt
 
 from edge.controller import grown
 from edge.geometry import SE2
-from export.model.action import ActionExpert
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.gym_env import DynaNavEnv
-from sim_hil.benchmark.latency import Timing
-from tools.train.action_tail import now_of, prefix, semantic_of, tail
-from tools.train.async_mind import AsyncMind, Models
-from tools.train.command_policy import CommandLimits, command_mean
 from tools.train.rollout import EpisodeEnd, EpisodeSteps, goal_features
 from tools.train.scenarios import Scenario
 
@@ -27,11 +22,52 @@ STUCK_S: Final = 15.0
 STUCK_M: Final = 0.5
 """An episode is cut off when the robot has come no further than this in that time: nothing is learned from waiting."""
 
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What a pilot would do: the mean command (v m/s, ω rad/s), and what optimisation needs beside what was seen."""
+
+    mean: tuple[float, float]
+    queries: Floats | None = None
+    latency: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    generation: int = 0
+
+
+class Pilot(Protocol):
+    """A policy that is trained, in one episode."""
+
+    @property
+    def semantic(self) -> Sequence[Floats]:
+        """Semantic tokens [T, hidden] of each generation that was acted by."""
+        ...
+
+    @property
+    def failure(self) -> str | None:
+        """Why it cannot go on; None while it can."""
+        ...
+
+    def see(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
+        """Begin a control period; the frame's visual tokens [1, N, D]."""
+        ...
+
+    def choose(
+        self, visual: Floats, state: tuple[float, ...], goal_m: tuple[float, float], time_s: float, T_odom_base: SE2
+    ) -> Chosen | None:
+        """The command's mean; None while there is nothing to act by. `goal_m` is in the robot frame."""
+        ...
+
+    def think(self, time_s: float) -> None:
+        """End the control period."""
+        ...
+
 
 @dataclass(frozen=True)
 class DriveOptions:
     """`log_std` of the exploration, None: the mean is driven; `drift` of odometry, `max_s` of one episode."""
 
+    image_px: int
     log_std: tuple[float, float] | None
     drift: str = "none"
     max_s: float = 120.0
@@ -39,62 +75,44 @@ class DriveOptions:
 
 def drive_episode(
     scenario: Scenario,
-    models: Models,
-    expert: ActionExpert,
+    pilot_for: Callable[[str], Pilot],
     limits: LimitsConfig,
     options: DriveOptions,
-    draw: Callable[[], Timing],
     rng: np.random.Generator,
 ) -> tuple[EpisodeSteps, EpisodeEnd]:
-    """Drive one episode to its end; `expert` is in evaluation mode, on the CPU."""
-    image_px = models.artifacts.runtime.image_px
+    """Drive one episode to its end with the pilot made for its instruction."""
     wording = int(rng.integers(len(scenario.wordings)))
     episode = replace(scenario.episode, timeout_s=min(scenario.episode.timeout_s, options.max_s))
-    steps = EpisodeSteps()
+    steps, wheel = EpisodeSteps(), _Wheel(limits)
+    std = None if options.log_std is None else np.exp(np.asarray(options.log_std))
     env = DynaNavEnv(
-        [episode], camera=(image_px, image_px), drift=options.drift, scenes={episode.scene: scenario.scene}
+        [episode], camera=(options.image_px,) * 2, drift=options.drift, scenes={episode.scene: scenario.scene}
     )
     try:
         seen, info = env.reset(options={"episode": episode.id, "wording": wording})
-        mind = AsyncMind(models, info["instruction"], draw)
-        actor = _Actor(expert, limits, models.artifacts.runtime.step_s, options.log_std, rng)
+        pilot = pilot_for(info["instruction"])
         places: deque[tuple[float, float]] = deque(maxlen=round(STUCK_S / CONTROL_S))
-        total, cut = 0.0, ""
-        while True:
-            time_s, state = float(seen["time"][0]), tuple(float(v) for v in seen["state"])
-            T_odom_base = SE2(*(float(v) for v in seen["pose"]))
-            visual = mind.see(time_s, seen["image"], T_odom_base)
-            metadata = mind.metadata(time_s, T_odom_base)
-            pose = env.world.pose()
-            goal = _goal(pose, episode.goal_xy)
-            acted = actor.act(mind, visual, state, metadata)
-            mind.think(time_s)
-            if acted.queries is not None:
-                steps.visual.append(visual[0])
-                steps.queries.append(acted.queries)
-                steps.state.append(state)
-                steps.latency.append(metadata)
-                steps.goal.append(goal)
-                steps.action.append(acted.action)
-                steps.generation.append(actor.generations - 1)
-            seen, reward, ended, timed_out, info = env.step(np.array([acted.vx_mps, 0.0, acted.wz_radps], np.float32))
+        total, cut, ended, timed_out = 0.0, "", False, False
+        while not (ended or timed_out or cut):
+            time_s, state, T_odom_base = _known(seen)
+            goal_m = _goal_m(env.world.pose(), episode.goal_xy)
+            visual = pilot.see(time_s, seen["image"], T_odom_base)
+            chosen = pilot.choose(visual, state, goal_m, time_s, T_odom_base)
+            pilot.think(time_s)
+            action = (0.0, 0.0) if chosen is None else _explored(chosen.mean, std, rng)
+            seen, reward, ended, timed_out, _ = env.step(np.array(wheel.turned(*action), np.float32))
             total += reward
-            if acted.queries is not None:
-                steps.reward.append(reward)
+            if chosen is not None:
+                steps.add(visual[0], state, goal_features(*goal_m), action, reward, chosen)
             here = env.world.pose()
             places.append((here.x_m, here.y_m))
-            if not ended and _is_stuck(places):
-                cut = "stuck"
-            if mind.failure is not None:
-                cut = "no-reasoning"
-            if ended or timed_out or cut:
-                break
-        if cut:
+            cut = "no-reasoning" if pilot.failure is not None else "stuck" if _is_stuck(places) else ""
+        if not env.world.done:
             env.world.stop()
-        steps.semantic = actor.semantic
-        steps.after_visual = models.encode(seen["image"], None)[0]
-        steps.after_state = tuple(float(v) for v in seen["state"])
-        steps.after_goal = _goal(env.world.pose(), episode.goal_xy)
+        time_s, steps.after_state, T_odom_base = _known(seen)
+        steps.after_visual = pilot.see(time_s, seen["image"], T_odom_base)[0]
+        steps.after_goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
+        steps.semantic = list(pilot.semantic)
         outcome = env.world.outcome()
     finally:
         env.close()
@@ -103,7 +121,7 @@ def drive_episode(
         kind=scenario.kind,
         people=episode.people,
         steps=len(steps),
-        end=cut or outcome.end,
+        end=outcome.end if ended or timed_out else cut,
         terminal=bool(ended),
         success=outcome.success,
         collided=outcome.collided,
@@ -114,76 +132,40 @@ def drive_episode(
     return steps, end
 
 
-@dataclass(frozen=True)
-class _Acted:
-    vx_mps: float
-    wz_radps: float
-    action: tuple[float, float] = (0.0, 0.0)
-    queries: np.ndarray | None = None
+class _Wheel:
+    """Within the robot's limits, speeding up no faster than they allow: what the runner's controller does."""
 
-
-class _Actor:
-    """The action expert for one robot at a time; remembers the generation whose tokens it has projected."""
-
-    def __init__(
-        self,
-        expert: ActionExpert,
-        limits: LimitsConfig,
-        step_s: float,
-        log_std: tuple[float, float] | None,
-        rng: np.random.Generator,
-    ) -> None:
-        self._expert, self._limits, self._step_s, self._rng = expert, limits, step_s, rng
-        self._bounds = CommandLimits(limits.vx_max_mps, limits.wz_max_radps)
-        self._std = None if log_std is None else np.exp(np.asarray(log_std))
-        self._number: int | None = None
-        self._tokens = torch.empty(0)
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
         self._last = (0.0, 0.0)
-        self.semantic: list[np.ndarray] = []
 
-    @property
-    def generations(self) -> int:
-        """How many have been acted by."""
-        return len(self.semantic)
-
-    def act(
-        self,
-        mind: AsyncMind,
-        visual: np.ndarray,
-        state: tuple[float, ...],
-        metadata: tuple[float, float, float, float],
-    ) -> _Acted:
-        semantic = mind.semantic
-        if semantic is None:
-            return self._driven(0.0, 0.0)
-        if semantic.generation != self._number:
-            self._number = semantic.generation
-            self._tokens = semantic_of(self._expert, torch.from_numpy(semantic.last_layer_kv))
-            self.semantic.append(self._tokens[0].numpy().copy())
-        with torch.no_grad():
-            now = now_of(self._expert, torch.from_numpy(visual), torch.tensor([state]), torch.tensor([metadata]))
-            x = prefix(self._expert, now, self._tokens)
-            mean = command_mean(tail(self._expert, x, now, self._tokens), self._step_s, self._bounds)[0].numpy()
-        action = mean.astype(np.float64)
-        if self._std is not None:
-            action = action + self._std * self._rng.standard_normal(2)
-        driven = self._driven(float(action[0]), float(action[1]))
-        return replace(driven, action=(float(action[0]), float(action[1])), queries=x[0].numpy().copy())
-
-    def _driven(self, vx_mps: float, wz_radps: float) -> _Acted:
-        """Within the robot's limits, speeding up no faster than they allow: what the runner's controller does."""
+    def turned(self, vx_mps: float, wz_radps: float) -> tuple[float, float, float]:
         limits = self._limits
         vx_mps = min(max(vx_mps, 0.0), limits.vx_max_mps)
         wz_radps = min(max(wz_radps, -limits.wz_max_radps), limits.wz_max_radps)
         vx_mps = grown(self._last[0], vx_mps, limits.accel_mps2 * CONTROL_S)
         wz_radps = grown(self._last[1], wz_radps, limits.alpha_radps2 * CONTROL_S)
         self._last = (vx_mps, wz_radps)
-        return _Acted(vx_mps, wz_radps)
+        return (vx_mps, 0.0, wz_radps)
 
 
-def _goal(pose: SE2, goal_xy: tuple[float, float]) -> tuple[float, float]:
+def _explored(
+    mean: tuple[float, float], std: npt.NDArray[np.float64] | None, rng: np.random.Generator
+) -> tuple[float, float]:
+    if std is None:
+        return mean
+    noise = std * rng.standard_normal(2)
+    return (mean[0] + float(noise[0]), mean[1] + float(noise[1]))
+
+
+def _known(seen: dict[str, npt.NDArray[np.float32]]) -> tuple[float, tuple[float, ...], SE2]:
+    """Time, s, body velocity and odometry pose of an observation."""
+    return float(seen["time"][0]), tuple(float(v) for v in seen["state"]), SE2(*(float(v) for v in seen["pose"]))
+
+
+def _goal_m(pose: SE2, goal_xy: tuple[float, float]) -> tuple[float, float]:
     there = pose.inverse() @ SE2(goal_xy[0], goal_xy[1], 0.0)
-    return goal_features(there.x_m, there.y_m)
+    return (there.x_m, there.y_m)
 
 
 def _is_stuck(places: deque[tuple[float, float]]) -> bool:

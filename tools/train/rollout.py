@@ -9,12 +9,15 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
+
+if TYPE_CHECKING:
+    from tools.train.rl_drive import Chosen
 
 FORMAT: Final = "tic-vla-edge-rollout/1"
 GOAL_SCALE_M: Final = 10.0
@@ -51,7 +54,7 @@ class EpisodeSteps:
     visual: list[Floats] = field(default_factory=list)
     """[N, D] a step."""
     queries: list[Floats] = field(default_factory=list)
-    """[steps, hidden] a step, before the last layer."""
+    """[steps, hidden] a step, before the last layer; none of a policy without one."""
     state: list[tuple[float, ...]] = field(default_factory=list)
     latency: list[tuple[float, ...]] = field(default_factory=list)
     goal: list[tuple[float, float]] = field(default_factory=list)
@@ -68,6 +71,26 @@ class EpisodeSteps:
     def __len__(self) -> int:
         return len(self.reward)
 
+    def add(
+        self,
+        visual: Floats,
+        state: tuple[float, ...],
+        goal: tuple[float, float],
+        action: tuple[float, float],
+        reward: float,
+        chosen: Chosen,
+    ) -> None:
+        """Keep a step that was acted in."""
+        self.visual.append(visual)
+        self.state.append(state)
+        self.goal.append(goal)
+        self.action.append(action)
+        self.reward.append(reward)
+        self.latency.append(chosen.latency)
+        self.generation.append(chosen.generation)
+        if chosen.queries is not None:
+            self.queries.append(chosen.queries)
+
 
 def goal_features(x_m: float, y_m: float) -> tuple[float, float]:
     """A goal in the robot frame as the value network is told it: clipped to 40 m, in tens of metres."""
@@ -83,19 +106,21 @@ def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> Non
     if driven:
         arrays = {
             "visual": np.stack([each for steps in driven for each in steps.visual]).astype(np.float32),
-            "queries": np.stack([each for steps in driven for each in steps.queries]).astype(np.float32),
             "state": _rows(driven, "state"),
             "latency": _rows(driven, "latency"),
             "goal": _rows(driven, "goal"),
             "action": _rows(driven, "action"),
             "reward": np.array([each for steps in driven for each in steps.reward], dtype=np.float32),
             "generation": _generations(driven),
-            "semantic": np.concatenate([each for steps in driven for each in steps.semantic]).astype(np.float32),
-            "semantic_end": np.cumsum([len(each) for steps in driven for each in steps.semantic]).astype(np.int64),
             "after_visual": np.stack([_after(steps) for steps in driven]).astype(np.float32),
             "after_state": np.array([steps.after_state for steps in driven], dtype=np.float32),
             "after_goal": np.array([steps.after_goal for steps in driven], dtype=np.float32),
         }
+        if driven[0].queries:
+            semantic = [each for steps in driven for each in steps.semantic]
+            arrays["queries"] = np.stack([each for steps in driven for each in steps.queries]).astype(np.float32)
+            arrays["semantic"] = np.concatenate(semantic).astype(np.float32)
+            arrays["semantic_end"] = np.cumsum([len(each) for each in semantic]).astype(np.int64)
     ends = [asdict(end) for _, end in episodes]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -135,9 +160,10 @@ def read(paths: Sequence[Path]) -> Rollout:
         ends += found
         if not arrays:
             continue
-        rows = np.split(arrays.pop("semantic"), arrays.pop("semantic_end")[:-1])
-        arrays["generation"] = arrays["generation"] + len(semantic)
-        semantic += rows
+        if "semantic" in arrays:
+            rows = np.split(arrays.pop("semantic"), arrays.pop("semantic_end")[:-1])
+            arrays["generation"] = arrays["generation"] + len(semantic)
+            semantic += rows
         parts.append(arrays)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
     if joined and sum(end.steps for end in ends) != len(joined["reward"]):
