@@ -227,6 +227,11 @@ def test_the_stage_collects_what_the_recipe_says(tmp_path: Path, monkeypatch: py
     json.dumps(result)
 
 
+def test_its_budget_is_its_drives() -> None:
+    recipe: Any = SimpleNamespace(collect=CollectConfig(episodes=7))
+    assert [samples for _, samples, _ in collect.budget(recipe)] == [7]
+
+
 def test_under_torchrun_it_refuses(tmp_path: Path) -> None:
     with pytest.raises(CollectError, match="without torchrun"):
         collect.run(_job(tmp_path, ranks=Ranks(0, 2)))

@@ -193,6 +193,16 @@ def test_a_torn_last_line_costs_that_drive_only(tmp_path: Path) -> None:
         assert writer.has("e1")
 
 
+def test_the_counts_say_how_drives_ended(tmp_path: Path) -> None:
+    ends = (("reached", False), ("reached", True), ("fell", False))
+    made = [drive(f"e{i}", frames=20, outcome=end, collided=hit) for i, (end, hit) in enumerate(ends)]
+    dataset(tmp_path, *made)
+    with DatasetWriter(tmp_path) as writer:
+        found = writer.summary()
+    assert found["outcomes"] == {"fell": 1, "reached": 2} and found["collided"] == 1
+    assert (found["drives"], found["frames"]) == (3, 60)
+
+
 def test_two_writers_at_a_time_are_refused(tmp_path: Path) -> None:
     with DatasetWriter(tmp_path), pytest.raises(DriveError, match="another process"):
         DatasetWriter(tmp_path)

@@ -83,13 +83,14 @@ class DatasetWriter:
         return Dataset.open(self.folder)
 
     def summary(self, prefix: str = "") -> dict[str, Any]:
-        """Counts, for a result: drives, frames, bytes, outcomes, kinds, why others were given up."""
+        """Counts, for a result: drives, frames, bytes, collisions, outcomes, kinds, why others were given up."""
         entries, dropped = self.entries(prefix), self.dropped(prefix)
         return {
             "drives": len(entries),
             "frames": sum(entry.frames for entry in entries),
             "bytes": sum(entry.bytes for entry in entries),
             "val_drives": sum(entry.val for entry in entries),
+            "collided": sum(entry.collided for entry in entries),
             "outcomes": dict(sorted(Counter(entry.outcome for entry in entries).items())),
             "kinds": dict(sorted(Counter(entry.kind for entry in entries).items())),
             "dropped": dict(sorted(Counter(each.why for each in dropped).items())),

@@ -229,6 +229,7 @@ class Entry:
     robot: str
     driver: str
     outcome: str
+    collided: bool
     val: bool
 
     @staticmethod
@@ -237,7 +238,7 @@ class Entry:
         about = drive.about
         return Entry(
             about.id, file_sha256(path), path.stat().st_size, len(drive), about.kind, about.layout_seed, about.robot,
-            about.driver, about.outcome, about.is_val,
+            about.driver, about.outcome, about.collided, about.is_val,
         )  # fmt: skip
 
 
