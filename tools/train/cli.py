@@ -147,7 +147,7 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     if args.base is not None and args.checkpoint:
         raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
     _check_device(args.device)
-    with ranks_of_environment(args.device) as ranks:
+    with ranks_of_environment(args.device) as ranks, deterministic(args.device):
         return _train(args, recipe, steps, ranks)
 
 
@@ -178,10 +178,23 @@ def _check_device(device: str) -> None:
         raise UsageError(f"--device {device}: expected cpu, cuda or cuda:N")
     if kind == "cuda" and not torch.cuda.is_available():
         raise UsageError(f"--device {device}: there is no such device here, or torch is built without it")
-    if kind == "cpu":
+
+
+@contextmanager
+def deterministic(device: str) -> Iterator[None]:
+    """On the CPU only what gives the same bits every time; an operation that cannot raises RuntimeError."""
+    import torch
+
+    before = torch.are_deterministic_algorithms_enabled(), torch.utils.deterministic.fill_uninitialized_memory
+    if device == "cpu":
         torch.use_deterministic_algorithms(True)
         # Nobody reads what was never written; filling it only costs time.
         torch.utils.deterministic.fill_uninitialized_memory = False
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0])
+        torch.utils.deterministic.fill_uninitialized_memory = before[1]
 
 
 def _train(args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], ranks: Ranks) -> dict[str, Any]:

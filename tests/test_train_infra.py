@@ -1,0 +1,390 @@
+"""Recipes, run folders, checkpoints, optimisers and ranks: what every stage of training stands on."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from export.model.config import PRESETS
+from tests import train_ranks
+from tools.train import checkpoint
+from tools.train.distributed import SINGLE, BatchOrder, Ranks
+from tools.train.job import StageJob
+from tools.train.optim import OptimConfig, Optimiser, learning_rate
+from tools.train.recipe import (
+    DaggerConfig,
+    Recipe,
+    RecipeError,
+    filled,
+    load_recipe,
+    recipe_names,
+    recipe_of,
+    stage_seed,
+)
+from tools.train.run_dir import RunDir, RunDirError
+
+NANO = PRESETS["nano"]
+ROOT = Path(__file__).parents[1]
+
+
+# Recipes
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_recipe_survives_being_written_down(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    path = tmp_path / "recipe.toml"
+    path.write_text(recipe.to_toml())
+    assert load_recipe(str(path)) == recipe
+
+
+def test_the_shipped_recipes_train_the_shipped_networks() -> None:
+    assert load_recipe("nano").model == NANO and load_recipe("1b").model == PRESETS["1b"]
+
+
+def test_a_setting_changes_one_number_of_a_stage_and_leaves_its_neighbours() -> None:
+    plain, changed = load_recipe("nano"), load_recipe("nano", ["sft.optim.lr=0.5", "seed=3", "dagger.rounds=0"])
+    assert plain.sft is not None and changed.sft is not None
+    assert changed.sft == replace(plain.sft, optim=replace(plain.sft.optim, lr=0.5))
+    assert changed.seed == 3 and changed.dagger.rounds == 0 and changed.rl == plain.rl
+
+
+def test_a_setting_may_change_the_network() -> None:
+    changed = load_recipe("nano", ["model.action.latency_aware=false"]).model
+    assert changed == replace(NANO, action=replace(NANO.action, latency_aware=False))
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("sft.epoch=3", "did you mean epochs"),
+        ("stf.epochs=3", "did you mean sft"),
+        ("sft.epochs=many", "a whole number"),
+        ("sft.epochs", "KEY=VALUE"),
+        ("sft=3", "STAGE.field"),
+        ("model.action.layer=3", "not a number of the model"),
+        ("sft.epochs=0", r"\[sft\]"),
+        ("seed=-1", "seed from 0"),
+    ],
+)
+def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says: str) -> None:
+    with pytest.raises(RecipeError, match=says) as caught:
+        load_recipe("nano", [setting])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("schema = 2", "schema = 1"),
+        ('schema = 1\nname = "a"\nseed = 1', "table \\[model\\]"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\nlayers = 3', "unknown key 'layers'"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sfd]', "unknown key 'sfd'"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sft]\nepoch = 1', "unknown key 'epoch'"),
+        ('schema = 1\nname = "a"\nseed = "b"\n[model]\npreset = "nano"', "seed, a whole number"),
+        ("schema =", "recipe.toml"),
+    ],
+)
+def test_a_wrong_recipe_is_one_clear_line(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=says) as caught:
+        load_recipe(str(path))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["nono", "nowhere.toml", "recipe.json"])
+def test_a_recipe_that_is_not_there_is_said(name: str) -> None:
+    with pytest.raises(RecipeError, match=name):
+        load_recipe(name)
+
+
+@dataclass(frozen=True)
+class Inner:
+    a: int = 1
+    b: int = 2
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=lambda: Inner(a=5))
+    c: int = 3
+
+
+def test_a_nested_table_is_filled_with_its_own_defaults() -> None:
+    assert filled(Outer(), {"inner": {"b": 7}}) == {"inner": {"a": 5, "b": 7}, "c": 3}
+
+
+def test_stages_have_seeds_of_their_own_that_follow_from_the_runs() -> None:
+    recipe = Recipe("r", 1, NANO)
+    seeds = {stage_seed(recipe, stage) for stage in ("collect", "sft", "imitate")}
+    assert len(seeds) == 3 and stage_seed(replace(recipe, name="other"), "sft") in seeds
+    assert stage_seed(replace(recipe, seed=2), "sft") not in seeds
+
+
+# Run folders
+
+
+def run_dir(tmp_path: Path, **changed: object) -> RunDir:
+    return RunDir.open(tmp_path / "run", replace(load_recipe("tiny"), **changed))
+
+
+def test_a_run_says_what_it_was_made_with(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    assert load_recipe(str(made.recipe_path)) == load_recipe("tiny")
+    versions = json.loads((made.out / "versions.json").read_text())
+    assert versions["packages"]["numpy"] == np.__version__ and versions["python"]
+
+
+def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    (made.stage("collect") / "drive").touch()
+    later = load_recipe("tiny", ["sft.epochs=9"])
+    assert load_recipe(str(RunDir.open(made.out, later).recipe_path)) == later
+    (made.stage("sft") / "state").touch()
+    with pytest.raises(RunDirError, match=r"sft.epochs: 9 there, 8 asked for"):
+        RunDir.open(made.out, load_recipe("tiny", ["sft.epochs=8"]))
+
+
+@pytest.mark.parametrize("setting", ["seed=5", "model.action.latency_aware=false"])
+def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    RunDir.open(made.out, load_recipe("tiny", [setting]))
+    (made.stage("collect") / "drive").touch()
+    with pytest.raises(RunDirError, match="was begun with other numbers"):
+        RunDir.open(made.out, load_recipe("tiny"))
+
+
+def test_how_many_processes_work_on_it_may_always_change(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    (made.stage("collect") / "drive").touch()
+    RunDir.open(made.out, load_recipe("tiny", ["collect.jobs=7"]))
+
+
+def test_somebody_elses_folder_is_not_taken(tmp_path: Path) -> None:
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "to-mother.txt").touch()
+    with pytest.raises(RunDirError, match="new or empty directory"):
+        RunDir.open(tmp_path / "letters", load_recipe("tiny"))
+
+
+def test_a_resumed_stage_writes_its_lines_again_and_only_its_own(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    for step in (1, 2, 3):
+        made.log("sft", step, loss=1.0 / step)
+        made.log("imitate", step, loss=2.0)
+    made.rewind("sft", 1)
+    assert [(line["stage"], line["step"]) for line in made.lines()] == [
+        ("sft", 1), ("imitate", 1), ("imitate", 2), ("imitate", 3),
+    ]  # fmt: skip
+
+
+def test_half_a_line_of_a_killed_run_is_no_line(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    made.log("sft", 1, loss=1.0)
+    with made.log_path.open("a") as file:
+        file.write('{"stage": "sf')
+    assert len(list(made.lines())) == 1
+
+
+def test_what_a_stage_left_is_kept_under_another_name(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    made.finish("imitate", {"loss": 1.0})
+    made.log("imitate", 1, loss=1.0)
+    made.retire("imitate", "imitate-0")
+    assert made.result("imitate") is None and made.result("imitate-0") == {"loss": 1.0}
+    assert [line["stage"] for line in made.lines()] == ["imitate-0"]
+
+
+def test_another_runs_stages_are_used_where_they_would_be_the_same(tmp_path: Path) -> None:
+    base = run_dir(tmp_path)
+    for stage in ("collect", "encoder", "sft"):
+        base.finish(stage, {"of": stage})
+    recipe = load_recipe("tiny", ["model.action.latency_aware=false"])
+    ablation = RunDir.open(tmp_path / "ablation", recipe)
+    ablation.borrow(base, ("collect", "encoder", "sft"), recipe)
+    assert ablation.result("sft") == {"of": "sft"} and ablation.borrowed("sft")
+    for setting in ("sft.epochs=99", "model.language.mlp=64"):
+        with pytest.raises(RunDirError, match="--from"):
+            RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny", [setting]))
+
+
+def test_a_stage_that_has_not_finished_is_not_lent(tmp_path: Path) -> None:
+    base = run_dir(tmp_path)
+    with pytest.raises(RunDirError, match="sft has not finished"):
+        RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny"))
+
+
+# Jobs
+
+
+def test_a_jobs_generators_follow_from_seed_and_tag() -> None:
+    job = StageJob(Recipe("r", 1, NANO), RunDir(Path("none")), seed=4)
+    assert job.rng("a", 1).integers(1000) == job.rng("a", 1).integers(1000) != job.rng("a", 2).integers(1000)
+    draws = [torch.rand(1, generator=job.generator(tag)) for tag in ("a", "a", "b")]
+    assert draws[0] == draws[1] != draws[2]
+
+
+# Checkpoints
+
+
+def learn(steps: int, path: Path | None = None, stop_at: int | None = None) -> tuple[torch.Tensor, list[float]]:
+    """Weights and losses of a small training with dropout, stopped into `path` at a step or gone on from there."""
+    model = torch.nn.Linear(6, 3)
+    torch.nn.init.constant_(model.weight, 0.1)
+    torch.nn.init.zeros_(model.bias)
+    optimiser = Optimiser(model.parameters(), OptimConfig(lr=0.01, warmup_steps=5), 20)
+    generator, rng = torch.Generator().manual_seed(3), np.random.default_rng(3)
+    if path is not None and stop_at is None:
+        tensors, meta = checkpoint.load(path)
+        model.load_state_dict(checkpoint.under("model", tensors))
+        optimiser.restore(checkpoint.under("optimiser", tensors))
+        checkpoint.restore_generator(generator, tensors["generator"])
+        checkpoint.restore_rng(rng, meta["rng"])
+    losses = []
+    while optimiser.step_count < (steps if stop_at is None else stop_at):
+        x = torch.randn(8, 6, generator=generator) * float(rng.uniform(0.5, 1.5))
+        loss = (model(x) - 1).pow(2).mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss))
+    if path is not None and stop_at is not None:
+        tensors = {
+            **checkpoint.with_prefix("model", model.state_dict()),
+            **checkpoint.with_prefix("optimiser", optimiser.tensors()),
+            "generator": checkpoint.generator_tensor(generator),
+        }
+        checkpoint.save(path, tensors, {"rng": checkpoint.rng_meta(rng)})
+    return model.weight.detach().clone(), losses
+
+
+def test_training_that_was_stopped_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    whole, losses = learn(20)
+    path = tmp_path / "checkpoint.safetensors"
+    _, first = learn(20, path, stop_at=7)
+    resumed, rest = learn(20, path)
+    assert torch.equal(whole, resumed) and first + rest == losses
+
+
+def test_a_checkpoint_holds_tensors_of_every_kind_and_tied_ones(tmp_path: Path) -> None:
+    shared = torch.arange(6.0)
+    tensors = {"a": shared, "b": shared, "half": torch.ones(2, dtype=torch.bfloat16), "count": torch.tensor(3)}
+    checkpoint.save(tmp_path / "c", tensors, {"epoch": 2, "words": ["x"]})
+    read, meta = checkpoint.load(tmp_path / "c")
+    assert meta == {"epoch": 2, "words": ["x"]}
+    assert all(torch.equal(read[name], tensor) and read[name].dtype == tensor.dtype for name, tensor in tensors.items())
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    checkpoint.save(path, {"a": torch.ones(1)}, {})
+    with pytest.raises(TypeError):
+        checkpoint.save(path, {"a": torch.zeros(1)}, {"no JSON": object()})
+    assert checkpoint.load(path)[0]["a"] == 1 and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 40, b"not tensors at all"])
+def test_a_damaged_checkpoint_is_one_clear_line(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    path.write_bytes(content)
+    with pytest.raises(checkpoint.CheckpointFileError, match="delete it to begin anew") as caught:
+        checkpoint.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_are_no_checkpoint(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.ones(1)}, str(tmp_path / "c"))
+    with pytest.raises(checkpoint.CheckpointFileError, match="expected format"):
+        checkpoint.load(tmp_path / "c")
+
+
+# Optimisers
+
+
+def test_the_learning_rate_warms_up_and_falls_like_a_cosine() -> None:
+    config = OptimConfig(lr=1.0 - 1e-9, warmup_steps=10, final_lr_share=0.1)
+    rates = [learning_rate(config, step, 110) for step in range(110)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == rates[10] == pytest.approx(1.0)
+    assert rates[60] == pytest.approx(0.55) and rates[-1] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_short_run_warms_up_for_a_tenth_of_it() -> None:
+    assert learning_rate(OptimConfig(lr=0.1, warmup_steps=1000), 5, 50) == pytest.approx(0.1)
+
+
+def test_gradients_are_clipped_by_their_norm() -> None:
+    weight = torch.nn.Parameter(torch.zeros(2, 2))
+    optimiser = Optimiser([weight], OptimConfig(clip=0.5), 10)
+    weight.grad = torch.full((2, 2), 3.0)
+    assert optimiser.step() == pytest.approx(6.0) and weight.grad is None
+
+
+def test_a_step_that_is_not_finite_changes_nothing_and_is_counted() -> None:
+    weight = torch.nn.Parameter(torch.ones(2, 2))
+    optimiser = Optimiser([weight], OptimConfig(), 10)
+    weight.grad = torch.full((2, 2), float("nan"))
+    assert np.isnan(optimiser.step()) and torch.equal(weight, torch.ones(2, 2)) and optimiser.step_count == 1
+
+
+def test_gains_and_biases_do_not_decay() -> None:
+    gain, weight = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(3, 3))
+    optimiser = Optimiser([gain, weight], OptimConfig(lr=0.1, weight_decay=0.5, warmup_steps=0), 10)
+    for each in (gain, weight):
+        each.grad = torch.zeros_like(each)
+    optimiser.step()
+    assert torch.equal(gain, torch.ones(3)) and float(weight.detach().max()) < 1
+
+
+# Ranks
+
+
+@pytest.mark.parametrize("world", [1, 2, 3])
+def test_ranks_share_every_batch_without_loss_or_overlap(world: int) -> None:
+    order = BatchOrder(count=23, batch=8, epochs=2, seed=1)
+    for step in range(order.steps):
+        shares = [Ranks(rank, world).share(order.indices(step)) for rank in range(world)]
+        assert sorted(np.concatenate(shares)) == sorted(order.indices(step))
+
+
+def test_every_epoch_shows_every_sample_once_in_an_order_of_its_own() -> None:
+    order = BatchOrder(count=23, batch=8, epochs=2, seed=1)
+    epochs = [np.concatenate([order.indices(e * 3 + s) for s in range(3)]) for e in range(2)]
+    assert all(sorted(epoch) == list(range(23)) for epoch in epochs) and list(epochs[0]) != list(epochs[1])
+
+
+def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
+    alone = train_ranks.train(SINGLE)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    ranks = []
+    for rank in range(2):
+        env = {**os.environ, "RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1",
+               "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": str(ROOT)}  # fmt: skip
+        ranks.append(subprocess.Popen([sys.executable, "-m", "tests.train_ranks", str(tmp_path)], env=env, cwd=ROOT))
+    try:
+        assert [process.wait(120) for process in ranks] == [0, 0]
+    finally:
+        for process in ranks:
+            process.kill()
+    together = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
+    assert together[0] == together[1]
+    assert together[0] == pytest.approx(alone, rel=1e-4) and alone[-1] < alone[0]
+
+
+def test_dagger_asks_for_something_that_can_be_done() -> None:
+    with pytest.raises(ValueError, match="rounds"):
+        DaggerConfig(rounds=-1)
+    with pytest.raises(RecipeError):
+        recipe_of({"schema": 1, "name": "", "seed": 1, "model": {"preset": "nano"}})
