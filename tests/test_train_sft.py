@@ -165,11 +165,12 @@ def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
 
 def test_the_stage_reads_the_runs_drives_and_leaves_the_runs_network(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
-    few = dataclasses.replace(CONFIG.evaluate, anchors=2, drives=1, max_new_tokens=3)
+    few = dataclasses.replace(CONFIG.evaluate, anchors=2, epoch_anchors=1, drives=1, max_new_tokens=3)
     job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=1, evaluate=few))
     result = run(job)
     assert result["steps"] == 3 and np.isfinite(result["held_loss"])
     assert result["held_out"]["taught"]["answers"] == 2 and result["held_out"]["own"]["answers"] == 4
+    assert [line["progress_share"] for line in job.run_dir.lines() if "progress_share" in line] == [0.0]
     assert (tmp_path / "sft" / "model.safetensors").read_bytes() == job.run_dir.model_path.read_bytes()
 
 

@@ -29,7 +29,7 @@ CONFIG = SftConfig(
     optim=OptimConfig(lr=3e-3, warmup_steps=0),
     held_anchors=5,
     checkpoint_steps=2,
-    evaluate=EvalConfig(anchors=0, drives=0),
+    evaluate=EvalConfig(anchors=0, epoch_anchors=0, drives=0),
 )
 """20 anchors to learn from: three steps an epoch."""
 

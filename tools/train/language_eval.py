@@ -34,6 +34,8 @@ class EvalConfig:
 
     anchors: int = 384
     """Anchors that are answered with the right words before them."""
+    epoch_anchors: int = 64
+    """The same after every epoch, for a curve."""
     drives: int = 24
     """Drives along which the model hears only itself."""
     gap_s: float = 2.0
@@ -42,7 +44,7 @@ class EvalConfig:
     batch: int = 48
 
     def __post_init__(self) -> None:
-        if min(self.anchors, self.drives) < 0 or self.batch < 1 or self.max_new_tokens < 1:
+        if min(self.anchors, self.epoch_anchors, self.drives) < 0 or self.batch < 1 or self.max_new_tokens < 1:
             raise ValueError("expected anchors and drives from 0 on, batch and max_new_tokens from 1 on")
         if self.gap_s < 1 or self.gap_s != round(self.gap_s):
             raise ValueError(f"expected gap_s to be whole seconds from 1 on, found {self.gap_s}")
@@ -119,22 +121,55 @@ def evaluate(
 ) -> dict[str, Any]:
     """Scores under `taught` (right words before), `own` (its own words before) and `waypoints_only`."""
     rng = np.random.default_rng((seed, _TAG))
-    some = [anchors[int(i)] for i in sorted(rng.permutation(len(anchors))[: config.anchors])]
-    wordings = [anchor.wordings[int(rng.integers(len(anchor.wordings)))] for anchor in some]
     speaker = Speaker(language, prompts, tokens, config)
-    scores: dict[str, Any] = {}
-    for name, only in (("taught", False), ("waypoints_only", True)):
-        drawn = [
-            Drawn(wording, anchor.before(config.gap_s), only) for anchor, wording in zip(some, wordings, strict=True)
-        ]
-        score = Score(config.gap_s)
-        for anchor, text in zip(some, speaker.say(list(zip(some, drawn, strict=True))), strict=True):
-            score.add(text, anchor)
-        scores[name] = score.points() if only else score.numbers()
+    some = _some(anchors, config.anchors, rng)
+    scores: dict[str, Any] = {
+        "taught": taught(speaker, some, config.gap_s).numbers(),
+        "waypoints_only": taught(speaker, some, config.gap_s, waypoints_only=True).points(),
+    }
     ids = sorted({anchor.drive_id for anchor in anchors})
     chosen = {ids[int(i)] for i in rng.permutation(len(ids))[: config.drives]}
     scores["own"] = closed_loop(speaker, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
     return scores
+
+
+def glance(
+    language: LanguageModel,
+    prompts: Prompts,
+    tokens: FrameTokens,
+    anchors: Sequence[Anchor],
+    config: EvalConfig,
+    *,
+    seed: int,
+) -> dict[str, float]:
+    """A few numbers for a curve, of `epoch_anchors` anchors, always the same ones; {} where there are none."""
+    some = _some(anchors, config.epoch_anchors, np.random.default_rng((seed, _TAG)))
+    numbers = taught(Speaker(language, prompts, tokens, config), some, config.gap_s).numbers()
+    found = {
+        "parsable_share": numbers["waypoints_parsable"],
+        "progress_share": numbers["progress_right"],
+        "side_share": numbers["side_right"],
+        "landmark_recall": numbers["landmark_recall"],
+        "waypoint_error_3s_m": numbers["waypoint_error_m"] and numbers["waypoint_error_m"][0],
+    }
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def taught(
+    speaker: Speaker, questions: Sequence[tuple[Anchor, str]], gap_s: float, *, waypoints_only: bool = False
+) -> Score:
+    """Of answers to (anchor, wording) where the generation before, `gap_s` ago, was right."""
+    drawn = [(anchor, Drawn(wording, anchor.before(gap_s), waypoints_only)) for anchor, wording in questions]
+    score = Score(gap_s)
+    for (anchor, _), text in zip(drawn, speaker.say(drawn), strict=True):
+        score.add(text, anchor)
+    return score
+
+
+def _some(anchors: Sequence[Anchor], count: int, rng: np.random.Generator) -> list[tuple[Anchor, str]]:
+    """Anchors spread over all, each with one of its wordings."""
+    chosen = [anchors[int(i)] for i in sorted(rng.permutation(len(anchors))[:count])]
+    return [(anchor, anchor.wordings[int(rng.integers(len(anchor.wordings)))]) for anchor in chosen]
 
 
 class Speaker:

@@ -26,7 +26,7 @@ from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
 from tools.train.language_batch import LanguageBatch, Row, buckets, collate, row_losses
-from tools.train.language_eval import EvalConfig, evaluate
+from tools.train.language_eval import EvalConfig, evaluate, glance
 from tools.train.mirror import FOLDER as MIRRORED
 from tools.train.mirror import MirroredDataset, Views, mirrored
 from tools.train.network_file import finish_network, start_network
@@ -180,6 +180,8 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[
             if questions and step % per_epoch == 0:
                 line["held_loss"] = numbers["held_loss"] = mean_loss(job, network, held, questions)
             if job.ranks.first:
+                if step % per_epoch == 0:
+                    line |= glance(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
                 job.run_dir.log(STAGE, step, **line)
             job.progress.update(step, total, **numbers)
             stopping = job.should_stop()
@@ -219,7 +221,7 @@ def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, 
         batch = _batch(job, network, data, own)
         with autocast(job.device, optimiser.config.bf16):
             loss = row_losses(network.language, batch).mean()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         value = float(loss.detach())
     optimiser.step(len(own))
     return job.ranks.mean(value, len(own))
