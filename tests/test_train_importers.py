@@ -100,30 +100,30 @@ def _synthetic(
 
 def test_poses_are_where_it_was_at_every_tenth_of_a_second(recording: Recording) -> None:
     (piece,) = pieces(recording)
-    assert len(piece.pose) == 451
-    expected = np.array([_pose(k / 10) for k in range(451)])
+    assert len(piece.pose) == 450
+    expected = np.array([_pose(k / 10) for k in range(1, 451)])
     expected[:, 2] = (expected[:, 2] + pi) % (2 * pi) - pi
     assert np.allclose(piece.pose, expected, atol=1e-3)
 
 
 def test_every_instant_has_the_newest_picture_that_was_there_by_then(recording: Recording) -> None:
     (piece,) = pieces(recording)
-    times = recording.stamps_s[0] + np.arange(len(piece.picture)) / 10
+    times = recording.stamps_s[0] + np.arange(1, len(piece.picture) + 1) / 10
     ages = times - recording.stamps_s[piece.picture]
     assert ages.min() > -2e-5 and ages.max() < 1 / PICTURE_HZ + 1e-5
 
 
 def test_the_state_is_of_the_tenth_before_and_knows_nothing_of_what_comes(recording: Recording) -> None:
     (piece,) = pieces(recording)
-    assert np.allclose(piece.state[1:], (SPEED_MPS, 0.0, TURN_RADPS), atol=0.02) and np.allclose(piece.state[0], 0.0)
+    assert np.allclose(piece.state, (SPEED_MPS, 0.0, TURN_RADPS), atol=0.02)
 
     def stops(time_s: float) -> tuple[float, float, float]:
         return _pose(min(time_s, 5.0))
 
     times = np.arange(0.0, 10.0, 0.02)
     (going,), (stopping,) = (pieces(_synthetic(times, times, pose)) for pose in (_pose, stops))
-    assert np.array_equal(going.state[:51], stopping.state[:51])
-    assert np.allclose(stopping.state[52:], 0.0, atol=1e-9)
+    assert np.array_equal(going.state[:49], stopping.state[:49])
+    assert np.allclose(stopping.state[51:], 0.0, atol=1e-6)
 
 
 def test_a_heading_that_wraps_is_interpolated_the_short_way() -> None:
@@ -132,25 +132,26 @@ def test_a_heading_that_wraps_is_interpolated_the_short_way() -> None:
 
     times = np.arange(0.0, 2.0, 0.07)
     (piece,) = pieces(_synthetic(times, times, turning))
-    assert np.allclose(piece.state[1:, 2], 0.5, atol=1e-6)
+    assert np.allclose(piece.state[:, 2], 0.5, atol=1e-6)
 
 
 def test_a_hole_in_the_pictures_cuts_the_recording() -> None:
     stamps = [k / 10 for k in range(100) if not 40 <= k < 60]
     found = pieces(_synthetic(stamps, np.arange(0.0, 9.9, 0.02)))
-    assert [len(piece.pose) for piece in found] == [42, 39]
-    assert np.allclose(found[1].pose[0], _pose(6.0), atol=1e-3) and np.allclose(found[1].state[0], 0.0)
+    assert [len(piece.pose) for piece in found] == [41, 39]
+    assert np.allclose(found[1].pose[0], _pose(6.0), atol=1e-3)
+    assert np.allclose(found[1].state[0], (SPEED_MPS, 0.0, TURN_RADPS), atol=0.02)
 
 
 def test_a_hole_in_the_poses_cuts_it_too() -> None:
     pose_times = [k / 50 for k in range(500) if not 100 < k < 200]
     found = pieces(_synthetic(np.arange(0.0, 9.9, 0.1), pose_times))
-    assert [len(piece.pose) for piece in found] == [21, 58]
+    assert [len(piece.pose) for piece in found] == [20, 57]
 
 
 def test_what_only_pictures_or_only_poses_cover_is_left_out() -> None:
     (piece,) = pieces(_synthetic(np.arange(1.0, 5.0, 0.1), np.arange(2.0, 9.0, 0.02)))
-    assert len(piece.pose) == 30 and np.allclose(piece.pose[0], _pose(2.0), atol=1e-3)
+    assert len(piece.pose) == 29 and np.allclose(piece.pose[0], _pose(2.1), atol=1e-3)
 
 
 # -- episodes ---------------------------------------------------------------------------------------------------------
@@ -160,7 +161,7 @@ def test_episodes_are_of_twenty_seconds_and_the_rest_is_left_out(recording: Reco
     found = list(drives(recording, "scand", "spot"))
     assert [drive.id for drive in found] == ["scand-A_Spot_1-0000", "scand-A_Spot_1-0001"]
     assert [len(drive) for drive in found] == [FRAMES, FRAMES] == [200, 200]
-    assert np.allclose(found[1].pose[0], _pose(20.0), atol=1e-3)
+    assert np.allclose(found[1].pose[0], _pose(20.1), atol=1e-3)
     assert found[0].about.driver == "imported" and found[0].about.robot == "spot" and not found[0].wordings
 
 
@@ -177,14 +178,14 @@ def test_labels_are_the_driven_future_and_waypoints_where_it_then_was(recording:
 
 def test_at_the_recordings_end_the_future_is_as_long_as_it_is_known(tmp_path: Path) -> None:
     (drive,) = drives(scand.read(_scand(tmp_path / "A", 20.4)), "scand", "spot")
-    assert [int(drive.future_steps[k]) for k in (154, 155, 199)] == [50, 49, 5]
-    assert np.array_equal(drive.future[199, 5:], np.repeat(drive.future[199, 4:5], 45, axis=0))
+    assert [int(drive.future_steps[k]) for k in (153, 154, 199)] == [50, 49, 4]
+    assert np.array_equal(drive.future[199, 4:], np.repeat(drive.future[199, 3:4], 46, axis=0))
 
 
 def test_pictures_are_squeezed_whole_to_128_pixels(recording: Recording) -> None:
     first = next(drives(recording, "scand", "spot"))
-    picture = first.frame(100)  # at 10.0 s: picture 150 of 15 Hz
-    assert picture.shape == (128, 128, 3) and np.abs(picture.mean() - 170) < 3
+    picture = first.frame(100)  # at 10.1 s: picture 151 of 15 Hz
+    assert picture.shape == (128, 128, 3) and np.abs(picture.mean() - 171) < 3
 
 
 def test_all_episodes_of_a_recording_are_in_one_half_of_the_split(recording: Recording) -> None:
@@ -194,7 +195,7 @@ def test_all_episodes_of_a_recording_are_in_one_half_of_the_split(recording: Rec
 def test_gnds_poses_in_space_become_poses_on_the_ground(recording_gnd: Recording) -> None:
     (drive,) = drives(recording_gnd, "gnd", "jackal")
     assert drive.id == "gnd-campus-1-0000"
-    assert np.allclose(drive.pose[::50], [_pose(k / 10) for k in (0, 50, 100, 150)], atol=2e-3)
+    assert np.allclose(drive.pose[::50], [_pose(k / 10) for k in (1, 51, 101, 151)], atol=2e-3)
     assert np.all(drive.future_steps[:199] == 50) and drive.future_steps[199] == 50
 
 

@@ -32,13 +32,14 @@ PICTURE_GAP_S: Final = 0.25  # an instant without a picture so new lies in a hol
 POSE_GAP_S: Final = 0.25  # and so does one between two poses further apart than this
 QUALITY: Final = 90
 THRESHOLD_M: Final = 1.5
+_STEP_S: Final = 1 / RATE_HZ
 _ROUNDING: Final = 1e-4  # of an instant: stamps since 1970 in seconds are exact to a quarter of a microsecond
 
 
 @dataclass(frozen=True)
 class Piece:
     """Part of a recording without holes, at 10 Hz: for each instant its newest picture [n], its pose [n, 3] and the
-    velocity since the instant before [n, 3]."""
+    body velocity [n, 3] over the tenth of a second before it: nothing of what comes after it."""
 
     picture: NDArray[np.int64]
     pose: Array
@@ -47,29 +48,28 @@ class Piece:
 
 def pieces(recording: Recording) -> list[Piece]:
     """The recording at 10 Hz, cut at its holes. No instant is given a picture that was taken after it."""
-    stamps, poses = recording.stamps_s, recording.poses
-    start, end = max(stamps[0], poses[0, 0]), min(stamps[-1], poses[-1, 0])
+    stamps, stamps_of_poses = recording.stamps_s, recording.poses[:, 0]
+    start, end = max(stamps[0], stamps_of_poses[0] + _STEP_S), min(stamps[-1], stamps_of_poses[-1])
     times = start + np.arange(max(0, int(np.floor((end - start) * RATE_HZ + _ROUNDING)) + 1)) / RATE_HZ
     picture = np.searchsorted(stamps, times + _ROUNDING / RATE_HZ, side="right") - 1
-    after = np.clip(np.searchsorted(poses[:, 0], times), 1, len(poses) - 1)
-    whole = (times - stamps[picture] <= PICTURE_GAP_S) & (poses[after, 0] - poses[after - 1, 0] <= POSE_GAP_S)
-    heading = np.unwrap(poses[:, 3])
-    columns = [np.interp(times, poses[:, 0], column) for column in (poses[:, 1], poses[:, 2], heading)]
-    pose = np.stack(columns, axis=1)
-    pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    whole = times - stamps[picture] <= PICTURE_GAP_S
+    for moments in (times, times - _STEP_S):
+        after = np.clip(np.searchsorted(stamps_of_poses, moments), 1, len(stamps_of_poses) - 1)
+        whole &= stamps_of_poses[after] - stamps_of_poses[after - 1] <= POSE_GAP_S
+    pose, before = _poses_at(recording.poses, times), _poses_at(recording.poses, times - _STEP_S)
+    state = np.array([relative(a, b)[0] for a, b in zip(before, pose, strict=True)]).reshape(-1, 3) * RATE_HZ
     edges = np.flatnonzero(np.diff(np.concatenate(((False,), whole, (False,))).astype(np.int8)))
     return [
-        Piece(picture[a:b], pose[a:b], _states(pose[a:b]))
+        Piece(picture[a:b], pose[a:b], state[a:b])
         for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
     ]
 
 
-def _states(pose: Array) -> Array:
-    """[n, 3] body velocity over the tenth of a second before each instant: nothing of what comes after it."""
-    states = np.zeros((len(pose), 3))
-    for k in range(1, len(pose)):
-        states[k] = relative(pose[k - 1], pose[k])[0] * RATE_HZ
-    return states
+def _poses_at(poses: Array, times: Array) -> Array:
+    """[n, 3] between the poses [p, 4] of a recording at instants [n], s; headings the short way round."""
+    heading = np.unwrap(poses[:, 3])
+    found = [np.interp(times, poses[:, 0], column) for column in (poses[:, 1], poses[:, 2], heading)]
+    return np.stack((found[0], found[1], (found[2] + np.pi) % (2 * np.pi) - np.pi), axis=1)
 
 
 def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
