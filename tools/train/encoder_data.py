@@ -203,6 +203,7 @@ def fill(
     total = sum(shard.frames for shard in shards)
     before = total - sum(shard.frames for shard in missing)
     taken: dict[str, int] = {}
+    progress.update(before, total)
     # The slowest first, so that no core idles at the end.
     waiting = sorted(missing, key=lambda shard: (shard.people * shard.frames, shard.name))
     workers = Workers([sys.executable, "-m", WORKER], jobs or len(os.sched_getaffinity(0)), logs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from math import radians
+from math import inf, isinf, radians
 from typing import Any, Final
 
 import numpy as np
@@ -29,8 +29,8 @@ from tools.train.encoder_labels import (
 Arrays = Mapping[str, NDArray[Any]]
 
 BEARING_RAD: Final = radians(10.0)
-_NEAR_BINS: Final = (0.0, 2.0, 5.0, 10.0, 30.1)  # m
-_FREE_BINS: Final = (0.0, 2.0, 5.0, 8.0, 12.1)
+_NEAR_BINS: Final = (0.0, 2.0, 5.0, 10.0, inf)  # m
+_FREE_BINS: Final = (0.0, 2.0, 5.0, 8.0, inf)
 _LEAST_CELLS: Final = 20  # fewer say nothing of a class
 _HALF_WIDTH: Final = float(np.tan(CAMERA_HFOV_RAD / 2))
 
@@ -125,7 +125,7 @@ class Score:
             off = np.abs(said - true)
             found[f"{name}_relative_error"] = float(np.median(off / np.maximum(true, 0.1))) if len(true) else None
             found[f"{name}_error_m"] = {
-                f"{low:g}-{high:g}": float(off[inside].mean())
+                (f"{low:g}+" if isinf(high) else f"{low:g}-{high:g}"): float(off[inside].mean())
                 for low, high in itertools.pairwise(bins)
                 if (inside := (true >= low) & (true < high)).any()
             }
