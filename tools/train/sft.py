@@ -55,7 +55,9 @@ class SftConfig:
     words: DrawConfig = field(default_factory=DrawConfig)
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
-    optim: OptimConfig = field(default_factory=lambda: OptimConfig(lr=1e-3, warmup_steps=200))
+    optim: OptimConfig = field(
+        default_factory=lambda: OptimConfig(lr=1e-3, final_lr_share=0.02, warmup_steps=200, bf16=True)
+    )
     """The paper's 2e-5 (Table 8) is for a language model that can speak; ours begins from nothing."""
     held_anchors: int = 512
     """Anchors of held-out layouts whose loss is looked at after every epoch."""
