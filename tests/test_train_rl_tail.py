@@ -27,8 +27,8 @@ from tools.train.action_tail import (
 )
 from tools.train.command_policy import CommandLimits, command_mean
 from tools.train.ppo import PpoConfig, PpoOptimiser
-from tools.train.rollout import EpisodeEnd, EpisodeSteps
 from tools.train.rl_learners import TailLearner
+from tools.train.rollout import EpisodeEnd, EpisodeSteps
 
 LIMITS = CommandLimits(1.0, 1.0)
 

@@ -86,7 +86,12 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--suite", required=True, metavar="NAME|FILE", help=f"one of: {', '.join(suite_names())}; or a file")
     p.add_argument("--episodes", action="append", default=[], metavar="GLOB", help="ids to run; may be repeated")
-    p.add_argument("--policy", required=True, metavar="P", help=f"artifacts:DIR, external:ADDR, {', '.join(BASELINES)}")
+    p.add_argument(
+        "--policy",
+        required=True,
+        metavar="P",
+        help=f"artifacts:DIR, external:ADDR, point-goal-net:FILE, {', '.join(BASELINES)}",
+    )
     p.add_argument(
         "--clock", choices=CLOCKS, default="lockstep",
         help="lockstep (default): virtual time, deterministic; realtime: edge-hil, edge-bridge and edge-run, go2 only",

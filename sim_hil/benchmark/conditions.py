@@ -15,7 +15,9 @@ from sim_hil.benchmark.latency import LatencyError, LatencyProfile
 from sim_hil.odometry_noise import LEVELS
 
 BASELINES = ("expert", "point-goal", "random", "still")
-POLICIES = ("artifacts", "external", *BASELINES)
+PLACED = ("artifacts", "external", "point-goal-net")
+"""Policies that are somewhere: a directory, an address, a file."""
+POLICIES = (*PLACED, *BASELINES)
 CLOCKS = ("lockstep", "realtime")
 MODES = ("async", "sync", "no-reasoning")
 DRIFTS = tuple(LEVELS)
@@ -43,11 +45,12 @@ class PolicySpec:
     where: str = ""
 
     def __post_init__(self) -> None:
-        wants_place = self.kind in ("artifacts", "external")
+        wants_place = self.kind in PLACED
         if self.kind not in POLICIES or wants_place != bool(self.where):
             found = f"{self.kind}:{self.where}" if self.where else self.kind
             raise ConditionsError(
-                f"policy {found!r}: expected artifacts:DIR, external:ADDR, or one of {', '.join(BASELINES)}"
+                f"policy {found!r}: expected artifacts:DIR, external:ADDR, point-goal-net:FILE, or one of "
+                f"{', '.join(BASELINES)}"
             )
 
     @staticmethod
@@ -55,7 +58,7 @@ class PolicySpec:
         """`expert`, `artifacts:DIR` …; a directory becomes an absolute path. Raises ConditionsError."""
         kind, _, where = text.partition(":")
         spec = PolicySpec(kind, where)
-        return PolicySpec(kind, str(Path(where).absolute())) if kind == "artifacts" else spec
+        return PolicySpec(kind, str(Path(where).absolute())) if kind in ("artifacts", "point-goal-net") else spec
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.where}" if self.where else self.kind
@@ -92,7 +95,7 @@ class Conditions:
             _one_of("mode", self.mode, MODES)
         if (self.mode is not None) != (kind == "artifacts"):
             raise ConditionsError(f"mode: belongs to a policy from artifacts, found {self.mode} with {kind}")
-        if self.latency is not None and kind in BASELINES:
+        if self.latency is not None and kind in (*BASELINES, "point-goal-net"):
             raise ConditionsError(f"latency: {kind} does not think; expected artifacts:DIR or external:ADDR with it")
         if kind == "artifacts" and self.clock == "lockstep" and self.latency is None:
             raise ConditionsError("latency: a policy from artifacts needs one in lockstep, found none")

@@ -34,6 +34,10 @@ def open_policy(conditions: Conditions, manifest_sha256: str = "") -> Policy:
     kind = conditions.policy.kind
     if kind == "artifacts":
         return _artifacts(conditions, manifest_sha256)
+    if kind == "point-goal-net":
+        from sim_hil.benchmark.point_goal_net import PointGoalNetPolicy
+
+        return PointGoalNetPolicy(Path(conditions.policy.where), robot_config())
     return _external(conditions) if kind == "external" else make_baseline(kind)
 
 

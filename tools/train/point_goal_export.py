@@ -1,0 +1,86 @@
+"""A trained point-goal network as one ONNX file: `python -m tools.train.point_goal_export RUN/rl --out bc.onnx`.
+
+What `edge-bench --policy point-goal-net:FILE` drives: frame, velocity and goal in, plan out; the encoder is inside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import onnx
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
+from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config_file import config_from_dict
+from export.model.vision import VisionEncoder
+from sim_hil.benchmark.point_goal_net import FORMAT, KEY
+from tools.train.network_file import NetworkFileError, read_network, weights_before
+from tools.train.point_goal_net import PointGoalFileError, PointGoalNet, load_point_goal
+
+OPSET: Final = 20
+
+
+class Whole(nn.Module):
+    """Frame uint8 [1, px, px, 3], state [1, 3], goal [1, 2] m in the robot frame → trajectory [1, steps, 3]."""
+
+    def __init__(self, vision: VisionEncoder, net: PointGoalNet) -> None:
+        super().__init__()
+        self.vision, self.net = vision, net
+
+    def forward(self, frame: Tensor, state: Tensor, goal: Tensor) -> Tensor:
+        trajectory: Tensor = self.net(self.vision(frame), state, goal)
+        return trajectory
+
+
+def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path: Path, origin: str) -> None:
+    """Write the file in one rename."""
+    px = config.vision.image_px
+    frame = torch.zeros(1, px, px, 3, dtype=torch.uint8)
+    inputs = (frame, torch.zeros(1, 3), torch.tensor([[1.0, 0.0]]))
+    program = torch.onnx.export(
+        Whole(vision.eval(), net.eval()), inputs, dynamo=True, verbose=False, opset_version=OPSET,
+        input_names=["frame", "state", "goal"], output_names=["trajectory"],
+    )  # fmt: skip
+    if program is None:
+        raise RuntimeError("torch's exporter gave no program")
+    model = program.model_proto
+    about = {"format": FORMAT, "image_px": px, "step_s": config.action.step_s, "origin": origin}
+    onnx.helper.set_model_props(model, {KEY: json.dumps(about, sort_keys=True)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    onnx.save(model, str(partial))
+    partial.replace(path)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    p = argparse.ArgumentParser("point_goal_export", description=__doc__.split("\n")[0])
+    p.add_argument("weights", type=Path, metavar="FILE", help="point_goal.safetensors of a run's imitate or rl stage")
+    p.add_argument("--out", type=Path, required=True, metavar="FILE.onnx")
+    args = p.parse_args(argv)
+    try:
+        run = args.weights.resolve().parent.parent
+        before = weights_before(run, "imitate")
+        if before is None:
+            raise NetworkFileError(f"{run}: the encoder's weights are not there; expected FILE in a run of edge-train")
+        with safe_open(str(before), framework="pt") as file:
+            config = config_from_dict(json.loads((file.metadata() or {})["config"]))
+        network = read_network(before, config, 0)
+        net = load_point_goal(args.weights, config)
+        export(network.vision, net, config, args.out, args.weights.parent.name)
+    except (OSError, SafetensorError, KeyError, ModelConfigError, NetworkFileError, PointGoalFileError) as error:
+        sys.stderr.write(f"point_goal_export: {error}\n")
+        return EXIT_BAD_INPUT
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
