@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 
 from export.checkpoint.coverage import CheckpointError
 from export.model.config import TicVlaConfig
+from export.model.config_file import config_from_dict
 
 FOLDER: Final = Path(__file__).with_name("weights")
 SECTIONS: Final = ("vision", "language", "action")
@@ -26,9 +27,8 @@ def shipped_weights(config: TicVlaConfig, folder: Path = FOLDER) -> Path | None:
         return None
     try:
         with safe_open(str(path), framework="pt") as file:
-            said = json.loads((file.metadata() or {})["config"])
-        ours = json.loads(json.dumps(config.to_dict()))
-        return path if all(said[section] == ours[section] for section in SECTIONS) else None
+            said = config_from_dict(json.loads((file.metadata() or {})["config"]))
+        return path if all(getattr(said, section) == getattr(config, section) for section in SECTIONS) else None
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{path}: the shipped weights cannot be read ({error}); install the package again"
