@@ -13,8 +13,6 @@ from export.model.config import TicVlaConfig
 from export.model.config_file import config_from_dict
 
 FOLDER: Final = Path(__file__).with_name("weights")
-SECTIONS: Final = ("vision", "language", "action")
-"""Of the network: what is exported."""
 
 
 def shipped_weights(config: TicVlaConfig, folder: Path = FOLDER) -> Path | None:
@@ -28,7 +26,7 @@ def shipped_weights(config: TicVlaConfig, folder: Path = FOLDER) -> Path | None:
     try:
         with safe_open(str(path), framework="pt") as file:
             said = config_from_dict(json.loads((file.metadata() or {})["config"]))
-        return path if all(getattr(said, section) == getattr(config, section) for section in SECTIONS) else None
+        return path if said == config else None
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{path}: the shipped weights cannot be read ({error}); install the package again"
