@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hil.benchmark.visibility import ASPECT
 from sim_hil.camera import MOUNTS, Mount
 from sim_hil.go2 import rotation_matrix
 from sim_hil.mesh import MeshBuilder, Surface, Vec2, Vec3
@@ -30,12 +31,11 @@ Ids = NDArray[np.int32]
 SKY, FLOOR, CEILING = 0, 1, 2
 """Numbers that are the same in every scene; terrain, walls, objects and people follow, each in the scene's order."""
 FIRST: Final = 3
-ASPECT: Final = 16 / 9  # of what a policy's square picture shows
 _LIT: Vec3 = (-3 / 7, 2 / 7, 6 / 7)  # towards the renderer's sun: no shade, so that a colour stays itself
 _BITS, _STEP = 5, 8  # of a colour's channel: numbers are written in steps of 8, in the middle of each
-_PERSON_M, _FAR_PERSON_M = 0.9, 45.0  # as the camera has them
+_PERSON_M, _FAR_PERSON_M = 0.9, 30.0  # labels end there; the camera shows a pixel or two of who is further away
 _UPRIGHT: Final = 0.9
-_DETAIL: Final = 0.5  # of people: nobody sees the buttons
+_DETAIL: Final = 0.4  # of people: nobody sees the buttons
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
-from sim_hil.benchmark.world import CAMERA_ASPECT
 from sim_hil.camera import CameraWorld
 from sim_hil.layouts import LayoutError
 from sim_hil.people import UPDATE_HZ, People, appearances
@@ -24,7 +23,7 @@ from sim_hil.scene import Scene
 from tools.train.augment import encoded
 from tools.train.drive import PICTURE_PX
 from tools.train.encoder_data import MOST_SCENES, WORKER, Shard, finish, path_of
-from tools.train.encoder_ids import IdWorld, view_of
+from tools.train.encoder_ids import ASPECT, IdWorld, view_of
 from tools.train.encoder_labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder_poses import Poses, body_state
 from tools.train.sites import Site
@@ -70,7 +69,7 @@ def render(folder: Path, shard: Shard) -> Iterator[int]:
             state[:7] = body_state(scene, shard.robot, pose, rng)
             sharp, quality = rng.uniform() < shard.sharp_share, rng.integers(*_span(shard))
             px = 2 * PICTURE_PX if sharp else PICTURE_PX
-            picture = camera.render(state, px, px, CAMERA_ASPECT)
+            picture = camera.render(state, px, px, ASPECT)
             if sharp:
                 picture = np.asarray(
                     cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8
