@@ -139,6 +139,8 @@ def _render(job: StageJob, config: EncoderConfig, folder: Path, shards: Sequence
     if job.ranks.first:
         fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.asked)
     while not all(made(folder, shard) for shard in shards):
+        if job.stop.asked:
+            raise KeyboardInterrupt
         time.sleep(_POLL_S)
     job.ranks.barrier()
 
