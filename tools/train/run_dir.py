@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.cli import write_whole
+from export import model
+from sim_hil.benchmark.code_version import code_sha256
 from tools.train.recipe import STAGES, Recipe, load_recipe
 
 VERSIONS: Final = "versions.json"
@@ -173,4 +176,15 @@ def versions() -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             found[package] = None
     machine = {"machine": platform.machine(), "cpus": os.cpu_count(), "system": platform.platform()}
-    return {"python": platform.python_version(), "packages": found, **machine}
+    code = {"simulation": code_sha256(), "training": _training_sha256()}
+    return {"python": platform.python_version(), "packages": found, "code_sha256": code, **machine}
+
+
+def _training_sha256() -> str:
+    """Of the sources and recipes that training consists of, beside what it simulates with."""
+    digest = hashlib.sha256()
+    for root in (Path(__file__).parent, Path(model.__path__[0])):
+        for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".json")):
+            digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
