@@ -32,8 +32,8 @@ ARMING_FREE_SHARE = 0.07
 """Fault matrix row 51: a robot that records is not armed with less of its file system free (openpilot's figure)."""
 _FLUSH_PERIOD_NS = 900_000_000  # below one second even when a pass of the loop is late
 _POLL_S = 0.05  # the writer looks by itself, so that a caller never pays for waking it
-_PART_AGE_NS = 3600 * 1_000_000_000
-"""The index of a part is kept in memory until it is finished, so none is written for longer than this."""
+_PART_AGE_NS = 300 * 1_000_000_000
+"""The index of a part is kept in memory until it is finished, 1 KiB a second: what five minutes take is used again."""
 _NICENESS = 10
 _RESUME = 1.25
 """A paused recording goes on once there is this many times the floor: not on and off with every flush."""
