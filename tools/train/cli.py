@@ -36,6 +36,7 @@ from tools.train.network_file import START, import_start
 from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.run_dir import RunDir
 from tools.train.show import progress_for
+from tools.train.variants import VARIANTS
 
 COMMAND: Final = "edge-train"
 COMMANDS: Final = (*chain.ALL, "all", "card")
@@ -50,7 +51,7 @@ EXAMPLES: Final = """examples:
   edge-train sft --out out/run --set sft.epochs=12
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
   edge-train imitate --out out/run --delay-profile orin.latency.json
-  edge-train all --from out/run --set model.action.latency_aware=false --set dagger.rounds=0 --out out/no-latency
+  edge-train imitate --from out/run --variant no-latency --out out/no-latency
   edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to give away
 
 stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
@@ -79,6 +80,12 @@ def parser() -> argparse.ArgumentParser:
         "--set", dest="settings", metavar="KEY=VALUE", action="append", default=[],
         help="change a number: seed, STAGE.field or model.SECTION.field; repeatable",
     )  # fmt: skip
+    p.add_argument(
+        "--variant",
+        choices=VARIANTS,
+        metavar="NAME",
+        help=f"an ablation or baseline of the paper: {', '.join(VARIANTS)}",
+    )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder of the run")
     p.add_argument("--resume", action="store_true", help="go on with a stage that was begun; skip what is done")
     p.add_argument("--from", dest="base", type=Path, metavar="DIR", help=f"use {', '.join(BORROWED)} of another run")
@@ -153,7 +160,9 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
 
 def _recipe(args: argparse.Namespace) -> Recipe:
     """The recipe that was named, else that of the run in --out or of the run it is taken from, else nano."""
-    settings = list(args.settings)
+    # First what is implied, so that a --set has the last word. Drives of another run are not added to.
+    implied = ["dagger.rounds=0"] if args.base is not None else []
+    settings = [*implied, *VARIANTS[args.variant or "full"], *args.settings]
     if args.delay_profile is not None:
         from edge.latency_profile import load_profile
 
