@@ -15,7 +15,7 @@ PREFILL, DECODE = LANGUAGE_PAIR
 
 @dataclass(frozen=True)
 class Linear:
-    """A weight matrix [rows, columns] and the tokens that go through it in one call."""
+    """A weight matrix [rows, columns] and the tokens that go through it in one call, all passes together."""
 
     name: str
     rows: int
@@ -23,6 +23,8 @@ class Linear:
     tokens: int
     table: bool = False
     """A lookup table: a call reads `tokens` of its rows and multiplies nothing."""
+    passes: int = 1
+    """Times that a call reads it: an unrolled loop goes through it again, with its share of the tokens each time."""
 
     @property
     def flops(self) -> int:
@@ -70,10 +72,10 @@ class Call:
         return sum(linear.bytes_in(precision, scale_bytes) for linear in self.linears)
 
     def traffic(self, precision: Precision, *, activation_bytes: int, cache_bytes: int) -> int:
-        """Bytes that one call moves: every weight once (of a table only the rows used), activations, caches."""
+        """Bytes that one call moves: every weight once a pass (of a table only the rows used), activations, caches."""
         read = 0
         for linear in self.linears:
-            stored = linear.bytes_in(precision, activation_bytes)
+            stored = linear.passes * linear.bytes_in(precision, activation_bytes)
             read += stored * min(linear.tokens, linear.rows) // linear.rows if linear.table else stored
         return read + self.activations * activation_bytes + self.cache * cache_bytes
 
@@ -170,9 +172,14 @@ def context_numbers(config: TicVlaConfig, tokens: int) -> int:
 
 
 def action_call(config: TicVlaConfig, *, context: int) -> Call:
-    """One step of the action expert over a semantic context of `context` tokens."""
+    """One step of the action expert over a semantic context of `context` tokens, all passes of its head included."""
     c, visual = config.action, config.vision.tokens
     now = visual + 2
+    denoises = c.head == "diffusion"
+    passes = c.ddim_steps if denoises else 1
+    chunk = passes * c.steps
+    # A diffusion's tokens also attend to one another: they go through the layers' keys and values as well.
+    among = c.steps if denoises else 0
     linears = [
         Linear("visual_projection.0", c.hidden, config.vision.token_dim, visual),
         Linear("visual_projection.2", c.hidden, c.hidden, visual),
@@ -182,20 +189,45 @@ def action_call(config: TicVlaConfig, *, context: int) -> Call:
         Linear("latency_projection.2", c.hidden, c.hidden, 1),
     ]
     for i in range(c.layers):
-        linears += [Linear(f"key_values.{i}.{part}", c.hidden, c.hidden, now) for part in "kv"]
+        seen, times = (now + chunk, 1 + passes) if denoises else (now, 1)
+        linears += [Linear(f"key_values.{i}.{part}", c.hidden, c.hidden, seen, passes=times) for part in "kv"]
         linears += [
-            # Layer 0's queries are constants.
-            *([Linear(f"layers.{i}.q", c.hidden, c.hidden, c.steps)] if i else []),
-            Linear(f"layers.{i}.o", c.hidden, c.hidden, c.steps),
-            Linear(f"layers.{i}.fc1", c.ffn, c.hidden, c.steps),
-            Linear(f"layers.{i}.fc2", c.hidden, c.ffn, c.steps),
+            # Layer 0's queries are constants, unless they are noisy actions.
+            *([Linear(f"layers.{i}.q", c.hidden, c.hidden, chunk, passes=passes)] if i or denoises else []),
+            Linear(f"layers.{i}.o", c.hidden, c.hidden, chunk, passes=passes),
+            Linear(f"layers.{i}.fc1", c.ffn, c.hidden, chunk, passes=passes),
+            Linear(f"layers.{i}.fc2", c.hidden, c.ffn, chunk, passes=passes),
         ]
-    linears += [Linear(f"head.{i}", c.hidden, c.hidden, c.steps) for i in (0, 2)]
-    linears.append(Linear("out", 3, c.hidden, c.steps))
+    linears += [Linear(f"head.{i}", c.hidden, c.hidden, chunk, passes=passes) for i in (0, 2)]
+    if denoises:
+        linears.append(Linear("diffusion.action_in", c.hidden, 3, chunk, passes=passes))
+    if c.head == "flow":
+        linears += _coupling_linears(config)
+    else:
+        linears.append(Linear("out", 3, c.hidden, chunk, passes=passes))
+    couplings = c.couplings if c.head == "flow" else 0
+    own = 6 * c.hidden + 2 * c.ffn + (2 * c.hidden if denoises else 0)
     return Call(
         linears=tuple(linears),
-        attention_flops=2 * FLOPS_PER_PRODUCT * c.steps * (now + context) * c.hidden * c.layers,
-        activations=2 * now * c.hidden * (3 + 2 * c.layers) + 2 * c.steps * (6 * c.hidden + 2 * c.ffn) * c.layers,
-        cache=context_numbers(config, context),
+        attention_flops=2 * FLOPS_PER_PRODUCT * chunk * (now + context + among) * c.hidden * c.layers
+        + 2 * FLOPS_PER_PRODUCT * (c.steps // 2) * ((c.steps + 1) // 2) * c.hidden * couplings,
+        activations=2 * now * c.hidden * (3 + 2 * c.layers)
+        + 2 * chunk * own * c.layers
+        + c.steps * 8 * c.hidden * couplings,
+        cache=passes * context_numbers(config, context),
         workspace=2 * now * 2 * c.hidden,
     )
+
+
+def _coupling_linears(config: TicVlaConfig) -> list[Linear]:
+    """Layers of a flow: of every coupling, one half of the steps is moved by the other."""
+    c = config.action
+    linears = []
+    for i in range(c.couplings):
+        moved = c.steps // 2 if i % 2 else (c.steps + 1) // 2
+        name, given = f"flow.couplings.{i}", c.steps - moved
+        linears += [Linear(f"{name}.action_in", c.hidden, 3, given)]
+        linears += [Linear(f"{name}.key_value.{part}", c.hidden, c.hidden, given) for part in "kv"]
+        linears += [Linear(f"{name}.layer.{part}", c.hidden, c.hidden, moved) for part in ("q", "o", "fc1", "fc2")]
+        linears += [Linear(f"{name}.out", 6, c.hidden, moved)]
+    return linears

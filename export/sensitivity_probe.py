@@ -330,4 +330,6 @@ def probe(reference: Reference, graph: str, rounder: Rounder, *, activations: bo
 def group_of(layer: str) -> str:
     """`layers.3.down` → `layers.3.*`, `projector.1` → `projector.*`, `lm_head` → `lm_head`."""
     parts = layer.split(".")
+    if parts[0] == "flow":
+        return ".".join([*parts[:3], "*"])  # a coupling as a whole
     return layer if len(parts) == 1 else ".".join([*parts[:-1], "*"])

@@ -127,22 +127,31 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     per = calls if stage == "decode" else 1  # a decode point is per token, any other for the whole stage
     where = f"measured on {point.machine}, {point.date}"
     same_chunks = point.chunk_tokens is None or point.chunk_tokens == work.chunk_tokens
-    if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks:
+    timed = _timed(config, stage)
+    if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks and timed == config:
         whole = Estimate(measured_ms * per, point.error, MEASURED, where)
         # Only the whole was measured: its longest call is the model's share of it.
         share = modelled.each.ms / modelled.whole.ms if modelled.whole.ms else 1.0
         energy_j = None if point.energy_j is None else point.energy_j * per
         return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED, energy_j=energy_j)
-    reference = _modelled(target, config, stage, precision, _at(stage, work, point))
+    reference = _modelled(target, timed, stage, precision, _at(stage, work, point))
     reference_ms = reference.whole.ms / (reference.calls if stage == "decode" else 1)
     factor = measured_ms / reference_ms
-    source = f"roofline scaled by {factor:.2f}: {where} at {taken} tokens"
+    at = "" if taken is None else f" at {taken} tokens"
+    source = f"roofline scaled by {factor:.2f}: {where}{at}{'' if timed == config else ', query head'}"
     scaled = [
         replace(e.times(factor), error=point.error, tag=MODELLED, source=source)
         for e in (modelled.whole, modelled.each)
     ]
     energy_j = None if point.energy_j is None else point.energy_j * scaled[0].ms / measured_ms
     return replace(modelled, whole=scaled[0], each=scaled[1], energy_j=energy_j)
+
+
+def _timed(config: TicVlaConfig, stage: str) -> TicVlaConfig:
+    """What a stage's measurements are of: points name a model, and its action expert was measured with queries."""
+    if stage != "action_expert":
+        return config
+    return replace(config, action=replace(config.action, head="query"))
 
 
 def _length(stage: str, work: Work) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -17,6 +17,7 @@ from export.checkpoint.layouts import find_layouts
 from export.checkpoint.sources import Source, open_source
 from export.checkpoint.tokenizer import directory_tokenizer
 from export.model.config import TicVlaConfig
+from export.model.config_file import config_from_dict
 from export.model.network import TicVla, empty_network, initialise
 from export.model.weights import FORMAT, WeightsInfo
 from export.stages import file_sha256
@@ -96,13 +97,13 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
     if written != FORMAT:
         raise CheckpointError(f"{source.label}: format {written!r}, expected {FORMAT!r}")
     try:
-        said = json.loads(source.metadata["config"])
-        ours = json.loads(json.dumps(config.to_dict()))
+        # A number that an older file does not know of: the usual value is what there was before it.
+        said, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
         differ = [
-            f"{section}.{key} is {said[section].get(key)!r}, expected {value!r}"
+            f"{section}.{key} is {said[section][key]!r}, expected {value!r}"
             for section in ("vision", "language", "action", "value")
             for key, value in ours[section].items()
-            if said[section].get(key) != value
+            if said[section][key] != value
         ]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{source.label}: its configuration is not readable; was it changed?") from error

@@ -126,6 +126,15 @@ def linear_layers(config: TicVlaConfig, name: str) -> tuple[str, ...]:
     if name == "action_expert":
         mlps = [f"{m}_projection.{i}" for m in ("visual", "state", "latency") for i in (0, 2)]
         layers = [f"layers.{i}.{part}" for i in range(config.action.layers) for part in ("q", "o", "fc1", "fc2")]
+        if config.action.head == "diffusion":
+            return (*mlps, *pairs, *layers, "head.0", "head.2", "out", "diffusion.action_in")
         # Layer 0 has no query product left: its queries are constants.
-        return (*mlps, *pairs, *(name for name in layers if name != "layers.0.q"), "head.0", "head.2", "out")
+        trunk = (*mlps, *pairs, *(name for name in layers if name != "layers.0.q"), "head.0", "head.2")
+        return (*trunk, *flow_layers(config)) if config.action.head == "flow" else (*trunk, "out")
     raise ValueError(f"graph {name!r} is not known")
+
+
+def flow_layers(config: TicVlaConfig) -> tuple[str, ...]:
+    """Names of a flow's own layers."""
+    parts = ("action_in", "key_value.k", "key_value.v", "layer.q", "layer.o", "layer.fc1", "layer.fc2", "out")
+    return tuple(f"flow.couplings.{i}.{part}" for i in range(config.action.couplings) for part in parts)

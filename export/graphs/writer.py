@@ -60,6 +60,7 @@ class GraphWriter:
         self._nodes: list[onnx.NodeProto] = []
         self._initializers: list[TensorProto] = []
         self._names: set[str] = set()
+        self._weights: dict[str, TensorProto] = {}
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
         self._shared: dict[tuple[str, tuple[int, ...], bytes], str] = {}
@@ -134,9 +135,19 @@ class GraphWriter:
         return self.constant(np.asarray(value).astype(self.float), stem)
 
     def weight(self, value: Array, name: str) -> str:
-        """A weight under its own name, in its own type; it goes to the data file when it is large."""
+        """A weight under its own name, in its own type; it goes to the data file when it is large.
+
+        A layer that is gone through again, as in an unrolled loop, gives the same weight again: it is stored once.
+        """
+        stored = self._weights.get(name)
+        if stored is not None:
+            if stored.raw_data != np.ascontiguousarray(value).tobytes():
+                raise ValueError(f"{self.name}: two weights have the name {name}")
+            return name
         self._names.add(name)
-        return self._store(value, name)
+        self._store(value, name)
+        self._weights[name] = self._initializers[-1]
+        return name
 
     def shared_weight(self, value: Array, name: str, file: str) -> str:
         """A weight in a data file of its own, which several graphs name and each of them writes alike."""

@@ -4,57 +4,53 @@ Split in two so that the part which depends on the semantic state alone runs onc
 projects the VLM's tokens to every layer's keys and values, `ActionExpert` adds what changes each tick. Keys and
 values are per-token linear maps, so the split is exact. Waypoints are re-expressed in the robot's current frame first
 (paper appendix C), so their context, of three tokens, is computed every tick.
+
+What becomes of the queries is the head's business: `query` reads the actions off them; `diffusion` and `flow` are in
+`export.model.heads`. A diffusion's layers also attend to the chunk's own tokens, with the keys and values that the
+present goes through: cross-attention alone would denoise every step without knowing of its neighbours.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from export.model.attention import CrossAttentionLayer, KeyValue, projection
 from export.model.config import TicVlaConfig
+from export.model.heads import ActionScale, Diffusion, Flow, differentiated, drawn, integrated, wrapped
 
 
-def projection(inputs: int, hidden: int) -> nn.Sequential:
-    """Two-layer MLP into the shared latent space (paper appendix A: "projected … via MLP layers")."""
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
+@dataclass(frozen=True)
+class Trunk:
+    """The cross-attention layers over what an expert knows at B instants: keys and values are made once for all."""
 
+    layers: tuple[CrossAttentionLayer, ...]
+    key_values: tuple[KeyValue, ...]
+    keys: tuple[Tensor, ...]
+    """Of each layer, present before semantics: [B, heads, N + 2 + T, d]."""
+    values: tuple[Tensor, ...]
+    mask: Tensor | None
+    """[B, 1, 1, N + 2 + T] bool, False at padding; None: nothing is padding."""
 
-class KeyValue(nn.Module):
-    """Keys and values of one cross-attention layer."""
+    @property
+    def batch(self) -> int:
+        """B."""
+        return len(self.keys[0])
 
-    def __init__(self, hidden: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.k = nn.Linear(hidden, hidden)
-        self.v = nn.Linear(hidden, hidden)
-
-    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens [1, T, hidden] → keys and values [1, heads, T, hidden/heads]."""
-        n, t, d = tokens.shape
-        split = (n, t, self.heads, d // self.heads)
-        return self.k(tokens).reshape(split).transpose(1, 2), self.v(tokens).reshape(split).transpose(1, 2)
-
-
-class CrossAttentionLayer(nn.Module):
-    """Pre-norm cross-attention of the queries, then an FFN."""
-
-    def __init__(self, hidden: int, heads: int, ffn: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm1 = nn.LayerNorm(hidden)
-        self.q = nn.Linear(hidden, hidden)
-        self.o = nn.Linear(hidden, hidden)
-        self.norm2 = nn.LayerNorm(hidden)
-        self.fc1 = nn.Linear(hidden, ffn)
-        self.fc2 = nn.Linear(ffn, hidden)
-
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor) -> Tensor:
-        n, t, d = x.shape
-        q = self.q(self.norm1(x)).reshape(n, t, self.heads, d // self.heads).transpose(1, 2)
-        attended = F.scaled_dot_product_attention(q, keys, values)
-        x = x + self.o(attended.transpose(1, 2).reshape(n, t, d))
-        return x + self.fc2(F.gelu(self.fc1(self.norm2(x))))
+    def __call__(self, x: Tensor, *, among: bool = False) -> Tensor:
+        """Tokens [B, S, hidden] through all layers; `among`: they also attend to one another."""
+        mask = self.mask
+        if among and mask is not None:
+            mask = torch.cat([mask, mask.new_ones(*mask.shape[:-1], x.shape[1])], dim=-1)
+        for layer, key_value, keys, values in zip(self.layers, self.key_values, self.keys, self.values, strict=True):
+            if among:
+                own_keys, own_values = key_value(layer.norm1(x))
+                keys, values = torch.cat([keys, own_keys], dim=2), torch.cat([values, own_values], dim=2)
+            x = layer(x, keys, values, mask)
+        return x
 
 
 class ActionExpert(nn.Module):
@@ -76,28 +72,61 @@ class ActionExpert(nn.Module):
         self.layers = nn.ModuleList(CrossAttentionLayer(c.hidden, c.heads, c.ffn) for _ in range(c.layers))
         self.norm = nn.LayerNorm(c.hidden)
         self.head = projection(c.hidden, c.hidden)
-        self.out = nn.Linear(c.hidden, 3)
+        self.scale = None if c.head == "query" else ActionScale(c)
+        self.diffusion = Diffusion(c) if c.head == "diffusion" else None
+        self.flow = Flow(c) if c.head == "flow" else None
+        if self.flow is None:
+            self.out = nn.Linear(c.hidden, 3)
 
-    def semantic_tokens(self, guidance: Tensor) -> Tensor:
-        """Last-layer K‖V [1, T, kv_dim], or waypoints [1, 3, 2] in m in the current robot frame → [1, T, hidden]."""
+    def start(self, generator: torch.Generator) -> None:
+        """Begin near a slow walk straight ahead, as policies usually start at their mean; fill the head's buffers."""
+        with torch.no_grad():
+            if self.scale is None:
+                self.out.bias.copy_(torch.tensor(self.config.action.initial_step))
+            else:
+                self.scale.start()
+            if self.diffusion is not None:
+                self.diffusion.start(generator)
+            if self.flow is not None:
+                self.flow.start()
+
+    def fit_actions(self, trajectories: Tensor, known: Tensor | None = None) -> None:
+        """Normalise actions by a data set's trajectories [N, steps, 3], of which `known` [N, steps].
+
+        The query head takes actions as they are, and nothing happens. Raises ValueError for a step that is never known.
+        """
+        if self.scale is not None:
+            self.scale.fit(differentiated(trajectories, self.config.action.parameterisation), known)
+
+    def semantic_tokens(self, guidance: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Last-layer K‖V [B, T, kv_dim], or waypoints [B, 3, 2] in m in the current robot frame → [B, T, hidden].
+
+        States of different lengths are padded on the right: a token's place is counted from the left. In training,
+        `generator` (else torch's own) says what is dropped out.
+        """
         interface = self.config.action.semantic_interface
         if interface == "values-only":
             guidance = guidance[..., self.config.kv_dim // 2 :]
         tokens = self.semantic_projection(guidance) + self.semantic_position[:, : guidance.shape[1]]
         if self.training and interface != "waypoints":
             # Whole K‖V tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
-            keep = torch.rand(tokens.shape[:2], device=tokens.device) >= self.config.action.kv_dropout
-            tokens = tokens * keep[..., None]
+            chance = drawn(torch.rand, tuple(tokens.shape[:2]), tokens.device, generator)
+            tokens = tokens * (chance >= self.config.action.kv_dropout)[..., None]
         return tokens
 
-    def context(self, guidance: Tensor) -> tuple[Tensor, Tensor]:
-        """Semantic context: keys and values [layers, 1, heads, T, hidden/heads] of the semantic tokens."""
-        tokens = self.semantic_tokens(guidance)
+    def context(self, guidance: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Semantic context: keys and values [layers, B, heads, T, hidden/heads] of the semantic tokens."""
+        return self.context_of(self.semantic_tokens(guidance, generator))
+
+    def context_of(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and values [layers, B, heads, T, hidden/heads] of semantic tokens [B, T, hidden]."""
         pairs = [kv(tokens) for kv in self.key_values]
         return torch.stack([k for k, _ in pairs]), torch.stack([v for _, v in pairs])
 
-    def now_tokens(self, visual_tokens: Tensor, state: Tensor, latency: Tensor) -> Tensor:
-        """Tokens of the present [1, N + 2, hidden]: frame, robot state (vx, vy, ωz), latency (Δt, Δx, Δy, Δθ)."""
+    def now_tokens(
+        self, visual_tokens: Tensor, state: Tensor, latency: Tensor, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Tokens of the present [B, N + 2, hidden]: frame, robot state (vx, vy, ωz), latency (Δt, Δx, Δy, Δθ)."""
         c = self.config.action
         visual = self.visual_projection(visual_tokens) + self.visual_position
         if not c.latency_aware:
@@ -107,21 +136,108 @@ class ActionExpert(nn.Module):
         metadata = torch.stack([self.state_projection(state), self.latency_projection(latency)], dim=1)
         metadata = metadata + self.metadata_position
         if self.training:
-            keep = torch.rand(metadata.shape[0], 1, 1, device=metadata.device) >= c.state_dropout
+            keep = drawn(torch.rand, (metadata.shape[0], 1, 1), metadata.device, generator) >= c.state_dropout
             metadata = torch.cat([metadata[:, :1] * keep, metadata[:, 1:]], dim=1)
         return torch.cat([visual, metadata], dim=1)
 
+    def trunk(
+        self, now: Tensor, context_keys: Tensor, context_values: Tensor, context_mask: Tensor | None = None
+    ) -> Trunk:
+        """The layers over the present [B, N + 2, hidden] and a semantic context of B, or of S that share it evenly.
+
+        B/S instants in a row act on one semantic state. `context_mask` [S, T] is False at padding.
+        """
+        keys, values = [], []
+        share = len(now) // context_keys.shape[1]
+        for i, key_value in enumerate(self.key_values):
+            now_keys, now_values = key_value(now)
+            keys.append(torch.cat([now_keys, _shared(context_keys[i], share)], dim=2))
+            values.append(torch.cat([now_values, _shared(context_values[i], share)], dim=2))
+        mask = None
+        if context_mask is not None:
+            known = _shared(context_mask.bool(), share)
+            mask = torch.cat([known.new_ones(now.shape[:2]), known], dim=1)[:, None, None]
+        return Trunk(tuple(self.layers), tuple(self.key_values), tuple(keys), tuple(values), mask)
+
     def forward(
-        self, visual_tokens: Tensor, state: Tensor, latency: Tensor, context_keys: Tensor, context_values: Tensor
+        self,
+        visual_tokens: Tensor,
+        state: Tensor,
+        latency: Tensor,
+        context_keys: Tensor,
+        context_values: Tensor,
+        context_mask: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Planned trajectory [1, steps, 3] (x m, y m, θ rad) in the current robot frame."""
+        """Planned trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
+        now = self.now_tokens(visual_tokens, state, latency, generator)
+        return self.plan(self.trunk(now, context_keys, context_values, context_mask))
+
+    def plan(self, trunk: Trunk) -> Tensor:
+        """The trajectory [B, steps, 3] from what the layers see; of a distribution, the point that `heads` explains."""
+        if self.scale is None:
+            actions = self.out(self._features(trunk))
+        elif self.flow is not None:
+            actions = self.scale(self.flow.sample(self._features(trunk)))
+        else:
+            assert self.diffusion is not None
+            clean = self.diffusion.sample(lambda noisy, times: self._denoised(noisy, times, trunk), trunk.batch)
+            actions = self.scale(clean)
+        return integrated(actions, self.config.action.parameterisation)
+
+    def loss(
+        self,
+        visual_tokens: Tensor,
+        state: Tensor,
+        latency: Tensor,
+        context_keys: Tensor,
+        context_values: Tensor,
+        target: Tensor,
+        mask: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        *,
+        context_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Mean of `errors` over the steps that `mask` [B, steps] does not leave out; inputs as of `forward`."""
+        now = self.now_tokens(visual_tokens, state, latency, generator)
+        errors = self.errors(self.trunk(now, context_keys, context_values, context_mask), target, generator)
+        if mask is None:
+            return errors.mean()
+        known = mask.to(errors.dtype)[..., None]
+        return (errors * known).sum() / (3 * known.sum()).clamp(min=1)
+
+    def errors(self, trunk: Trunk, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """What training makes small, number by number [B, steps, 3], for driven trajectories `target` [B, steps, 3].
+
+        query: smooth L1 of the integrated poses (equation 4); diffusion: squared error of the clean normalised actions
+        at a noise level drawn by `generator`; flow: −log p of the normalised actions. Raises ValueError.
+        """
         c = self.config.action
-        now = self.now_tokens(visual_tokens, state, latency)
-        x = self.queries.expand(visual_tokens.shape[0], -1, -1)
-        for i, (key_value, layer) in enumerate(zip(self.key_values, self.layers, strict=True)):
-            keys, values = key_value(now)
-            x = layer(x, torch.cat([keys, context_keys[i]], dim=2), torch.cat([values, context_values[i]], dim=2))
-        out = self.out(self.head(self.norm(x)))
-        if c.parameterisation == "increments":
-            return torch.cumsum(out, dim=1)
-        return torch.cat([out[..., :2], torch.cumsum(out[..., 2:], dim=1)], dim=-1)
+        if target.shape != (trunk.batch, c.steps, 3):
+            raise ValueError(f"target is {list(target.shape)}, expected {[trunk.batch, c.steps, 3]}")
+        target = target.float()
+        if self.scale is None:
+            error = self.plan(trunk).float() - target
+            error = torch.cat([error[..., :2], wrapped(error[..., 2:])], dim=-1)
+            return F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
+        actions = self.scale.normalised(differentiated(target, c.parameterisation))
+        if self.flow is not None:
+            return self.flow.surprise(actions, self._features(trunk))
+        assert self.diffusion is not None
+        noisy, times = self.diffusion.corrupted(actions, generator)
+        return (self._denoised(noisy, times, trunk).float() - actions).square()
+
+    def _features(self, trunk: Trunk) -> Tensor:
+        """What each step's query found [B, steps, hidden]."""
+        return self.head(self.norm(trunk(self.queries.expand(trunk.batch, -1, -1))))
+
+    def _denoised(self, noisy: Tensor, times: Tensor, trunk: Trunk) -> Tensor:
+        """Clean normalised actions [B, steps, 3] as predicted from noisy ones at levels [B]."""
+        assert self.diffusion is not None
+        tokens = self.diffusion.tokens(noisy, times, self.queries)
+        return self.out(self.head(self.norm(trunk(tokens, among=True))))
+
+
+def _shared(tensor: Tensor, share: int) -> Tensor:
+    """Every row for `share` instants in a row."""
+    return tensor if share == 1 else tensor.repeat_interleave(share, dim=0)

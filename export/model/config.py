@@ -11,6 +11,10 @@ from edge.reasoning_text import WAYPOINT_TIMES_S
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
 PARAMETERISATIONS = ("increments", "offsets")
+HEADS = ("query", "diffusion", "flow")
+"""How the actions are made (paper Table 11): read off the queries, denoised, or flown out of a Gaussian."""
+OF_HEADS = ("head", "diffusion_steps", "ddim_steps", "couplings")
+"""Numbers of an action expert that came with the heads."""
 
 
 class ModelConfigError(ValueError):
@@ -125,6 +129,13 @@ class ActionConfig:
     parameterisation: str = "increments"
     initial_step: tuple[float, float, float] = (0.05, 0.0, 0.0)
     """(dx m, dy m, dθ rad) a step that the head's bias starts from: 0.5 m/s straight ahead."""
+    head: str = "query"
+    diffusion_steps: int = 100
+    """Noise levels that a diffusion is trained on."""
+    ddim_steps: int = 5
+    """Of them at inference, each a pass through all layers."""
+    couplings: int = 5
+    """Affine couplings of a flow."""
 
     def __post_init__(self) -> None:
         _require_sizes(self)
@@ -137,6 +148,13 @@ class ActionConfig:
             self.parameterisation in PARAMETERISATIONS,
             f"parameterisation {self.parameterisation!r}: expected one of {PARAMETERISATIONS}",
         )
+        _require(self.head in HEADS, f"head {self.head!r}: expected one of {HEADS}")
+        _require(
+            self.ddim_steps <= self.diffusion_steps,
+            f"ddim_steps {self.ddim_steps} are more than the {self.diffusion_steps} of diffusion_steps",
+        )
+        _require(self.head != "diffusion" or self.hidden % 2 == 0, f"hidden {self.hidden} must be even for a diffusion")
+        _require(self.head != "flow" or self.steps > 1, "steps is 1, expected two or more that a flow can split")
         for name in ("kv_dropout", "state_dropout"):
             _require(0 <= getattr(self, name) < 1, f"{name} must be in [0, 1)")
 
@@ -195,8 +213,14 @@ class TicVlaConfig:
         return len(WAYPOINT_TIMES_S) if by_text else self.language.max_context
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
-        return dataclasses.asdict(self)
+        """Plain JSON form; a query head's is without what only other heads have, as it was before there were any."""
+        content = dataclasses.asdict(self)
+        if self.action.head == "query":
+            usual, action = ActionConfig(), content["action"]
+            for key in OF_HEADS:
+                if action[key] == getattr(usual, key):
+                    del action[key]
+        return content
 
 
 PRESETS = {

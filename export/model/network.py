@@ -69,7 +69,9 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
                 if module.bias is not None:
                     module.bias.zero_()
             elif isinstance(module, nn.Linear):
-                std = HEAD_STD if name == "action.out" else max(INIT_STD, module.in_features**-0.5)
+                # What a head gives starts near zero; `ActionExpert.start` says around what.
+                ends = name.startswith("action.") and name.endswith(".out")
+                std = HEAD_STD if ends else max(INIT_STD, module.in_features**-0.5)
                 module.weight.normal_(0.0, std, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
@@ -79,8 +81,7 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
             if name.split(".")[0] in parts and name.endswith(("position", "cls", "queries")):
                 parameter.normal_(0.0, 1.0 if name.endswith("queries") else INIT_STD, generator=generator)
         if "action" in parts:
-            # The head starts near zero around a slow walk straight ahead, as policies usually start at their mean.
-            model.action.out.bias.copy_(torch.tensor(model.config.action.initial_step))
+            model.action.start(generator)
 
 
 def build(config: TicVlaConfig, seed: int) -> TicVla:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from export.model.action import projection
+from export.model.attention import projection
 from export.model.config import TicVlaConfig
 
 

@@ -1,0 +1,49 @@
+"""What the action expert is built of: projections into its latent space and cross-attention layers."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+
+
+def projection(inputs: int, hidden: int) -> nn.Sequential:
+    """Two-layer MLP into the shared latent space (paper appendix A: "projected … via MLP layers")."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
+
+
+class KeyValue(nn.Module):
+    """Keys and values of one cross-attention layer."""
+
+    def __init__(self, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.k = nn.Linear(hidden, hidden)
+        self.v = nn.Linear(hidden, hidden)
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens [B, T, hidden] → keys and values [B, heads, T, hidden/heads]."""
+        n, t, d = tokens.shape
+        split = (n, t, self.heads, d // self.heads)
+        return self.k(tokens).reshape(split).transpose(1, 2), self.v(tokens).reshape(split).transpose(1, 2)
+
+
+class CrossAttentionLayer(nn.Module):
+    """Pre-norm cross-attention of the queries, then an FFN."""
+
+    def __init__(self, hidden: int, heads: int, ffn: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(hidden)
+        self.q = nn.Linear(hidden, hidden)
+        self.o = nn.Linear(hidden, hidden)
+        self.norm2 = nn.LayerNorm(hidden)
+        self.fc1 = nn.Linear(hidden, ffn)
+        self.fc2 = nn.Linear(ffn, hidden)
+
+    def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Queries [B, S, hidden] over keys and values [B, heads, T, d]; `mask` [B, 1, 1, T] is False at padding."""
+        n, t, d = x.shape
+        q = self.q(self.norm1(x)).reshape(n, t, self.heads, d // self.heads).transpose(1, 2)
+        attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)
+        x = x + self.o(attended.transpose(1, 2).reshape(n, t, d))
+        return x + self.fc2(F.gelu(self.fc1(self.norm2(x))))

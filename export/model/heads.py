@@ -1,0 +1,258 @@
+"""The two other ways to make a chunk of actions that the paper compares (appendix D, Table 11): denoise it, or flow it.
+
+Both work on actions normalised by each step's own mean and deviation over the data set, which are stored with the
+weights. An *action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the
+parameterisation `offsets`, a position and an increment of the heading.
+
+What they start from at inference, `noise`, is a buffer stored with the weights, so that a plan is a function of its
+inputs: the same inputs give the same plan on every machine, and a graph is the same bytes when it is written again.
+Every tick takes the same point of the learned distribution: where two ways are as good, ticks do not alternate
+between them, and no chance is left in driving.
+
+* Diffusion: one Gaussian sample, drawn from the seed of the weights. Zero would be no better: the denoiser is trained
+  on inputs of the noise's own length and never sees one without any.
+* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned. A sample would be a
+  bias that every tick repeats.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+from export.model.attention import CrossAttentionLayer, KeyValue, projection
+from export.model.config import ActionConfig
+
+MIN_STD = 1e-3
+"""Smallest deviation that an action is divided by: 1 mm or 1 mrad a step, below which there is nothing to learn."""
+MAX_BETA = 0.999
+COSINE_OFFSET = 0.008
+"""Of the cosine schedule (Nichol and Dhariwal 2021, equation 17)."""
+TIME_PERIOD = 1e4
+MAX_LOG_SCALE = 2.0
+"""Of one coupling: data that hardly varies would else make the likelihood grow without bound."""
+
+
+def drawn(
+    kind: Callable[..., Tensor], shape: tuple[int, ...], device: torch.device, generator: torch.Generator | None
+) -> Tensor:
+    """`torch.rand` or `torch.randn` of a shape: by the generator, wherever it lives, else by torch's own."""
+    place = device if generator is None else generator.device
+    return kind(shape, generator=generator, device=place).to(device)
+
+
+def integrated(actions: Tensor, parameterisation: str) -> Tensor:
+    """Actions [B, steps, 3] → trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
+    if parameterisation == "increments":
+        return torch.cumsum(actions, dim=1)
+    return torch.cat([actions[..., :2], torch.cumsum(actions[..., 2:], dim=1)], dim=-1)
+
+
+def differentiated(trajectory: Tensor, parameterisation: str) -> Tensor:
+    """The inverse of `integrated`; headings may be wrapped, increments of them are within ±π."""
+    steps = torch.diff(trajectory, dim=1, prepend=torch.zeros_like(trajectory[:, :1]))
+    position = steps[..., :2] if parameterisation == "increments" else trajectory[..., :2]
+    return torch.cat([position, wrapped(steps[..., 2:])], dim=-1)
+
+
+def wrapped(angle: Tensor) -> Tensor:
+    """Angles in rad between −π and π."""
+    return torch.atan2(torch.sin(angle), torch.cos(angle))
+
+
+class ActionScale(nn.Module):
+    """Mean and deviation of every step's action, [1, steps, 3], stored with the weights."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: ActionConfig) -> None:
+        super().__init__()
+        self._start = config.initial_step
+        self.register_buffer("mean", torch.zeros(1, config.steps, 3))
+        self.register_buffer("std", torch.ones(1, config.steps, 3))
+
+    def start(self) -> None:
+        """As the query head begins: around a slow walk straight ahead."""
+        self.mean.copy_(torch.tensor(self._start).expand_as(self.mean))
+        self.std.fill_(1.0)
+
+    def fit(self, actions: Tensor, known: Tensor | None = None) -> None:
+        """Take mean and deviation from a data set's actions [N, steps, 3], of which `known` [N, steps]."""
+        weight = torch.ones_like(actions[..., :1]) if known is None else known[..., None]
+        weight = weight.double()
+        count = weight.sum(dim=0, keepdim=True)
+        if not (count > 0).all() or not torch.isfinite(actions).all():
+            raise ValueError(f"actions {list(actions.shape)}: expected finite ones, at least one known for every step")
+        mean = (actions.double() * weight).sum(dim=0, keepdim=True) / count
+        variance = ((actions.double() - mean).square() * weight).sum(dim=0, keepdim=True) / count
+        with torch.no_grad():
+            self.mean.copy_(mean)
+            self.std.copy_(variance.sqrt().clamp(min=MIN_STD))
+
+    def normalised(self, actions: Tensor) -> Tensor:
+        """Actions without unit, of mean 0 and deviation 1 at every step."""
+        return (actions.float() - self.mean) / self.std
+
+    def forward(self, normalised: Tensor) -> Tensor:
+        """The inverse of `normalised`: actions in m and rad."""
+        return normalised.float() * self.std + self.mean
+
+
+@lru_cache
+def cosine_schedule(levels: int) -> tuple[float, ...]:
+    """Share of the clean signal's power left at each noise level, from the least noise to the most (paper: cosine)."""
+
+    def left(level: int) -> float:
+        return math.cos((level / levels + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
+
+    shares, share = [], 1.0
+    for level in range(levels):
+        share *= 1 - min(1 - left(level + 1) / left(level), MAX_BETA)
+        shares.append(share)
+    return tuple(shares)
+
+
+@lru_cache
+def ddim_steps(levels: int, count: int) -> tuple[tuple[int, float, float], ...]:
+    """DDIM without added noise in `count` steps: (noise level, a, b) of x ← a·x + b·(clean actions as predicted).
+
+    Levels are spread evenly from the noisiest; the last step gives the prediction itself (a 0, b 1).
+    """
+    shares = cosine_schedule(levels)
+    times = [round(levels * i / count) - 1 for i in range(count, 0, -1)]
+    steps = []
+    for time, following in zip(times, [*times[1:], None], strict=True):
+        left = 1.0 if following is None else shares[following]
+        a = math.sqrt((1 - left) / (1 - shares[time]))
+        steps.append((time, a, math.sqrt(left) - a * math.sqrt(shares[time])))
+    return tuple(steps)
+
+
+def time_embedding(times: Tensor, width: int) -> Tensor:
+    """Noise levels [B] → sines and cosines [B, width] of wavelengths up to 2π·TIME_PERIOD."""
+    rates = TIME_PERIOD ** (-torch.arange(width // 2, device=times.device, dtype=torch.float32) / (width // 2))
+    angles = times.float()[:, None] * rates
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class Diffusion(nn.Module):
+    """Around the denoiser: noisy actions and their noise level as tokens, and the sampling by DDIM.
+
+    The denoiser itself is the expert's own transformer; its learned queries serve as the positions of the tokens.
+    """
+
+    noise: Tensor
+
+    def __init__(self, config: ActionConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.action_in = nn.Linear(3, config.hidden)
+        self.time_projection = projection(config.hidden, config.hidden)
+        self.register_buffer("noise", torch.zeros(1, config.steps, 3))
+
+    def start(self, generator: torch.Generator) -> None:
+        """Draw what every chunk is denoised from."""
+        self.noise.normal_(generator=generator)
+
+    def time_tokens(self, times: Tensor) -> Tensor:
+        """What a noise level [B] adds to every token: [B, 1, hidden]."""
+        return self.time_projection(time_embedding(times, self.config.hidden))[:, None]
+
+    def tokens(self, noisy: Tensor, times: Tensor, positions: Tensor) -> Tensor:
+        """Noisy normalised actions [B, steps, 3] at levels [B] → tokens [B, steps, hidden]."""
+        return self.action_in(noisy) + positions + self.time_tokens(times)
+
+    def corrupted(self, clean: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Clean normalised actions at noise levels [B] drawn evenly: what the denoiser is trained on."""
+        levels = self.config.diffusion_steps
+        times = (drawn(torch.rand, clean.shape[:1], clean.device, generator) * levels).long().clamp(max=levels - 1)
+        share = torch.tensor(cosine_schedule(levels), device=clean.device)[times][:, None, None]
+        noise = drawn(torch.randn, tuple(clean.shape), clean.device, generator)
+        return share.sqrt() * clean + (1 - share).sqrt() * noise, times
+
+    def sample(self, denoise: Callable[[Tensor, Tensor], Tensor], batch: int) -> Tensor:
+        """Normalised actions [batch, steps, 3] by `denoise`: noisy actions and levels → clean actions."""
+        x = self.noise.expand(batch, -1, -1)
+        for time, a, b in ddim_steps(self.config.diffusion_steps, self.config.ddim_steps):
+            x = a * x + b * denoise(x, torch.full((batch,), time, device=x.device)).float()
+        return x
+
+
+class Coupling(nn.Module):
+    """Affine map of one half of a chunk's steps by what the other half is, and by what the expert sees."""
+
+    def __init__(self, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.action_in = nn.Linear(3, hidden)
+        self.key_value = KeyValue(hidden, heads)
+        self.layer = CrossAttentionLayer(hidden, heads, hidden)
+        self.norm = nn.LayerNorm(hidden)
+        self.out = nn.Linear(hidden, 6)
+
+    def forward(self, given: Tensor, given_features: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithm of the scale, and shift, [B, S, 3] each, of the steps with `features` [B, S, hidden].
+
+        `given` [B, G, 3] are the other steps' actions, `given_features` what the expert sees for those.
+        """
+        x = self.layer(features, *self.key_value(given_features + self.action_in(given)))
+        log_scale, shift = self.out(self.norm(x)).float().chunk(2, dim=-1)
+        return MAX_LOG_SCALE * torch.tanh(log_scale / MAX_LOG_SCALE), shift
+
+
+class Flow(nn.Module):
+    """Normalising flow of couplings, which move even and odd steps in turn (even steps first and last of five).
+
+    Neighbouring steps say nearly everything about one another, which is what a coupling can use.
+    """
+
+    noise: Tensor
+
+    def __init__(self, config: ActionConfig) -> None:
+        super().__init__()
+        self.couplings = nn.ModuleList(Coupling(config.hidden, config.heads) for _ in range(config.couplings))
+        self.register_buffer("noise", torch.zeros(1, config.steps, 3))
+
+    def start(self) -> None:
+        """Begin at the mode of the base."""
+        self.noise.zero_()
+
+    def sample(self, features: Tensor) -> Tensor:
+        """Features [B, steps, hidden] → normalised actions [B, steps, 3]."""
+        halves, seen = halved(self.noise.expand(len(features), -1, -1)), halved(features)
+        for index, coupling in enumerate(self.couplings):
+            moved, given = index % 2, 1 - index % 2
+            log_scale, shift = coupling(halves[given], seen[given], seen[moved])
+            halves[moved] = halves[moved] * log_scale.exp() + shift
+        return woven(halves)
+
+    def surprise(self, actions: Tensor, features: Tensor) -> Tensor:
+        """−log p of normalised actions [B, steps, 3], exactly, as one term a number; their sum is the chunk's."""
+        halves, seen = halved(actions), halved(features)
+        scales = [torch.zeros_like(half) for half in halves]
+        for index in reversed(range(len(self.couplings))):
+            moved, given = index % 2, 1 - index % 2
+            log_scale, shift = self.couplings[index](halves[given], seen[given], seen[moved])
+            halves[moved] = (halves[moved] - shift) * torch.exp(-log_scale)
+            scales[moved] = scales[moved] + log_scale
+        terms = [0.5 * z.square() + scale for z, scale in zip(halves, scales, strict=True)]
+        return woven(terms) + 0.5 * math.log(2 * math.pi)
+
+
+def halved(x: Tensor) -> list[Tensor]:
+    """Even and odd steps of [B, steps, …]."""
+    return [x[:, 0::2], x[:, 1::2]]
+
+
+def woven(halves: list[Tensor]) -> Tensor:
+    """The inverse of `halved`."""
+    return torch.cat(halves, dim=1)[:, weave(sum(half.shape[1] for half in halves))]
+
+
+def weave(steps: int) -> list[int]:
+    """Where every step lies among the even steps followed by the odd ones."""
+    return [step // 2 + (steps + 1) // 2 * (step % 2) for step in range(steps)]
