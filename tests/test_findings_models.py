@@ -1,0 +1,61 @@
+"""The models that findings are about: exported once each from a run and its ablations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
+from tools.findings_models import main, models_of
+from tools.train.recipe import load_recipe
+from tools.train.variants import VARIANTS
+
+
+def run_of(folder: Path, *stages: str, variant: str = "full") -> Path:
+    """A run that has left weights of some stages."""
+    for stage in stages:
+        (folder / stage).mkdir(parents=True)
+        (folder / stage / "model.safetensors").write_bytes(stage.encode())
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "recipe.toml").write_text(load_recipe("tiny", VARIANTS[variant]).to_toml())
+    return folder
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> list[str]:
+    """An `edge-export` that leaves a manifest."""
+    script = tmp_path / "export.sh"
+    script.write_text('mkdir -p "${@: -1}"\ntouch "${@: -1}/manifest.json"\n')
+    return ["bash", str(script)]
+
+
+def test_a_run_gives_the_model_before_and_after_ppo_and_its_ablations(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "encoder", "sft", "imitate", "rl")
+    run_of(tmp_path / "ablations" / "no-latency", "imitate", variant="no-latency")
+    run_of(tmp_path / "ablations" / "waypoints", variant="waypoints")
+    found = {model.name: model for model in models_of(run, tmp_path / "ablations")}
+    assert set(found) == {"no-rl", "rl", "no-latency"}
+    assert found["rl"].weights == run / "rl" / "model.safetensors"
+    assert not found["no-latency"].recipe.model.action.latency_aware
+
+
+def test_every_model_has_a_folder_of_its_own(tmp_path: Path, command: list[str]) -> None:
+    run = run_of(tmp_path / "run", "imitate", "rl")
+    assert main(["--run", str(run), "--out", str(tmp_path / "models")], command) == EXIT_DONE
+    assert {path.parent.name for path in (tmp_path / "models").glob("*/manifest.json")} == {"rl", "no-rl"}
+
+
+@pytest.mark.parametrize("stages", [(), ("collect",)])
+def test_a_run_without_weights_is_said(
+    stages: tuple[str, ...], tmp_path: Path, command: list[str], capsys: Any
+) -> None:
+    run = run_of(tmp_path / "run", *stages)
+    assert main(["--run", str(run), "--out", str(tmp_path / "models")], command) == EXIT_BAD_INPUT
+    assert "has no weights yet" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_run_is_said(tmp_path: Path, command: list[str], capsys: Any) -> None:
+    assert main(["--run", str(tmp_path), "--out", str(tmp_path / "models")], command) == EXIT_BAD_INPUT
+    assert "holds no run of edge-train" in capsys.readouterr().err

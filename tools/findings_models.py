@@ -1,0 +1,97 @@
+"""The folder of models that `tools.findings` compares: exported from a training run and from its ablations."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from tools.findings_rows import AFTER, BEFORE
+from tools.train.exported import COMMAND, ExportError, export_artifacts
+from tools.train.network_file import stage_weights
+from tools.train.recipe import Recipe, RecipeError, load_recipe
+
+EXAMPLES: Final = """examples:
+  edge-train all --preset nano --out out/run
+  edge-train imitate --from out/run --variant no-latency --out out/ablations/no-latency
+  edge-train imitate --from out/run --variant no-motion-offset --out out/ablations/no-motion-offset
+  python -m tools.findings_models --run out/run --ablations out/ablations --out out/models
+  python -m tools.findings --artifacts out/models --out out/findings --jobs 2
+exit codes: 0 done, 1 an export failed, 2 bad arguments or input, 130 interrupted
+"""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is exported as `name`: a stage's weights of a run."""
+
+    name: str
+    weights: Path
+    recipe: Recipe
+
+
+def models_of(run: Path, ablations: Path | None) -> Iterator[Model]:
+    """`rl` and `no-rl` of the run, and every ablation by its folder's name; raises RecipeError for what is no run."""
+    recipe = _recipe(run)
+    for name, stage in ((BEFORE, "imitate"), (AFTER, "rl")):
+        if (weights := stage_weights(run, stage)).is_file():
+            yield Model(name, weights, recipe)
+    for folder in sorted(path for path in (ablations.iterdir() if ablations is not None else ()) if path.is_dir()):
+        own = _recipe(folder)
+        if (weights := stage_weights(folder, "imitate")).is_file():
+            yield Model(folder.name, weights, own)
+
+
+def _recipe(run: Path) -> Recipe:
+    path = run / "recipe.toml"
+    if not path.is_file():
+        raise RecipeError(f"{run}: holds no run of edge-train")
+    return load_recipe(str(path))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "python -m tools.findings_models", description=__doc__, epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    p.add_argument("--run", type=Path, required=True, metavar="DIR", help="run of edge-train")
+    p.add_argument("--ablations", type=Path, metavar="DIR", help="a run a variant, named like it")
+    p.add_argument("--out", type=Path, required=True, metavar="ROOT", help="folder of the models")
+    return p
+
+
+def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        models = list(models_of(args.run, args.ablations))
+        if not models:
+            raise RecipeError(f"{args.run}: has no weights yet; run edge-train imitate first")
+        for model in models:
+            _say(f"{model.name}: {model.weights}")
+            export_artifacts(model.weights, model.recipe.model, args.out / model.name, command=command)
+    except ExportError as error:
+        return _fail(EXIT_CHECK_FAILED, str(error))
+    except (RecipeError, OSError) as error:
+        return _fail(EXIT_BAD_INPUT, str(error))
+    except KeyboardInterrupt:
+        return _fail(EXIT_INTERRUPTED, "interrupted; run it again to go on")
+    return EXIT_DONE
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"findings-models: {line}\n")
+
+
+def _fail(code: int, line: str) -> int:
+    _say(line)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
