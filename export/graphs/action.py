@@ -8,7 +8,7 @@ import numpy as np
 from onnx import TensorProto
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.graphs.action_heads import denoised, flown, in_metres
+from export.graphs.action_heads import denoised, flowed, in_metres
 from export.graphs.cross_attention import attend, key_values, mlp, query, query_weights, weights
 from export.graphs.vision import array, layer_norm, split_heads
 from export.graphs.writer import Array, GraphWriter
@@ -82,7 +82,7 @@ def write_action(action: ActionExpert, directory: Path, *, precision: Precision,
         if action.diffusion is not None:
             x = denoised(g, action, action.diffusion, now, split)
         elif action.flow is not None:
-            x = flown(g, action.flow, _features(g, action, now, split))
+            x = flowed(g, action.flow, _features(g, action, now, split))
         else:
             x = g.linear(_features(g, action, now, split), "out", *weights(action.out))
             x = g.in_float32(x)

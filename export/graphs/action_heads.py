@@ -61,7 +61,7 @@ def _clean(
     return g.in_float32(g.linear(x, "out", *weights(action.out)))
 
 
-def flown(g: GraphWriter, flow: Flow, features: str) -> str:
+def flowed(g: GraphWriter, flow: Flow, features: str) -> str:
     """Features [1, steps, hidden] → normalised actions [1, steps, 3] in fp32."""
     steps = flow.noise.shape[1]
     halves = [g.constant(array(half), "noise") for half in halved(flow.noise)]

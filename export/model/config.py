@@ -12,7 +12,7 @@ SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
 PARAMETERISATIONS = ("increments", "offsets")
 HEADS = ("query", "diffusion", "flow")
-"""How the actions are made (paper Table 11): read off the queries, denoised, or flown out of a Gaussian."""
+"""How the actions are made (paper Table 11): read off the queries, denoised, or mapped from a Gaussian."""
 OF_HEADS = ("head", "diffusion_steps", "ddim_steps", "couplings")
 """Numbers of an action expert that came with the heads."""
 

@@ -4,15 +4,14 @@ Both work on actions normalised by each step's own mean and deviation over the d
 weights. An *action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the
 parameterisation `offsets`, a position and an increment of the heading.
 
-What they start from at inference, `noise`, is a buffer stored with the weights, so that a plan is a function of its
-inputs: the same inputs give the same plan on every machine, and a graph is the same bytes when it is written again.
-Every tick takes the same point of the learned distribution: where two ways are as good, ticks do not alternate
-between them, and no chance is left in driving.
+What they start from at inference, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
+function of its inputs, the same on every machine, and a graph is the same bytes when it is written again. Every tick
+takes the same point of the learned distribution: where two ways are as good, ticks do not alternate between them, and
+no chance is left in driving.
 
-* Diffusion: one Gaussian sample, drawn from the seed of the weights. Zero would be no better: the denoiser is trained
-  on inputs of the noise's own length and never sees one without any.
-* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned. A sample would be a
-  bias that every tick repeats.
+* Diffusion: one Gaussian sample, drawn from the seed of the weights. Whatever is particular to it, every tick repeats;
+  but zero would be worse: the denoiser is trained on noise of its full length and never sees an input without any.
+* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned: nothing to repeat.
 """
 
 from __future__ import annotations
