@@ -237,19 +237,23 @@ def _step(
     args: argparse.Namespace, recipe: Recipe, run_dir: RunDir, step: Step, ranks: Ranks, stop: StopFlag
 ) -> dict[str, Any]:
     started_ns = time.monotonic_ns()
-    with progress_for(step.name, quiet=not ranks.first) as progress:
-        job = StageJob(
-            recipe=recipe,
-            run_dir=run_dir,
-            resume=args.resume,
-            device=args.device,
-            progress=progress,
-            seed=stage_seed(recipe, step.stage),
-            ranks=ranks,
-            stop=stop,
-        )
-        result = run_step(job, step)
-    took_s = (time.monotonic_ns() - started_ns) / 1e9
+    try:
+        with progress_for(step.name, quiet=not ranks.first) as progress:
+            job = StageJob(
+                recipe=recipe,
+                run_dir=run_dir,
+                resume=args.resume,
+                device=args.device,
+                progress=progress,
+                seed=stage_seed(recipe, step.stage),
+                ranks=ranks,
+                stop=stop,
+            )
+            result = run_step(job, step)
+    finally:
+        took_s = (time.monotonic_ns() - started_ns) / 1e9
+        if ranks.first:
+            run_dir.add_time(step.name, took_s)
     if ranks.first:
         draw_curves(run_dir)
     _say(ranks, f"{step.name}: done in {duration(took_s)}")

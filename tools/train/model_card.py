@@ -12,6 +12,7 @@ from safetensors import safe_open
 from edge.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
+from export.progress import duration
 from tools.train.chain import retired
 from tools.train.drive import file_sha256
 from tools.train.network_file import START, read_network
@@ -172,6 +173,11 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any]) -> st
         f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
         f"made with `edge-train all --recipe recipe.toml`. Python {versions['python']}, {packages}.",
     ]
+    if timings := run_dir.timings():
+        each = ", ".join(f"{step} {duration(seconds)}" for step, seconds in timings.items())
+        lines.append(
+            f"It took {duration(sum(timings.values()))} on {versions['cpus']} cores ({versions['machine']}): {each}."
+        )
     for name in ("encoder", "sft", "imitate", "rl"):
         if name in results:
             again = retired(run_dir) if name == "imitate" else 0

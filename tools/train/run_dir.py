@@ -17,6 +17,7 @@ from sim_hil.benchmark.code_version import code_sha256
 from tools.train.recipe import STAGES, Recipe, load_recipe
 
 VERSIONS: Final = "versions.json"
+TIMINGS: Final = "timings.json"
 SHARED_PARTS: Final = ("vision", "language")
 """Of the network: what another run's encoder and language model are used in."""
 PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "tokenizers", "panda3d", "pybullet")
@@ -28,7 +29,7 @@ class RunDirError(ValueError):
 
 
 class RunDir:
-    """`out/{recipe.toml,versions.json,collect/,…,model.safetensors,curves/*.png,log.jsonl}`."""
+    """`out/{recipe.toml,versions.json,timings.json,collect/,…,model.safetensors,curves/*.png,log.jsonl}`."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -147,6 +148,17 @@ class RunDir:
                 yield json.loads(line)
             except ValueError:
                 continue
+
+    def timings(self) -> dict[str, float]:
+        """Seconds that each step has taken so far, all its resumptions together."""
+        path = self.out / TIMINGS
+        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
+
+    def add_time(self, step: str, seconds: float) -> None:
+        """Count time to a step."""
+        timings = self.timings()
+        timings[step] = round(timings.get(step, 0.0) + seconds, 1)
+        write_whole(self.out / TIMINGS, json.dumps(timings, indent=1) + "\n")
 
     def result(self, stage: str) -> dict[str, Any] | None:
         """What a finished stage gave; None if it has not finished."""
