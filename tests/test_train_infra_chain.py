@@ -226,6 +226,7 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
     assert run("sft", "--out", out) == EXIT_DONE
     assert json.loads((tmp_path / "r.json").read_text())["stages"]["collect"]["stage"] == "collect"
     assert RunDir(out).result("sft") is not None and load_recipe(str(out / "recipe.toml")) == TINY
+    assert set(RunDir(out).timings()) == {"collect", "sft"}
     assert run("sft", "--out", out) == EXIT_DONE
     assert "sft: done before" in capsys.readouterr().err
 
