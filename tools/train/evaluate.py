@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from edge.cli import write_whole
+
 if TYPE_CHECKING:
     from tools.train.job import StageJob
 
@@ -57,8 +59,8 @@ def run(job: StageJob) -> dict[str, Any]:
 
     config = job.recipe.evaluate or EvaluateConfig()
     weights = weights_before(job.run_dir.out, STAGE)
-    if weights is None:
-        raise EvaluateError(f"{job.run_dir.out}: no weights to evaluate; run imitate first")
+    if weights is None or weights.parent.name not in ("imitate", "rl"):
+        raise EvaluateError(f"{job.run_dir.out}: no policy to evaluate; run imitate first")
     folder = job.run_dir.stage(STAGE)
     artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
     suite = write_suite(folder, config)
@@ -89,12 +91,14 @@ def run(job: StageJob) -> dict[str, Any]:
 
 
 def write_suite(folder: Path, config: EvaluateConfig) -> Path:
-    """The episodes as a suite's file, with their scenes beside it; the same numbers give the same files."""
+    """The episodes as a suite's file, with their scenes beside it; one that is there is taken as it is."""
     from sim_hil.benchmark.episode import suite_to_toml
     from sim_hil.scene import scene_to_toml
     from tools.train.scenarios import SHARES, training_episodes
 
     path = folder / SUITE
+    if path.exists():
+        return path
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
     episodes = []
@@ -102,7 +106,7 @@ def write_suite(folder: Path, config: EvaluateConfig) -> Path:
     for scenario in training_episodes(config.scenario_seed, config.episodes, kinds):
         scene = scenes / f"{scenario.scene.name}.toml"
         if not scene.exists():
-            scene.write_text(scene_to_toml(scenario.scene), encoding="utf-8")
+            write_whole(scene, scene_to_toml(scenario.scene))
         episodes.append(replace(scenario.episode, scene=str(scene.absolute())))
-    path.write_text(suite_to_toml("training", 1, episodes), encoding="utf-8")
+    write_whole(path, suite_to_toml("training", 1, episodes))
     return path
