@@ -76,7 +76,7 @@ def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_pat
     errors = result["held_out"]["all"]
     # The side is in the words alone: with the other drive's it goes the other way.
     assert errors["policy"]["fde_m"]["3s"] < 0.8 * errors["other_words"]["fde_m"]["3s"]
-    assert (job.run_dir.curves / "imitate_errors.png").stat().st_size > 1000
+    assert (job.run_dir.curves / "imitate_held_out.png").stat().st_size > 1000
 
 
 def test_all_of_the_action_expert_learns_and_nothing_else(whole: tuple[Any, list[dict[str, Any]]]) -> None:

@@ -127,9 +127,12 @@ def run(job: StageJob) -> dict[str, Any]:
     if seconds is not None:
         seen = MirrorTokens(seconds)
         mirror = Mirror(seen, _said(job, network, MirroredDrives.of(dataset), seen, MIRRORED_STATES, dataset.train))
+    own = None
+    if config.evaluate.own_words and dataset.val:
+        own = _said(job, network, dataset, tokens, STATES, dataset.val, own=True)
     pupil = ExpertPupil(network.action, config.loss)
     of = f"{states.key} {parts_sha256(network, (*SEEN_PARTS, 'action'))}"
-    result = fit(job, pupil, dataset, tokens, states, of=of, share=share, mirror=mirror)
+    result = fit(job, pupil, dataset, tokens, states, of=of, share=share, mirror=mirror, own=own)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
@@ -144,9 +147,17 @@ def _encoded(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> TokenCach
 
 
 def _said(
-    job: StageJob, network: TicVla, dataset: Dataset, tokens: FrameTokens, folder: str, ids: Sequence[str]
+    job: StageJob,
+    network: TicVla,
+    dataset: Dataset,
+    tokens: FrameTokens,
+    folder: str,
+    ids: Sequence[str],
+    *,
+    own: bool = False,
 ) -> KvCache:
-    """What the language model says along drives."""
+    """States along drives: of what is true there, or (`own`) of what the language model says itself."""
+    config = _config(job).states
     job.progress.say("semantic states")
     return build_kv_cache(
         dataset.folder / folder,
@@ -154,7 +165,7 @@ def _said(
         tokenizer_for(network.config, None),
         dataset,
         tokens,
-        _config(job).states,
+        replace(config, draws=1, own_share=1.0) if own else config,
         # Of the run, not of the stage: ablations of one seed share their states.
         seed=job.recipe.seed,
         ids=ids,
@@ -197,10 +208,12 @@ def fit(
     of: str,
     share: float = 1.0,
     mirror: Mirror | None = None,
+    own: States | None = None,
 ) -> dict[str, Any]:
     """Train a pupil in place and say how far its plans are from the expert's; raises ImitateError, SampleError.
 
-    `of`: what frames and states were made with; `share` of the recipe's samples; `mirror`: of the drives to learn from.
+    `of`: what frames and states were made with; `share` of the recipe's samples; `mirror`: of the drives to learn from;
+    `own`: states of the held-out drives with what the language model says itself.
     """
     config = _config(job)
     delays = config.delays.load() if config.inject_delay and pupil.hears else Delays.none()
@@ -224,13 +237,15 @@ def fit(
         "mean_age_s": delays.mean_s,
         **numbers,
     }
-    # Of every age, whatever was trained under.
-    looked = _held(job, unseen, tokens, states, Delays.uniform(DelayConfig()), pupil) if pupil.hears else held
-    if job.ranks.first and looked is not None:
-        result["held_out"] = evaluate(
-            pupil.plan, looked, config.evaluate, seed=job.seed, device=torch.device(job.device), words=pupil.hears
-        )
-        draw_errors(result["held_out"], job.run_dir.curves / f"{STAGE}_errors.png")
+    for name, told in (("held_out", states), ("held_out_own", own)):
+        # Of every age, whatever was trained under.
+        every = Delays.uniform(DelayConfig()) if pupil.hears else delays
+        looked = _held(job, unseen, tokens, told, every, pupil) if told is not None else None
+        if job.ranks.first and looked is not None:
+            result[name] = evaluate(
+                pupil.plan, looked, config.evaluate, seed=job.seed, device=torch.device(job.device), words=pupil.hears
+            )
+            draw_errors(result[name], job.run_dir.curves / f"{STAGE}_{name}.png")
     return result
 
 

@@ -47,6 +47,8 @@ class ImitateEvalConfig:
     batch: int = 64
     edges_s: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
     """Ages are told apart by these; the last bin holds its upper edge."""
+    own_words: bool = True
+    """Look also at what becomes of it when the language model has said the texts itself."""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.batch < 1:
