@@ -8,10 +8,11 @@ SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
 
-.PHONY: help demo faults test lint clean
+.PHONY: help demo nano faults test lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
+	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
 	@echo "make test   lint, type-check and run the tests"
 	@echo "make lint   ruff and mypy only"
@@ -33,6 +34,11 @@ help:
 
 demo: .venv/.demo-installed
 	@$(BIN)/python -m tools.demo --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
+
+# Every stage of tools/train/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
+nano: .venv/.demo-installed
+	@$(BIN)/edge-train all --preset nano --out out/nano-run --resume
+	@$(BIN)/edge-train card --out out/nano-run --ship export/weights
 
 # The demo's artifacts, if they are there; otherwise its own.
 faults: .venv/.demo-installed
