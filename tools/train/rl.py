@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -35,11 +35,16 @@ from tools.train.rollout import Rollout
 from tools.train.scenarios import SHARES
 from tools.train.vector_env import drive
 
+if TYPE_CHECKING:
+    from tools.train.recipe import Recipe
+
 STAGE: Final = "rl"
 POLICIES: Final = ("action", "point-goal")
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 _SCENES, _EVALUATION_SCENES = 9003, 9002  # seeds of scenarios that no other stage draws
 _DELAYS: Final = 41
+STEPS_PER_EPISODE: Final = 300
+"""As a rule: 30 s. For the plan of a run alone."""
 
 
 class RlError(ValueError):
@@ -115,6 +120,16 @@ class RlConfig:
         if self.delay_profile:
             return load_profile(Path(self.delay_profile)).generation_s
         return tuple(round(float(v), 4) for v in np.linspace(0.0, 2 * self.mean_delay_s, _DELAYS))
+
+
+def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
+    """(what, number of samples, key of the throughput) of a run of this stage."""
+    config = recipe.rl
+    if config is None:
+        return []
+    evaluations = 1 + -(-config.iterations // config.evaluate_every)
+    episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes
+    return [("steps driven and learned from", episodes * STEPS_PER_EPISODE, "ppo")]
 
 
 @dataclass(frozen=True)
