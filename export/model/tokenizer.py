@@ -69,7 +69,8 @@ def train(vocab: int) -> Tokenizer:
     lists = word_lists()
     everyday = [f" {word}" for word in lists.pop("everyday")]
     # A word stands after a space; the names of aspects and roles stand at the start of a line.
-    ours = [f" {word}" for words in lists.values() for word in words] + [*lists["line_starts"], *_numbers(), ".\n"]
+    starts = lists.pop("line_starts")
+    ours = [f" {word}" for words in lists.values() for word in words] + [*starts, *_numbers(), ".\n"]
     wholes = list(dict.fromkeys(piece for text in ours for piece in _pieces(text)))
     base = _tokenizer(models.BPE())
     trainer = trainers.BpeTrainer(
