@@ -221,7 +221,7 @@ def test_the_point_goal_baseline_learns_from_where_the_goal_is(tmp_path: Path, d
     job = imitate_job(tmp_path, config)
     pupil = PointGoalPupil(build_point_goal(tiny_model(), job.generator("start")), config.loss)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, 32)
-    result = fit(job, pupil, dataset, MadeUpTokens(FRAMES), states, of="test")
+    result = fit(job, pupil, dataset, MadeUpTokens(), states, of="test")
     assert result["mean_age_s"] == 0.0 and set(result["held_out"]["all"]) == {"policy", "keep_state"}
     assert result["held_loss"] < 0.5 * next(iter(job.run_dir.lines()))["loss"]
 
@@ -234,7 +234,7 @@ def test_drives_without_states_cannot_be_learned_from(tmp_path: Path, dataset: D
     job = imitate_job(tmp_path)
     pupil = ExpertPupil(build(tiny_model(), 1).action, CONFIG.loss)
     with pytest.raises(SampleError, match="no frame"):
-        fit(job, pupil, dataset, MadeUpTokens(FRAMES), Nobody(dataset), of="test")
+        fit(job, pupil, dataset, MadeUpTokens(), Nobody(dataset), of="test")
 
 
 def test_the_stage_reads_the_runs_drives_and_goes_on_after_a_round_of_dagger(tmp_path: Path) -> None:

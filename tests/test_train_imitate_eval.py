@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.train_drives import MadeUpTokens, tiny_model
-from tests.train_imitate_rank import FRAMES, SideStates, side_dataset
+from tests.train_imitate_rank import SideStates, side_dataset
 from tools.train.action_batch import ActionBatch
 from tools.train.delays import DelayConfig, Delays
 from tools.train.drive import Dataset
@@ -28,7 +28,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
     plain = SampleConfig().undisturbed()
     drives = [DriveFrames.of(drive, 30, plain.weights) for drive in dataset.drives(dataset.val, pictures=False)]
     delays = Delays.uniform(DelayConfig())
-    return Samples(drives, MadeUpTokens(FRAMES), SideStates(dataset), delays, plain, tiny_model(), drop=False)
+    return Samples(drives, MadeUpTokens(), SideStates(dataset), delays, plain, tiny_model(), drop=False)
 
 
 def test_keeping_the_state_is_driving_on_along_its_arc() -> None:

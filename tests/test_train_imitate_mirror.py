@@ -10,7 +10,7 @@ import pytest
 
 from edge.geometry import SE2
 from tests.train_drives import MadeUpTokens, tiny_model
-from tests.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, side_drive
+from tests.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive
 from tools.train.anchors import anchors_of
 from tools.train.delays import DelayConfig, Delays
 from tools.train.drive import Dataset
@@ -76,7 +76,7 @@ def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dat
     states = SideStates(dataset)
     samples = Samples(
         balanced(plain, others, 0.3),
-        BothTokens(MadeUpTokens(FRAMES), MirrorTokens(MirroredSeconds())),
+        BothTokens(MadeUpTokens(), MirrorTokens(MirroredSeconds())),
         BothStates(states, states),
         Delays.uniform(DelayConfig()),
         EVEN,

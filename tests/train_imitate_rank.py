@@ -118,7 +118,7 @@ def trained(dataset: Dataset, job: StageJob) -> tuple[TicVla, dict[str, Any]]:
     network = build(job.recipe.model, 1)
     assert job.recipe.imitate is not None
     pupil = ExpertPupil(network.action, job.recipe.imitate.loss)
-    return network, fit(job, pupil, dataset, MadeUpTokens(FRAMES), SideStates(dataset), of="test")
+    return network, fit(job, pupil, dataset, MadeUpTokens(), SideStates(dataset), of="test")
 
 
 def main() -> None:
