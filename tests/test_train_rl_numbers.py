@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,15 @@ from sim_hil.benchmark.policies import robot_config
 from tools.train.command_policy import CommandLimits, command_mean, entropy, log_prob
 from tools.train.gae import advantages
 from tools.train.ppo import PpoConfig, PpoOptimiser
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Networks so small are slower on two threads, and much slower beside others."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def test_advantages_are_those_worked_out_by_hand() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,15 @@ from tools.train.rl_learners import TailLearner
 from tools.train.rollout import EpisodeEnd, EpisodeSteps
 
 LIMITS = CommandLimits(1.0, 1.0)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Networks so small are slower on two threads, and much slower beside others."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def _config() -> TicVlaConfig:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -64,8 +65,11 @@ class Children:
             for child in reversed(self._started):
                 self.end(child)
 
-    def start(self, step: str, command: Sequence[str]) -> Child:
-        """Start a step; StepError when its program cannot be started at all."""
+    def start(self, step: str, command: Sequence[str], *, fifo_priority: int = 0) -> Child:
+        """Start a step; StepError when its program cannot be started at all.
+
+        `fifo_priority` above 0: before everything else on its core, where this user may have that.
+        """
         log = self.log_dir / f"{step}.log"
         with log.open("wb") as stream:
             try:
@@ -76,7 +80,7 @@ class Children:
                     stderr=subprocess.STDOUT,
                     # A session of its own: Ctrl-C reaches the parent alone, which then stops its children in order.
                     start_new_session=True,
-                    preexec_fn=_end_with_parent,  # one system call; nothing in it can meet a lock
+                    preexec_fn=partial(_prepare, fifo_priority),  # system calls alone; nothing in it can meet a lock
                 )
             except OSError as error:
                 raise StepError(f"step '{step}' failed: {command[0]} cannot be started: {error}") from error
@@ -159,10 +163,13 @@ def _kill_session(pid: int) -> None:
         os.killpg(pid, signal.SIGKILL)  # start_new_session made the child the leader of a group of its own
 
 
-def _end_with_parent() -> None:
+def _prepare(fifo_priority: int) -> None:
     # Even a SIGKILL of the parent must not leave a robot walking: the kernel then interrupts the children.
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    if fifo_priority > 0:
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
 
 
 def tail(path: Path, lines: int = 8, limit_bytes: int = 16_384) -> list[str]:

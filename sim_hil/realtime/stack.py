@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 import firmware_bridge
+from edge.units import BRIDGE_PRIORITY
 from sim_hil.faults.client import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
@@ -141,12 +142,12 @@ class Stack:
             self.faults = FaultClient(faults, self._sockets / "asked")
 
     def start_bridge(self, tick: Tick) -> None:
-        """Start the bridge and wait for its socket. Raises StepError."""
+        """Start the bridge, as urgent as its service is where that is allowed; wait for its socket; StepError."""
         socket = self._sockets / "bridge"
         socket.unlink(missing_ok=True)  # of a bridge that was killed
         name = f"edge-bridge-{self.runs + 1}"
         command = [*self._commands["edge-bridge"], *self._link(), "--json", str(self.result(name))]
-        bridge = self.bridge = self._children.start(name, command)
+        bridge = self.bridge = self._children.start(name, command, fifo_priority=BRIDGE_PRIORITY)
         self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
 
     def start_runner(self, instruction: str) -> Child:

@@ -46,7 +46,7 @@ def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path:
     frame = torch.zeros(1, px, px, 3, dtype=torch.uint8)
     inputs = (frame, torch.zeros(1, 3), torch.tensor([[1.0, 0.0]]))
     program = torch.onnx.export(
-        Whole(vision.eval(), net.eval()), inputs, dynamo=True, verbose=False, opset_version=OPSET,
+        Whole(vision, net).eval(), inputs, dynamo=True, verbose=False, opset_version=OPSET,
         input_names=["frame", "state", "goal"], output_names=["trajectory"],
     )  # fmt: skip
     if program is None:

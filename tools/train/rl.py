@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from export.model.network import initialise
+from export.model.weights import weights_sha256
 from sim_hil.benchmark.latency import load_profile
 from sim_hil.benchmark.policies import robot_config
 from tools.train import checkpoint
@@ -182,7 +183,7 @@ def improve(
 ) -> dict[str, Any]:
     """Train the learner's policy and value network in place; gives first and best scores. Ends with the best."""
     config = job.recipe.rl or RlConfig()
-    state = _State(job, learner, PpoOptimiser(learner, config.ppo), before)
+    state = _State(job, learner, PpoOptimiser(learner, config.ppo))
     orders = _Orders(job, config, before, artifacts)
     state.load()
     if state.iteration == 0:
@@ -295,11 +296,15 @@ class _Orders:
 class _State:
     """The stage's checkpoint: policy, value network, exploration, moments, the best policy so far."""
 
-    def __init__(self, job: StageJob, learner: Learner, optimiser: PpoOptimiser, before: Path) -> None:
+    def __init__(self, job: StageJob, learner: Learner, optimiser: PpoOptimiser) -> None:
         self._job, self._learner, self.optimiser = job, learner, optimiser
         folder = job.run_dir.stage(STAGE)
         self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
-        content = {"rl": asdict(job.recipe.rl or RlConfig()), "seed": job.seed, "before": _sha256(before)}
+        content = {
+            "rl": asdict(job.recipe.rl or RlConfig()),
+            "seed": job.seed,
+            "before": weights_sha256(learner.network),
+        }
         content["rl"].pop("jobs")
         self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
         self.iteration = 0
@@ -371,7 +376,3 @@ class _State:
 
 def _score(content: Mapping[str, float] | None) -> Score | None:
     return None if content is None else Score(**content)
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
