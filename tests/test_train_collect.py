@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -24,18 +25,19 @@ from tools.train.collection import CollectError, Collection, fill, job_count
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.distributed import Ranks
-from tools.train.drive import Dataset
+from tools.train.drive import Dataset, Drive
 from tools.train.job import QuietProgress
 
 FAKE = (sys.executable, "-m", "tests.train_fake_worker")
 Faulty = Callable[..., None]
+COUNT = 10
 
 
-def _collection(count: int = 20, **changed: Any) -> Collection:
+def _collection(count: int = COUNT, **changed: Any) -> Collection:
     return Collection("e", count, 3, 0, CollectConfig(episodes=count, **changed))
 
 
-def _collect(folder: Path, count: int = 20, jobs: int = 2, stopped: Callable[[], bool] = lambda: False) -> Dataset:
+def _collect(folder: Path, count: int = COUNT, jobs: int = 2, stopped: Callable[[], bool] = lambda: False) -> Dataset:
     with DatasetWriter(folder) as writer:
         fill(writer, _collection(count), jobs, stopped=stopped, command=FAKE)
         return writer.finish()
@@ -51,45 +53,48 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> Faulty:
     return lambda **fault: monkeypatch.setenv("FAKE_WORKER", json.dumps(fault))
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """All of a collection, made by three processes."""
+    return _collect(tmp_path_factory.mktemp("whole"), jobs=3)
+
+
 # -- who makes what ---------------------------------------------------------------------------------------------------
 
 
-def test_every_drive_that_was_asked_for_comes_and_no_other(tmp_path: Path) -> None:
-    found = _collect(tmp_path)
-    assert found.ids == tuple(f"e{number:05d}" for number in range(20))
-    assert Counter(_begun(tmp_path)).most_common(1)[0][1] == 1
+def test_every_drive_that_was_asked_for_comes_and_no_other(whole: Dataset) -> None:
+    assert whole.ids == tuple(f"e{number:05d}" for number in range(COUNT))
+    assert Counter(_begun(whole.folder)).most_common(1)[0][1] == 1
 
 
-def test_how_many_processes_there_are_changes_nothing(tmp_path: Path) -> None:
-    assert _collect(tmp_path / "one", jobs=1).sha256 == _collect(tmp_path / "three", jobs=3).sha256
+def test_how_many_processes_there_are_changes_nothing(tmp_path: Path, whole: Dataset) -> None:
+    assert _collect(tmp_path, jobs=1).sha256 == whole.sha256
 
 
-def test_a_collection_that_was_ended_goes_on_to_the_same_data_set(tmp_path: Path) -> None:
+def test_a_collection_that_was_ended_goes_on_to_the_same_data_set(tmp_path: Path, whole: Dataset) -> None:
     looks = iter([False, False, False])
     with pytest.raises(KeyboardInterrupt):
-        _collect(tmp_path / "ended", jobs=1, stopped=lambda: next(looks, True))
-    ended = _collect(tmp_path / "ended", jobs=2)
-    assert ended.sha256 == _collect(tmp_path / "whole").sha256
+        _collect(tmp_path, jobs=1, stopped=lambda: next(looks, True))
+    assert _collect(tmp_path, jobs=2).sha256 == whole.sha256
 
 
-def test_a_data_set_that_is_whole_starts_no_process(tmp_path: Path) -> None:
-    _collect(tmp_path)
-    with DatasetWriter(tmp_path) as writer:
+def test_a_data_set_that_is_whole_starts_no_process(whole: Dataset) -> None:
+    with DatasetWriter(whole.folder) as writer:
         fill(writer, _collection(), 2, command=("/no/such/program",))
 
 
-def test_only_the_drive_whose_file_is_damaged_is_made_again(tmp_path: Path) -> None:
-    before = _collect(tmp_path)
+def test_only_the_drive_whose_file_is_damaged_is_made_again(tmp_path: Path, whole: Dataset) -> None:
+    shutil.copytree(whole.folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / BEGUN).unlink()
-    before.path("e00011").write_bytes(b"damaged")
-    assert _collect(tmp_path).sha256 == before.sha256
-    assert _begun(tmp_path) == ["e00011"]
+    replace(whole, folder=tmp_path).path("e00009").write_bytes(b"damaged")
+    assert _collect(tmp_path).sha256 == whole.sha256
+    assert _begun(tmp_path) == ["e00009"]
 
 
-def test_more_drives_may_be_asked_for_later(tmp_path: Path) -> None:
-    few = _collect(tmp_path / "few", count=5)
-    more = _collect(tmp_path / "few", count=20)
-    assert few.ids == more.ids[:5] and more.sha256 == _collect(tmp_path / "once").sha256
+def test_more_drives_may_be_asked_for_later(tmp_path: Path, whole: Dataset) -> None:
+    few = _collect(tmp_path, count=5)
+    more = _collect(tmp_path)
+    assert few.ids == more.ids[:5] and more.sha256 == whole.sha256
 
 
 # -- what goes wrong --------------------------------------------------------------------------------------------------
@@ -206,18 +211,19 @@ def test_all_cores_are_used_unless_a_number_is_asked_for() -> None:
 
 def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_process(tmp_path: Path) -> None:
     config = CollectConfig(episodes=1, kinds={"corridor": 1.0}, noise_share=0.0)
-    collected = Collection("e", 1, 11, 0, config)
-    with DatasetWriter(tmp_path / "process") as writer:
-        fill(writer, collected, 1)
-        found = writer.finish()
-    drive = found.load("e00000")
+    with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:
+        order = Order(str(here.folder), "e", 7, 3, 0, 1, (), config)
+        begun, made = list(messages(order.as_json()))
+        workers, told = collection.Workers(collection.WORKER, 1, tmp_path), []
+        workers.start("e", replace(order, folder=str(there.folder)).as_json())
+        while workers.running():
+            told += [each.message for each in workers.wait(1.0)]
+        workers.close()
+        drive = Drive.load(here.path("e00000"))
+    assert begun == {"begun": "e00000"} and told == [begun, dict(made), None]
     assert drive.about.kind == "corridor" and drive.about.outcome == "reached" and drive.about.driver == "expert"
     assert len(drive.wordings) >= 8 and not any(is_held_out(text) for text in drive.wordings)
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1
-    (tmp_path / "here" / "drives").mkdir(parents=True)
-    order = collected.orders(tmp_path / "here", lambda _: False)[0]
-    told = list(messages(order.as_json()))
-    assert told[0] == {"begun": "e00000"} and told[1]["drive"]["sha256"] == found.entries[0].sha256
 
 
 def test_the_stage_collects_what_the_recipe_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
+from tools.train import record as recording
 from tools.train.collect_config import CollectConfig
 from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY
 from tools.train.record import (
@@ -147,9 +148,10 @@ def test_where_a_policy_drives_the_label_is_what_the_expert_would_do(standing: R
     assert np.all(standing.arrays["future"][10:, 29, 0] > 1.5)
 
 
-def test_a_policy_that_stands_for_fifteen_seconds_is_cut() -> None:
+def test_a_policy_that_stands_for_too_long_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "_PUPIL_STUCK_S", 3.0)
     recorded = _drive(_still, timeout_s=20.0)
-    assert recorded.outcome == "cut" and len(recorded.arrays["pose"]) == 151
+    assert recorded.outcome == "cut" and len(recorded.arrays["pose"]) == 31
 
 
 def _poses(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -86,7 +86,7 @@ def drive(name: str = "a", frames: int = 60, pose: NDArray[np.float64] | None = 
 def _jpeg(k: int) -> NDArray[np.uint8]:
     """A red picture as bright as its number, above a blue one."""
     picture = np.zeros((128, 128, 3), np.uint8)
-    picture[:64, :, 0] = 60 + k
+    picture[:64, :, 0] = 60 + k % 180
     picture[64:, :, 2] = 200
     done, jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     assert done
