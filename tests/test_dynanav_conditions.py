@@ -42,7 +42,7 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--policy", "clever"), "expected artifacts:DIR, external:ADDR, or one of"),
+        (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
         (("--policy", "artifacts:"), "expected artifacts:DIR"),
         (("--policy", "expert:here"), "expected artifacts:DIR"),
         (("--policy", "expert", "--mode", "sync"), "mode: belongs to a policy from artifacts"),

@@ -62,7 +62,15 @@ def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
         count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
         return [("episodes", count, "policy-drive")]
     told = getattr(importlib.import_module(STAGES[step.stage][0]), "budget", None)
-    return [] if told is None else list(told(recipe))
+    work = [] if told is None else list(told(recipe))
+    return _again(recipe, work) if step.stage == "imitate" and step.round else work
+
+
+def _again(recipe: Recipe, work: Sequence[tuple[str, int, str]]) -> list[tuple[str, int, str]]:
+    """Imitation after a round of DAgger: states of the new drives alone, and as many samples as it goes on for."""
+    more = recipe.dagger.episodes / recipe.collect.episodes if recipe.collect is not None else 1.0
+    share = (recipe.imitate.go_on_share or 1.0) if recipe.imitate is not None else 1.0
+    return [(what, round(count * (more if key == "kv" else share)), key) for what, count, key in work]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:
