@@ -101,7 +101,7 @@ def test_a_batchs_loss_is_the_mean_of_its_pictures_losses(heads: EncoderHeads) -
     together = total(costs(heads, labels, seen))
     for i in range(6):
         alone = total(costs(heads, {name: array[i : i + 1] for name, array in labels.items()}, seen[i : i + 1]))
-        assert alone[0] == pytest.approx(together[i].item(), rel=1e-5)
+        assert alone[0].item() == pytest.approx(together[i].item(), rel=1e-5)
 
 
 def test_what_has_no_colour_no_heading_no_thing_or_no_opening_teaches_nothing_of_it(heads: EncoderHeads) -> None:

@@ -149,7 +149,7 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
     kinds = [kind for kind in config.kinds if not (held and kind == CORRIDOR)]
     left = config.held if held else config.count
     # Held-out pictures come from many layouts: they tell more about new ones than many pictures of one.
-    per_scene = min(config.per_scene, max(1, -(-left // (4 * len(set(kinds)))))) if held else config.per_scene
+    per_scene = min(config.per_scene, -(-left // (4 * len(set(kinds))))) if held and left else config.per_scene
     shards: list[Shard] = []
     while left > 0:
         number = len(shards)
