@@ -11,6 +11,7 @@ from zlib import crc32
 import numpy as np
 import torch
 
+from export.progress import duration
 from tools.train.distributed import SINGLE, Ranks
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ class PlainProgress:
         self._said_ns = now_ns
         rate = (done - self._first) / max((now_ns - self._started_ns) / 1e9, 1e-9)
         shown = "".join(f", {name} {value:.4g}" for name, value in numbers.items())
-        self.say(f"{done} of {total} ({rate:.1f} /s){shown}")
+        left = f", {duration((total - done) / rate)} to go" if rate > 0 and done < total else ""
+        self.say(f"{done} of {total} ({rate:.3g} /s{left}){shown}")
 
     def say(self, line: str) -> None:
         """One line."""
