@@ -18,7 +18,7 @@ from export.model.config import PRESETS
 from export.model.tokenizer import NANO_TOKENIZER
 from sim_hil.benchmark.latency import Timing
 from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner
-from tests.train_drives import WORDINGS, made_up_drive, trace_at
+from tests.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.anchors import (
     WAYPOINTS_START,
     Anchor,
@@ -30,6 +30,7 @@ from tools.train.anchors import (
     draw,
     frames_at,
 )
+from tools.train.trace_words import Trace
 
 NANO = PRESETS["nano"]
 PERIOD_NS = 100_000_000
@@ -127,8 +128,8 @@ def test_the_answer_reads_back_as_the_label(prompts: Prompts, anchors: dict[int,
         _, answer = prompts.of(anchor, Drawn(WORDINGS[0], None))
         assert answer[-1] == NANO.language.im_end_id and answer.count(answer[-1]) == 1
         text = prompts.text(answer)
-        assert text == anchor.reasoning
-        assert parse_progress(text) == trace_at(k).progress == anchor.progress
+        assert text == anchor.reasoning == Trace.from_json(trace_at(k)).text(anchor.points)
+        assert parse_progress(text) == progress_at(k) == anchor.progress
         assert parse_waypoints(text) == pytest.approx(np.round(anchor.points, 1))
 
 
@@ -145,9 +146,9 @@ def test_waypoints_alone_are_asked_for_by_beginning_the_answer(prompts: Prompts,
 
 def test_before_is_what_was_true_when_the_last_generation_looked(anchors: dict[int, Anchor]) -> None:
     assert anchors[0].before(0.3) is None
-    assert anchors[100].before(0.5) == trace_at(90).progress
-    assert anchors[100].before(1.5) == trace_at(80).progress
-    assert anchors[100].before(10.0) == trace_at(0).progress
+    assert anchors[100].before(0.5) == progress_at(90)
+    assert anchors[100].before(1.5) == progress_at(80)
+    assert anchors[100].before(10.0) == progress_at(0)
     assert anchors[100].before(10.1) is None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,15 @@ TOKENS = MadeUpTokens()
 RIGHT = DrawConfig(waypoints_only=0.0, before_wrong=0.0, before_min_s=1.0, before_max_s=1.0)
 CONFIG = KvConfig(batch=3, max_new_tokens=4, words=RIGHT)
 ROUNDING = 4e-3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """More would only wait for each other: the layers are tiny."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

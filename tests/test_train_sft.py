@@ -28,10 +28,13 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module", autouse=True)
 def as_on_the_command_line() -> Iterator[None]:
-    """`edge-train` asks torch for deterministic algorithms: one that is not would raise."""
+    """`edge-train` asks torch for deterministic algorithms: one that is not would raise. Tiny layers: one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +158,7 @@ def test_two_processes_have_the_loss_curve_of_one(
         for rank in range(2)
     ]
     try:
-        assert [rank.wait(timeout=100) for rank in ranks] == [0, 0]
+        assert [rank.wait(timeout=240) for rank in ranks] == [0, 0]
     finally:
         for rank in ranks:
             rank.kill()

@@ -15,7 +15,6 @@ from edge.reasoning_text import Progress
 from export.model.config import PRESETS, TicVlaConfig
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import EXPERT, PICTURE_PX, TRACE_EVERY, About, Dataset, Drive, Entry
-from tools.train.traces import Trace
 
 WORDINGS = ("Turn left, then stop at the desk.", "Take the first left and wait at the desk.")
 VAL_LAYOUT = 106
@@ -41,22 +40,27 @@ def pose_at(k: int) -> tuple[float, float, float]:
     return (4.6, 0.6 + 0.05 * (k - 100), pi / 2)
 
 
-def trace_at(k: int) -> Trace:
-    """Before the turn at frame 90 it is next, after it there is the last leg."""
+def progress_at(k: int) -> Progress:
+    """Before the turn at frame 90 it is next and openings are passed, after it there is the last leg."""
+    return Progress(1, 1, min(k // 30, 2)) if k < 90 else Progress(2, 1, 0)
+
+
+def trace_at(k: int) -> Mapping[str, Any]:
+    """As `Trace.to_json` writes it."""
     left = k < 90
-    return Trace(
-        "in a corridor" if left else "in a room",
-        "desk left 6 m, red chair right 3 m" if left else "none",
-        "nobody near",
-        Progress(1, 1, min(k // 30, 2)) if left else Progress(2, 1, 0),
-        "turn left into the room in 3 m" if left else "stop in 6 m",
-    )
+    return {
+        "situation": "in a corridor" if left else "in a room",
+        "objects": "desk left 6 m, red chair right 3 m" if left else "none",
+        "motion": "nobody near",
+        "progress": dataclasses.asdict(progress_at(k)),
+        "plan": "turn left into the room in 3 m" if left else "stop in 6 m",
+    }
 
 
 def made_up_drive(drive_id: str, frames: int = 130, *, layout_seed: int = 100, **about: Any) -> Drive:
     """A drive with traces; its pictures are all the same grey."""
     poses = np.array([pose_at(k) for k in range(frames)])
-    traces = [{"k": k, **trace_at(k).to_json()} for k in range(0, frames, TRACE_EVERY)]
+    traces = [{"k": k, **trace_at(k)} for k in range(0, frames, TRACE_EVERY)]
     facts: Mapping[str, Any] = {
         "kind": "office", "layout_seed": layout_seed, "scene": "office", "robot": "go2", "people": 0, "seed": 1,
         "driver": "expert", "drift": "none", "goal_xy": (4.6, 4.0), "threshold_m": 1.5, "outcome": "reached",

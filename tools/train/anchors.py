@@ -25,7 +25,7 @@ from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
 from export.model.config import TicVlaConfig
 from tools.train.drive import RATE_HZ, TRACE_EVERY, Drive
-from tools.train.traces import Trace
+from tools.train.trace_words import Trace
 
 FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """How far before the newest frame the older ones are (paper appendix A), the oldest first."""
