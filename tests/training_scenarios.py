@@ -9,13 +9,13 @@ from tools.train.scenarios import Scenario, scenario_group
 from tools.train.sites import KINDS
 
 SEED = 5
-EACH = 2
+EACH = {"hospital": 2, "office": 2, "warehouse": 2, "sidewalk": 1, "corridor": 2}
 
 
 @cache
 def scenarios(kind: str) -> tuple[Scenario, ...]:
-    """Two of one kind, all of one layout as a rule."""
-    return tuple(scenario_group(SEED, KINDS.index(kind), {kind: 1.0}, EACH))
+    """Some of one kind, all of one layout as a rule."""
+    return tuple(scenario_group(SEED, KINDS.index(kind), {kind: 1.0}, EACH[kind]))
 
 
 def all_scenarios() -> tuple[Scenario, ...]:

@@ -235,7 +235,7 @@ def _draw(site: Site, rng: np.random.Generator) -> Task:
         thing = next(thing for thing in site.scene.objects if thing.label == "vending machine")
         return make_task(site.scene, site.grid, (round(x, 2), round(y, 2), round(turn, 3)), thing)
     length_m = _at(float(rng.uniform()), _BANDS.get(site.kind, _OUTDOORS if site.outdoors else _INDOORS))
-    return sample_task(site.scene, site.grid, rng, length_m=length_m)
+    return sample_task(site.scene, site.grid, rng, things=site.goals, length_m=length_m)
 
 
 def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:

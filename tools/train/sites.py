@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 
 from sim_hil.benchmark.robots import robot_grid, telling_grid
+from sim_hil.benchmark.tasks import goals
 from sim_hil.benchmark.visibility import Sightlines
 from sim_hil.layouts import KINDS as LAYOUTS
 from sim_hil.layouts import generate, is_reserved
 from sim_hil.nav_grid import NavGrid
-from sim_hil.scene import Area, Scene, load_scene
+from sim_hil.scene import Area, Scene, SceneObject, load_scene
 
 CORRIDOR: Final = "corridor"
 KINDS: Final = (*LAYOUTS, CORRIDOR)
@@ -22,6 +23,7 @@ OUTDOORS: Final = frozenset(("sidewalk",))
 _CORRIDOR_LANDMARKS: Final = frozenset(
     ("vending machine", "bench", "water dispenser", "fire extinguisher", "cabinet", "notice board", "exit door")
 )
+_OUTDOOR_GOALS: Final = 8
 _MOVED_M: Final = 0.7  # along the wall: no two of them meet
 
 
@@ -57,6 +59,15 @@ class Site:
     def grid(self) -> NavGrid:
         """The floor by which ways are told."""
         return telling_grid(self.scene)
+
+    @cached_property
+    def goals(self) -> tuple[SceneObject, ...]:
+        """Landmarks to be sent to; outdoors some of them: to search the whole scene for each would take too long."""
+        found = goals(self.scene)
+        if not self.outdoors or len(found) <= _OUTDOOR_GOALS:
+            return tuple(found)
+        rng = np.random.default_rng((self.layout_seed, 47))
+        return tuple(found[index] for index in sorted(rng.choice(len(found), _OUTDOOR_GOALS, replace=False)))
 
     @cached_property
     def lines(self) -> Sightlines:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2, wrap_angle
-from sim_hil.benchmark.openings import Frame, bounds_of
+from sim_hil.benchmark.openings import Frame, Opening, bounds_of
 from sim_hil.benchmark.route import Step
 from sim_hil.benchmark.sights import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
 from sim_hil.benchmark.visibility import EYE_M, HFOV_RAD
@@ -31,8 +31,11 @@ _AHEAD_RAD: Final = radians(15.0)
 _STANDING_MPS: Final = 0.2
 _ALONG: Final = cos(radians(30.0))
 _BODY_M: Final = (0.35, 0.5, 1.7)  # a person: depth, width, height
+_SHOWN, _WHOLE_PX = 0.2, 4400.0  # of a body as it would be in the picture a metre away
+_SLEEVE_M: Final = 0.1  # whose middle is further beside the picture shows at most a sleeve
 _WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
 _WAIT_FOR_M: Final = 2.5
+_INSIDE_M: Final = 0.2  # so far within an opening it is looked into
 _BACK_M: Final = -0.3  # who means to be so far behind itself in three seconds turns round
 _ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go on
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
@@ -92,24 +95,35 @@ class Tracer:
             if gaps[index] >= PEOPLE_M:
                 break
             body = _body(people[index])
-            if self._seen(pose, body, nearer):
+            least_px = max(MIN_PIXELS, _SHOWN * _WHOLE_PX / max(float(gaps[index]), 1.0) ** 2)
+            if self._in_frame(pose, body, _SLEEVE_M) and self._seen(pose, body, nearer, least_px):
                 found.append((int(index), float(gaps[index])))
                 nearer.append(body)
         return found
 
-    def _seen(self, pose: SE2, thing: SceneObject, bodies: Sequence[SceneObject]) -> bool:
+    def _seen(
+        self, pose: SE2, thing: SceneObject, bodies: Sequence[SceneObject], least_px: float = MIN_PIXELS
+    ) -> bool:  # fmt: skip
         """Whether enough of a thing is in the picture, and nobody stands right before it."""
-        return self._pixels(pose, thing) >= MIN_PIXELS and not any(_covers(pose, body, thing) for body in bodies)
+        return self._pixels(pose, thing) >= least_px and not any(_covers(pose, body, thing) for body in bodies)
 
     def _pixels(self, pose: SE2, thing: SceneObject) -> float:
         """What is seen of a thing in a 128 x 128 picture, px."""
-        c, s = cos(pose.theta_rad), sin(pose.theta_rad)
-        x, y = pose.x_m + self._eye_ahead_m * c, pose.y_m + self._eye_ahead_m * s
-        dx, dy, reach = thing.position_m[0] - x, thing.position_m[1] - y, hypot(*thing.size_m[:2]) / 2
-        if abs(dy * c - dx * s) - reach > tan(HFOV_RAD / 2) * (dx * c + dy * s + reach):
+        reach_m = hypot(*thing.size_m[:2]) / 2
+        if not self._in_frame(pose, thing, reach_m * (1.0 + tan(HFOV_RAD / 2))):
             return 0.0  # no need to cast rays
-        eye = (x, y, self._scene.ground_height_m(pose.x_m, pose.y_m) + self._eye_up_m)
+        eye = (*self._eye(pose), self._scene.ground_height_m(pose.x_m, pose.y_m) + self._eye_up_m)
         return self._lines.pixels(eye, pose.theta_rad, thing, self._range_m)
+
+    def _eye(self, pose: SE2) -> Vec2:
+        ahead = self._eye_ahead_m
+        return (pose.x_m + ahead * cos(pose.theta_rad), pose.y_m + ahead * sin(pose.theta_rad))
+
+    def _in_frame(self, pose: SE2, thing: SceneObject, margin_m: float) -> bool:
+        """Whether a thing's middle is between the picture's sides, or beside them by no more than the margin."""
+        (x, y), c, s = self._eye(pose), cos(pose.theta_rad), sin(pose.theta_rad)
+        dx, dy = thing.position_m[0] - x, thing.position_m[1] - y
+        return abs(dy * c - dx * s) <= tan(HFOV_RAD / 2) * (dx * c + dy * s) + margin_m
 
     def _objects(self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject]) -> list[str]:
         """The goal, the next opening that counts, what an instruction may name, then whatever is nearest."""
@@ -130,23 +144,31 @@ class Tracer:
     def _next_opening(self, pose: SE2, step: Step) -> str:
         """The nearest opening ahead that counts for a step and is in view; "" without any."""
         frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
-        here, own = frame.along(xy), frame.across(xy)
+        here = frame.along(xy)
         for opening in step.counted:
             if opening.middle_m <= here:
                 continue
-            _, (right, left) = frame.span(bounds_of(opening.area))
-            # The border nearest to the robot; an area that the corridor runs across opens a metre to the side.
-            across = right if opening.side == "left" else left
-            if right < own < left:
-                across = own + (1.0 if opening.side == "left" else -1.0)
+            left = opening.side == "left"
+            across = self._border(frame, xy, opening) + (_INSIDE_M if left else -_INSIDE_M)
             point = frame.point(opening.middle_m, across)
-            if self._in_sight(pose, point):
+            # From close to the wall its far end is seen first.
+            if self._in_sight(pose, point) or self._in_sight(pose, frame.point(opening.high_m - _INSIDE_M, across)):
                 # Along the corridor it is on the side on which it counts, however small the angle.
                 along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
                 side = opening.side if along else _side(pose, point)
                 metres = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
                 return words.seen(words.opening(opening.area.kind), side, metres)
         return ""
+
+    def _border(self, frame: Frame, xy: Vec2, opening: Opening) -> float:
+        """Where an opening begins, across the direction of travel."""
+        low, high = frame.span(bounds_of(opening.area))[1]
+        if not low < frame.across(xy) < high:
+            return low if opening.side == "left" else high
+        # The corridor runs into or across that area: it opens where the corridor's own wall ends.
+        own = self._scene.area_at(*xy)
+        low, high = (frame.across(xy),) * 2 if own is None else frame.span(bounds_of(own))[1]
+        return high if opening.side == "left" else low
 
     def _in_sight(self, pose: SE2, point: Vec2) -> bool:
         """Whether a post as high as a table would be seen at a point."""
