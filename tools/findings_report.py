@@ -71,7 +71,7 @@ def markdown(content: Mapping[str, Any], judged: Sequence[Judged], pictures: Seq
     lines[2] += f"{content['latency']}.{'' if content['trained'] else ' **The weights are untrained.**'}"
     lines += [
         HOW,
-        "| claim | of | n | from | to | difference (95 %) | bound | |",
+        "| claim | of | n | from | to | measured (95 %) | bound | |",
         "|---|---|---:|---:|---:|---:|---:|---|",
     ]
     lines += [_row(each) for each in judged]
@@ -99,9 +99,11 @@ def markdown(content: Mapping[str, Any], judged: Sequence[Judged], pictures: Seq
 
 def _row(each: Judged) -> str:
     name = NAMES[each.metric]
-    interval = "–" if each.ci95 is None else f"{each.ci95[0]:+.1f} to {each.ci95[1]:+.1f}"
+    # A difference has a sign; a level has none.
+    sign = "" if each.before is None else "+"
+    low, high = each.ci95 or (each.value, each.value)
     before = "" if each.before is None else f"{each.before:.1f}"
-    value = f"{each.value:+.1f} ({interval})"
+    value = f"{each.value:{sign}.1f} ({low:{sign}.1f} to {high:{sign}.1f})"
     return (
         f"| {each.claim} | {each.source} | {each.n} | {before} | {name} {each.after:.1f} | {value} | {each.least:g} | "
         f"**{each.verdict}** |"
