@@ -84,8 +84,11 @@ def test_every_variant_of_a_head_plans_as_the_network_does(tmp_path: Path, head:
 BOUNDS = {"fp32": 0.02, "fp16": 0.02, "int8-b32": 0.1, "int8": 0.2, "int4-b32": 1.0}
 
 
-@pytest.mark.parametrize("half", [False, True], ids=["float", "half"])
-@pytest.mark.parametrize("precision", BOUNDS)
+# Blocks in fp16 are for CUDA: on the CPU, ONNX Runtime 1.31 loses such a product where it follows a Gelu in fp16.
+COMBINATIONS = [(precision, half) for precision in BOUNDS for half in (False, True) if not (half and "-b" in precision)]
+
+
+@pytest.mark.parametrize(("precision", "half"), COMBINATIONS)
 @pytest.mark.parametrize("head", OTHERS)
 def test_every_precision_runs_and_is_near(tmp_path: Path, head: str, precision: str, half: bool) -> None:
     assert check(lively(with_head(TINY, head)), tmp_path, Precision(precision), "fused", half=half) < BOUNDS[precision]
@@ -185,6 +188,7 @@ def counted_flops(model: TicVla, context: int) -> int:
     c, vision = model.config.action, model.config.vision
     context_shape = (c.layers, 1, c.heads, context, c.hidden // c.heads)
     inputs = [torch.zeros(1, vision.tokens, vision.token_dim), torch.zeros(1, 3), torch.zeros(1, 4)]
+    model.action.requires_grad_(False)  # the counter looks for gradients of everything that has one
     with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         model.action(*inputs, torch.zeros(context_shape), torch.zeros(context_shape))
     return int(counter.get_total_flops())
