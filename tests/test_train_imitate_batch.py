@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,15 @@ from tools.train.action_batch import Group, collate, errors, plan, smooth_l1, tr
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """So small a network computes no faster with more, and far slower where others compute beside it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def model_with(**action: Any) -> TicVlaConfig:
