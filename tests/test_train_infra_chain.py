@@ -18,11 +18,9 @@ from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights
 from export.shipped import shipped_weights
 from tools.train import chain, cli
-from tools.train.budget import Line, budget_of, lines_of
 from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
-from tools.train.curves import draw_curves, panels_of, smoothed
 from tools.train.exported import ExportError, export_artifacts, model_argument
-from tools.train.job import PlainProgress, StageJob
+from tools.train.job import StageJob
 from tools.train.model_card import CardError, card, ship, write_card
 from tools.train.network_file import (
     NetworkFileError,
@@ -304,41 +302,6 @@ def test_torchrun_is_for_stages_that_share_batches(
     monkeypatch.setattr(cli, "ranks_of_environment", lambda _device: nullcontext(Ranks(0, 2)))
     assert run("collect", "--preset", "tiny", "--out", tmp_path / "run") == EXIT_BAD_INPUT
     assert "torchrun is for encoder, sft, imitate" in capsys.readouterr().err
-
-
-# What it shows and leaves
-
-
-def test_curves_are_drawn_of_every_stage_that_has_more_than_a_point(run_dir: RunDir) -> None:
-    for step in range(200):
-        run_dir.log("sft", step, loss=100.0 / (1 + step), lr=1e-3, val_loss=5.0)
-    run_dir.log("rl", 1, success=0.5)
-    assert [path.name for path in draw_curves(run_dir)] == ["sft.png"]
-    first = (run_dir.curves / "sft.png").read_bytes()
-    draw_curves(run_dir)
-    assert (run_dir.curves / "sft.png").read_bytes() == first
-
-
-def test_numbers_of_a_kind_share_an_axis() -> None:
-    assert panels_of(["loss", "lr", "val_loss", "success"]) == [["loss", "val_loss"], ["success"], ["lr"]]
-
-
-def test_a_jagged_line_is_averaged_over_what_came_before() -> None:
-    assert smoothed([4.0, 2.0]) == [4.0, 3.0] and smoothed([1.0] * 100)[-1] == 1.0
-
-
-def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
-    steps = steps_of("all", TINY)
-    told = lines_of(TINY, steps, [Line("sft", "anchors", 5400, 54.0), Line("rl", "steps", 9, None)], "cpu")
-    assert "1 min 40 s" in told[-1] and "1 parts that nobody has measured" in told[-1]
-    assert {line.step for line in budget_of(TINY, steps, "cpu")} >= {"dagger-1", "evaluate"}
-
-
-def test_progress_elsewhere_than_on_a_terminal_is_a_line_now_and_then(capsys: Any) -> None:
-    progress = PlainProgress("sft", period_s=1e9)
-    for done in range(1, 5):
-        progress.update(done, 4, loss=0.5)
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 # Model card, and what is given away

@@ -45,18 +45,22 @@ class PlainProgress:
     def __init__(self, stage: str, period_s: float = 15.0) -> None:
         self._stage = stage
         self._period_s = period_s
-        self._started_ns = self._said_ns = time.monotonic_ns()
-        self._first: int | None = None
+        self._said_ns = time.monotonic_ns()
+        self._began: tuple[int, int, int] | None = None
+        """Total, first count and instant of the work under way: a stage may do one thing after another."""
+        self._last = 0
 
     def update(self, done: int, total: int, **numbers: float) -> None:
-        """Say it if the last line is long enough ago."""
-        if self._first is None:
-            self._first = done
+        """Say it if the last line is long enough ago, or if that was the last of it."""
         now_ns = time.monotonic_ns()
-        if done < total and (now_ns - self._said_ns) / 1e9 < self._period_s:
+        if self._began is None or self._began[0] != total or done < self._last:
+            self._began, self._last = (total, done, now_ns), -1
+        due = (now_ns - self._said_ns) / 1e9 >= self._period_s
+        if done == self._last or not (due or done >= total):
             return
-        self._said_ns = now_ns
-        rate = (done - self._first) / max((now_ns - self._started_ns) / 1e9, 1e-9)
+        self._said_ns, self._last = now_ns, done
+        _, first, since_ns = self._began
+        rate = (done - first) / max((now_ns - since_ns) / 1e9, 1e-9)
         shown = "".join(f", {name} {value:.4g}" for name, value in numbers.items())
         left = f", {duration((total - done) / rate)} to go" if rate > 0 and done < total else ""
         self.say(f"{done} of {total} ({rate:.3g} /s{left}){shown}")

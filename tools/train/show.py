@@ -30,6 +30,7 @@ class StageBar(AbstractContextManager["StageBar"]):
             TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False), console=console,
         )  # fmt: skip
         self._task: TaskID | None = None
+        self._total = 0
 
     def __enter__(self) -> StageBar:
         self._bar.start()
@@ -41,7 +42,10 @@ class StageBar(AbstractContextManager["StageBar"]):
     def update(self, done: int, total: int, **numbers: float) -> None:
         """Move the bar."""
         if self._task is None:
-            self._task = self._bar.add_task("", total=total, completed=done)
+            self._task, self._total = self._bar.add_task("", total=total, completed=done), total
+        if total != self._total:  # a stage may do one thing after another
+            self._bar.reset(self._task, total=total)
+            self._total = total
         shown = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
         self._bar.update(self._task, completed=done, total=total, description=shown)
 
