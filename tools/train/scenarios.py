@@ -48,7 +48,7 @@ _CROWDS: Final = {
     CORRIDOR: ((0, 0.4), (2, 0.2), (5, 0.2), (8, 0.2)),
 }
 # A task is kept the more readily the more there is to learn from it: nothing to do, turns, turns to be counted.
-_KEEP: Final = (0.25, 0.75, 1.0)
+_KEEP: Final = (0.2, 0.6, 1.0)
 _TAG = 43
 
 _T = TypeVar("_T")
