@@ -78,7 +78,8 @@ class ImitateConfig:
     mirrored: float = 0.3
     """Share of samples that are of the drives as a mirror shows them, at whole seconds."""
     loss: LossConfig = field(default_factory=LossConfig)
-    optim: OptimConfig = field(default_factory=OptimConfig)
+    optim: OptimConfig = field(default_factory=lambda: OptimConfig(bf16=True))
+    """Table 8; in bfloat16, which is nearly twice as fast on two cores."""
     held_samples: int = 1024
     """Of held-out layouts, whose loss is looked at every `held_steps` steps and at the end."""
     held_steps: int = 500
