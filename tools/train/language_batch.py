@@ -7,6 +7,7 @@ queries and the vocabulary's scores at the positions whose next token matters.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,12 +16,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from export.model.language import DecoderLayer, LanguageModel, rotate
+from export.model.language import DecoderLayer, LanguageModel, RmsNorm, rotate
 from export.model.vision import fold_tokens
 
 IGNORED = -100
 """Target where there is nothing to be said (torch's own value)."""
+PLAIN_TOKENS = 512
+"""Rows up to this length take plain attention on a CPU; its memory grows with their square."""
 POOL = 32
 """Batches that are sorted by length together: alike enough to waste little, mixed enough to be random."""
 
@@ -142,6 +146,18 @@ def keys_values(layer: DecoderLayer, h: Tensor, cos: Tensor, sin: Tensor) -> tup
     return rotate(heads_of(layer.k(h), layer.config.kv_heads), cos, sin).to(v.dtype), v
 
 
+def normed(norm: RmsNorm, x: Tensor) -> Tensor:
+    """A norm's output in the number format that the layers after it compute in, converted once for all of them."""
+    h: Tensor = norm(x)
+    kind = x.device.type
+    return h.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else h
+
+
+def attention(device: torch.device, tokens: int) -> AbstractContextManager[None]:
+    """The quicker way to learn attention: on a CPU, for short rows, torch's plain one (an eighth of a step's time)."""
+    return sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" and tokens <= PLAIN_TOKENS else nullcontext()
+
+
 def finish_layer(
     layer: DecoderLayer, x: Tensor, h: Tensor, cos: Tensor, sin: Tensor, k: Tensor, v: Tensor, mask: Tensor | None
 ) -> Tensor:
@@ -156,7 +172,7 @@ def finish_layer(
         is_causal=mask is None,
     )
     x = x + layer.o(attended.transpose(1, 2).flatten(2))
-    h = layer.mlp_norm(x)
+    h = normed(layer.mlp_norm, x)
     return x + layer.down(F.silu(layer.gate(h)) * layer.up(h))
 
 
@@ -168,11 +184,11 @@ def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query
     caches: list[tuple[Tensor, Tensor]] = []
     *earlier, last = language.layers
     for layer in earlier:
-        h = layer.input_norm(x)
+        h = normed(layer.input_norm, x)
         k, v = keys_values(layer, h, cos, sin)
         caches.append((k, v))
         x = finish_layer(layer, x, h, cos, sin, k, v, None)
-    h = last.input_norm(x)
+    h = normed(last.input_norm, x)
     k, v = keys_values(last, h, cos, sin)
     caches.append((k, v))
     kv = torch.cat([k.transpose(1, 2).flatten(2), v.transpose(1, 2).flatten(2)], dim=-1)
@@ -188,7 +204,8 @@ def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query
 
 def token_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
     """-log p of every answer token [B, A], zero behind a row's answer (the terms of the paper's equation 3)."""
-    hidden = run(language, batch.input_ids, batch.visual_tokens, batch.query_at).hidden
+    with attention(batch.input_ids.device, batch.input_ids.shape[1]):
+        hidden = run(language, batch.input_ids, batch.visual_tokens, batch.query_at).hidden
     assert hidden is not None
     logits = language.lm_head(hidden).float()
     return F.cross_entropy(logits.flatten(0, 1), batch.targets.flatten(), reduction="none").view_as(batch.targets)
