@@ -335,6 +335,17 @@ def test_without_a_generator_torchs_own_seed_decides(head: str) -> None:
 
 
 @pytest.mark.parametrize("head", HEADS)
+def test_in_16_bits_the_loss_is_nearly_the_same(head: str) -> None:
+    action = expert(head)
+    exact = loss(action, seeded(1))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = loss(action, seeded(1))
+    assert rounded.dtype == torch.float32
+    rounded.backward()
+    assert float(rounded.detach()) == pytest.approx(float(exact.detach()), rel=0.05, abs=0.01)
+
+
+@pytest.mark.parametrize("head", HEADS)
 def test_every_weight_learns(head: str) -> None:
     action = expert(head)
     loss(action, seeded(0)).backward()
