@@ -36,7 +36,7 @@ class KvConfig:
     """States of each anchor, each with words and a `before` of its own."""
     own_share: float = 0.0
     """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
-    max_new_tokens: int = 96
+    max_new_tokens: int = 72
     """Of its own texts."""
     every: int = TRACE_EVERY
     """Frames between two anchors."""

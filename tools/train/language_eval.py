@@ -40,7 +40,7 @@ class EvalConfig:
     """Drives along which the model hears only itself."""
     gap_s: float = 2.0
     """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
-    max_new_tokens: int = 96
+    max_new_tokens: int = 72
     batch: int = 48
 
     def __post_init__(self) -> None:
