@@ -260,7 +260,7 @@ def _rows(boxes: list[Box], most: int) -> list[tuple[float, ...]]:
 def _met(boxes: Array, eye: Array, rays: Array) -> Array:
     """[n]: where rays [n, 3] from the eye meet one of their boxes [n, k, 8], in lengths of the ray.
 
-    The last box is the whole's: for rays that meet no part; who misses that too is as far away as its nearest side.
+    The last box is the whole's: for rays that meet no part, or pass an edge by less than a pixel.
     """
     offset = eye - boxes[..., :3]
     c, s, half = boxes[..., 3], boxes[..., 4], boxes[..., 5:] / 2
@@ -273,8 +273,9 @@ def _met(boxes: Array, eye: Array, rays: Array) -> Array:
     one, other = (-half - start) / run, (half - start) / run
     enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
     met = np.where((enter <= leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
-    parts = met[:, :-1].min(axis=1) if met.shape[1] > 1 else np.full(len(met), np.inf)
-    found = np.where(np.isfinite(parts), parts, met[:, -1])
-    beside = np.maximum(np.abs(start[:, -1, :2]) - half[:, -1, :2], 0.0)
-    missed = np.hypot(beside[:, 0], beside[:, 1]) / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
-    return np.where(np.isfinite(found), found, missed)
+    found = met[:, :-1].min(axis=1, initial=np.inf)
+    # What is around the eye (a parasol, a tree's crown) is seen where the ray leaves it; a ray that just misses an edge
+    # has left the box a little before it would have come into it.
+    first, last = enter[:, -1], leave[:, -1]
+    whole = np.where((first > 0) & (first <= last), first, np.where(last > 0, last, np.maximum(first, 0.0)))
+    return np.where(np.isfinite(found), found, whole)
