@@ -70,7 +70,7 @@ def now_of(expert: ActionExpert, visual_tokens: Tensor, state: Tensor, latency: 
 def prefix(expert: ActionExpert, now: Tensor, semantic: Tensor) -> Tensor:
     """The queries [B, steps, hidden] before the last layer; frozen. All of the batch have T semantic tokens."""
     with torch.no_grad():
-        x = expert.queries.expand(now.shape[0], -1, -1)
+        x = expert.queries.detach().expand(now.shape[0], -1, -1)
         pairs = list(zip(expert.key_values, expert.layers, strict=True))
         for key_value, layer in pairs[:-1]:
             keys, values = key_value(torch.cat([now, semantic], dim=1))
