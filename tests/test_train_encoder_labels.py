@@ -196,7 +196,7 @@ def test_the_wall_behind_the_doorway_is_as_far_away_as_it_is(twin: IdWorld, grid
 def test_a_pixel_that_misses_an_edge_by_a_hair_is_as_far_away_as_its_neighbours(twin: IdWorld, grid: NavGrid) -> None:
     for turn in (-0.02, 0.0, 0.01):
         cells = labelled(twin, grid, state(turn=turn))["near_m"][1:4, SIDE // 2]
-        assert cells.min() > 5.8  # the wall on the right, which begins beside the robot, and the one ahead
+        assert cells.min() > 5.5  # the wall on the right, which begins beside the robot, and the one ahead
 
 
 def test_the_way_ahead_leads_through_the_doorway_into_the_room(twin: IdWorld, grid: NavGrid) -> None:

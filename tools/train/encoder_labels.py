@@ -45,6 +45,7 @@ _CLEAR_M: Final = 0.2  # of a free way to each side: what a far doorway still ha
 _STEP_M: Final = 0.1
 _BEYOND: Final = 3  # steps that a way goes on into an opening, or it is only touched
 _PERSON_HALF_M: Final = 0.15
+_PIXEL: Final = 0.04  # of the twin's pictures, m at a distance of 1 m
 _NOWHERE: Final = (1e9, 1e9, 1e9, 1.0, 0.0, 0.0, 0.0, 0.0)  # a box that no ray meets
 
 
@@ -258,10 +259,39 @@ def _rows(boxes: list[Box], most: int) -> list[tuple[float, ...]]:
 
 
 def _met(boxes: Array, eye: Array, rays: Array) -> Array:
-    """[n]: where rays [n, 3] from the eye meet one of their boxes [n, k, 8], in lengths of the ray.
+    """[n]: where rays [n, 3] from the eye meet one of their boxes [n, k, 8], in lengths of the ray; inf for none.
 
-    The last box is the whole's: for rays that meet no part, or pass an edge by less than a pixel.
+    The last box is the whole's: for rays that meet no part, or pass an edge by about a pixel.
     """
+    enter, leave = _spans(boxes, eye, rays)
+    met = np.where((enter <= leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
+    found = met[:, :-1].min(axis=1, initial=np.inf)
+    # What is around the eye (a parasol, a tree's crown) is seen where the ray leaves it.
+    found = np.where(np.isfinite(found), found, np.where(enter[:, -1] > 0, met[:, -1], _left(enter, leave)))
+    missed = ~np.isfinite(found)
+    if missed.any():
+        rest = boxes[missed, -1:].copy()
+        rest[..., 5:] += 2 * _PIXEL * _gaps(rest, eye)[..., None]
+        enter, leave = _spans(rest, eye, rays[missed])
+        found[missed] = np.where(enter[:, 0] > 0, np.where(enter <= leave, enter, np.inf)[:, 0], _left(enter, leave))
+    return found
+
+
+def _gaps(boxes: Array, eye: Array) -> Array:
+    """[n, k]: from the eye to the nearest side of each box, along the floor, m."""
+    x, y = eye[0] - boxes[..., 0], eye[1] - boxes[..., 1]
+    c, s = boxes[..., 3], boxes[..., 4]
+    along, across = np.abs(x * c + y * s) - boxes[..., 5] / 2, np.abs(y * c - x * s) - boxes[..., 6] / 2
+    return np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
+
+
+def _left(enter: Array, leave: Array) -> Array:
+    """[n]: where rays leave the last of their boxes; inf where they are never in it."""
+    return np.where((enter <= leave) & (leave > 0), leave, np.inf)[:, -1]
+
+
+def _spans(boxes: Array, eye: Array, rays: Array) -> tuple[Array, Array]:
+    """[n, k] each: where rays come into their boxes and leave them, in lengths of the ray (out of order: never)."""
     offset = eye - boxes[..., :3]
     c, s, half = boxes[..., 3], boxes[..., 4], boxes[..., 5:] / 2
     start = np.stack(
@@ -271,11 +301,4 @@ def _met(boxes: Array, eye: Array, rays: Array) -> Array:
     run = np.stack((x * c + y * s, y * c - x * s, np.broadcast_to(z, c.shape)), -1)
     run = np.where(np.abs(run) < 1e-9, 1e-9, run)
     one, other = (-half - start) / run, (half - start) / run
-    enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
-    met = np.where((enter <= leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
-    found = met[:, :-1].min(axis=1, initial=np.inf)
-    # What is around the eye (a parasol, a tree's crown) is seen where the ray leaves it; a ray that just misses an edge
-    # has left the box a little before it would have come into it.
-    first, last = enter[:, -1], leave[:, -1]
-    whole = np.where((first > 0) & (first <= last), first, np.where(last > 0, last, np.maximum(first, 0.0)))
-    return np.where(np.isfinite(found), found, whole)
+    return np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
