@@ -355,12 +355,13 @@ def test_every_weight_learns(head: str) -> None:
     assert idle == []
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_a_head_learns_what_to_do_where(head: str) -> None:
+LEFT = torch.stack([torch.full((11,), 0.05), 0.01 * torch.arange(11), torch.full((11,), 0.04)], dim=-1)
+TWO_WAYS = torch.stack([LEFT, LEFT * torch.tensor([1.0, -1.0, -1.0])]).cumsum(dim=1)
+"""Half a metre to the left, and the same to the right."""
+
+
+def trained(head: str, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor) -> ActionExpert:
     action = build(with_head(TINY, head), 0).action
-    left = torch.stack([torch.full((11,), 0.05), 0.01 * torch.arange(11), torch.full((11,), 0.04)], dim=-1)
-    target = torch.stack([left, left * torch.tensor([1.0, -1.0, -1.0])]).cumsum(dim=1)
-    inputs, kv = instants(2), states(2, 6)
     action.fit_actions(target)
     optimiser = torch.optim.AdamW(action.parameters(), lr=3e-3)
     generator = seeded(0)
@@ -370,10 +371,31 @@ def test_a_head_learns_what_to_do_where(head: str) -> None:
         action.loss(*inputs, keys, values, target, generator=generator).backward()
         torch.nn.utils.clip_grad_norm_(action.parameters(), 1.0)
         optimiser.step()
+    return action
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_head_learns_what_to_do_where(head: str) -> None:
+    inputs, kv = instants(2), states(2, 6)
+    action = trained(head, inputs, kv, TWO_WAYS)
     with torch.no_grad():
         found = action(*inputs, *action.context(kv))
-    assert float((found - target).abs().max()) < 0.1
-    assert float(target[0, -1, 1]) > 0.5
+    assert float((found - TWO_WAYS).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("head", ["diffusion", "flow"])
+def test_where_two_ways_are_as_good_one_is_taken_and_not_their_middle(head: str) -> None:
+    inputs = tuple(x.expand(8, *x.shape[1:]) for x in instants(1))
+    action = trained(head, inputs, states(1, 6), TWO_WAYS.repeat(4, 1, 1))
+    noise = {"diffusion": action.diffusion, "flow": action.flow}[head].noise
+    ends = []
+    for seed in range(20):
+        noise.normal_(generator=seeded(seed))
+        ends.append(float(plan(action)[0, -1, 1]))
+    # Half a metre to a side; the mean of both is what a query learns.
+    assert min(ends) < -0.4
+    assert max(ends) > 0.4
+    assert sum(0.4 < abs(end) < 0.7 for end in ends) >= 14
 
 
 # Actions and their scale
