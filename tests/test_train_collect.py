@@ -34,7 +34,7 @@ COUNT = 10
 
 
 def _collection(count: int = COUNT, **changed: Any) -> Collection:
-    return Collection("e", count, 3, 0, CollectConfig(episodes=count, **changed))
+    return Collection("e", count, 3, 0, CollectConfig(episodes=count, drives_per_layout=8, **changed))
 
 
 def _collect(folder: Path, count: int = COUNT, jobs: int = 2, stopped: Callable[[], bool] = lambda: False) -> Dataset:

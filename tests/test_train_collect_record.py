@@ -221,6 +221,7 @@ def test_a_pupils_collisions_are_kept_and_its_falls_are_not() -> None:
     ("changed", "says"),
     [
         ({"episodes": 0}, "episodes"),
+        ({"drives_per_layout": 0}, "drives_per_layout"),
         ({"noise_share": 1.1}, "shares"),
         ({"typical_drift_share": 0.7, "severe_drift_share": 0.4}, "shares"),
         ({"jpeg_quality_min": 96}, "jpeg_quality"),

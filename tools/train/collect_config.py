@@ -16,6 +16,8 @@ class CollectConfig:
     episodes: int = 700
     kinds: Mapping[str, float] = field(default_factory=dict)
     """Shares of the kinds of scenes; empty: those of `tools.train.scenarios`."""
+    drives_per_layout: int = 4
+    """Fewer show more places; each place takes its time to be thought up, and a process makes the drives in it."""
     jobs: int = 0
     """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
     noise_share: float = 0.3
@@ -41,6 +43,8 @@ class CollectConfig:
             raise ValueError(f"expected shares of 0 to 1, those of the drifts 1 together at most, found {shares}")
         if not 30 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100:
             raise ValueError("jpeg_quality: expected 30 <= min <= max <= 100")
+        if not 1 <= self.drives_per_layout <= 100:
+            raise ValueError(f"drives_per_layout: expected 1 to 100, found {self.drives_per_layout}")
         if not 0.2 <= self.speed_mps <= 1.5:
             raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:

@@ -26,7 +26,7 @@ from tools.train.collect_config import CollectConfig
 from tools.train.dagger_driver import PolicyDriver, PolicyOptions
 from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TRACE_EVERY, About, Drive, Entry
 from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
-from tools.train.scenarios import SHARES, TASKS_PER_SCENE, Scenario, ScenarioError, training_episodes
+from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_episodes
 from tools.train.steering import SteeringNoise, Velocity
 from tools.train.traces import Tracer
 from tools.train.workers import Message, worker_main
@@ -96,10 +96,13 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
     """
     order = Order.of_json(job)
     numbers = range(order.start, order.start + order.count)
-    if order.start // TASKS_PER_SCENE != (numbers[-1] // TASKS_PER_SCENE):
+    size, kinds = order.config.drives_per_layout, order.config.kinds or SHARES
+    if order.start // size != numbers[-1] // size:
         raise ValueError("an order is of one layout")
     try:
-        scenarios = list(training_episodes(order.scenario_seed, order.count, _kinds(order), start=order.start))
+        scenarios = list(
+            training_episodes(order.scenario_seed, order.count, kinds, start=order.start, tasks_per_scene=size)
+        )
     except ScenarioError:
         for number in numbers:
             yield {"dropped": order.id(number), "why": "no such layout"}
@@ -118,10 +121,6 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
         except ArtifactError as error:
             yield {"refused": str(error)}
             return
-
-
-def _kinds(order: Order) -> Mapping[str, float]:
-    return order.config.kinds or SHARES
 
 
 def _drive(order: Order, number: int, scenario: Scenario) -> Entry:

@@ -17,7 +17,7 @@ from tools.train.collect_worker import MODULE, Order
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Entry
-from tools.train.scenarios import MAX_SEED, TASKS_PER_SCENE
+from tools.train.scenarios import MAX_SEED
 from tools.train.workers import Told, Workers
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
@@ -47,13 +47,11 @@ class Collection:
         scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
         # Jobs are no part of an order: it must not matter how many there are.
         config = replace(self.config, jobs=0)
-        orders = []
-        for start in range(0, self.count, TASKS_PER_SCENE):
+        orders, size = [], config.drives_per_layout
+        for start in range(0, self.count, size):
             # A whole layout always, so that the same tasks are found in it whatever the count.
-            order = Order(
-                str(folder), self.prefix, draw_seed, scenario_seed, start, TASKS_PER_SCENE, (), config, self.policy
-            )
-            ids = [order.id(number) for number in range(start, start + TASKS_PER_SCENE)]
+            order = Order(str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy)
+            ids = [order.id(number) for number in range(start, start + size)]
             wanted = [drive_id for drive_id in ids[: self.count - start] if not has(drive_id)]
             if wanted:
                 orders.append(replace(order, skip=tuple(drive_id for drive_id in ids if drive_id not in wanted)))
