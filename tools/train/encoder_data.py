@@ -41,6 +41,7 @@ _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
 _OUTDOORS_LEAST: Final = 20  # people
 _CORRIDOR_MOST: Final = 12
+_LEAST_HELD: Final = 32  # pictures of a scene, which takes seconds to build
 _EMPTY_SHARE: Final = 0.12  # of scenes indoors
 
 
@@ -149,7 +150,9 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
     kinds = [kind for kind in config.kinds if not (held and kind == CORRIDOR)]
     left = config.held if held else config.count
     # Held-out pictures come from many layouts: they tell more about new ones than many pictures of one.
-    per_scene = min(config.per_scene, -(-left // (4 * len(set(kinds))))) if held and left else config.per_scene
+    per_scene = config.per_scene
+    if held and left:
+        per_scene = min(per_scene, max(_LEAST_HELD, -(-left // (4 * len(set(kinds))))))
     shards: list[Shard] = []
     while left > 0:
         number = len(shards)
