@@ -20,10 +20,6 @@ from firmware_bridge.config import DdsConfig
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
 DECODE_ERRORS: Final = (struct.error, ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)
 MAX_SAMPLE_BYTES: Final = 10 * 1024 * 1024  # more than a camera frame
-# What Cyclone receives into. Discovery fills a buffer from end to end, a few hundred bytes a second, before the next
-# takes its place: Cyclone's own 1 MiB looks like a leak for half an hour, these are full within minutes.
-_RECEIVE_BUFFER_KIB: Final = 96
-_RECEIVE_CHUNK_KIB: Final = 66  # of one packet: more than UDP has
 # What a call into DDS itself can raise.
 DDS_ERRORS: Final = (DDSException,)
 _FRESH: Final = ViewState.Any | InstanceState.Alive | SampleState.NotRead
@@ -38,18 +34,18 @@ def domain_xml(config: DdsConfig, max_sample_bytes: int = MAX_SAMPLE_BYTES) -> s
     """Cyclone DDS configuration that also finds 0.10.2 peers, with and without multicast (protocol facts, section 1).
 
     `ParticipantIndex auto` up to 9 is 0.10.2's own port range: at most ten participants a host. Tracing stays off, so
-    nothing is written to a fixed path in /tmp.
+    nothing is written to a fixed path in /tmp. Discovery fills a receive buffer from end to end, a few hundred bytes a
+    second, before the next takes its place: Cyclone's own 1 MiB looks like a leak for half an hour, 96 KiB are full
+    within minutes. A chunk is one packet: more than UDP has.
     """
     peers = "".join(f'<Peer address="{peer}"/>' for peer in config.peers)
     return (
         '<CycloneDDS><Domain Id="any"><General><Interfaces>'
         f'<NetworkInterface name="{config.interface}" priority="default" multicast="default"/>'
         "</Interfaces></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
-        f"<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex><Peers>{peers}</Peers>"
-        f"</Discovery><Sizing><ReceiveBufferSize>{_RECEIVE_BUFFER_KIB} KiB</ReceiveBufferSize>"
-        f"<ReceiveBufferChunkSize>{_RECEIVE_CHUNK_KIB} KiB</ReceiveBufferChunkSize></Sizing>"
-        f"<Internal><MaxSampleSize>{max_sample_bytes} B</MaxSampleSize></Internal>"
-        "</Domain></CycloneDDS>"
+        f"<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex><Peers>{peers}</Peers></Discovery><Sizing>"
+        "<ReceiveBufferSize>96 KiB</ReceiveBufferSize><ReceiveBufferChunkSize>66 KiB</ReceiveBufferChunkSize></Sizing>"
+        f"<Internal><MaxSampleSize>{max_sample_bytes} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
     )
 
 
