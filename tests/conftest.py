@@ -56,3 +56,14 @@ def artifacts_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def artifacts(artifacts_dir: Path) -> Artifacts:
     """The session's artifacts, verified and loaded."""
     return load_artifacts(artifacts_dir)
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """So small a network computes no faster with more, and far slower where others compute beside it."""
+    import torch  # here: most tests do without it
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +20,7 @@ from tools.train.command_policy import CommandLimits, command_mean, entropy, log
 from tools.train.gae import advantages
 from tools.train.ppo import PpoConfig, PpoOptimiser
 
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Networks so small are slower on two threads, and much slower beside others."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_advantages_are_those_worked_out_by_hand() -> None:

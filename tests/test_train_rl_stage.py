@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,7 @@ from tools.train.run_dir import RunDir
 PPO = PpoConfig(batch=4, epochs=2, action_lr=1e-3, value_lr=1e-3)
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Networks so small are slower on two threads, and much slower beside others."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _job(out: Path, config: RlConfig, *, resume: bool = False, stop: StopFlag | None = None) -> StageJob:
