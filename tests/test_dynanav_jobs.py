@@ -109,7 +109,7 @@ def test_a_stop_ends_the_run_with_what_is_finished(tmp_path: Path) -> None:
 def test_a_killed_worker_process_is_found_by_its_signal_and_its_last_words(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "dies"), LocalJobs(1, FAKE_WORKER), store)
-    assert store.failed[0].why == "its process ended by SIGKILL before a result: out of luck"
+    assert store.failed[0].why == "its process gave no result: ended by SIGKILL: out of luck"
 
 
 def test_a_worker_process_that_is_killed_once_is_run_again_and_leaves_no_log(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_worker_process_that_is_killed_once_is_run_again_and_leaves_no_log(tmp
 def test_half_a_result_is_none(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "half"), LocalJobs(1, FAKE_WORKER), store)
-    assert not store.results and store.failed[0].why == "its process ended with exit code 0 before a result"
+    assert not store.results and store.failed[0].why == "its process gave no result: ended with exit code 0"
 
 
 def test_what_no_further_attempt_can_mend_ends_the_run_with_its_line(tmp_path: Path) -> None:

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from edge.artifact_files import _SECTIONS, SCHEMA_VERSION, seal
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
-from sim_hil.benchmark.conditions import Conditions
-from sim_hil.benchmark.episode import Episode
+from sim_hil.benchmark.conditions import Conditions, ConditionsError
+from sim_hil.benchmark.episode import Episode, load_suite
 from sim_hil.benchmark.latency import LatencyProfile
 from sim_hil.benchmark.results import EpisodeResult, ResultError
+from sim_hil.benchmark.rewording import reworded
 from sim_hil.benchmark.store import ResultStore
+from sim_hil.scene import load_scene
 from tests.dynanav_fakes import missed, result, suite_text
 from tools import findings
 from tools.benchmark_runs import RunsError
 from tools.findings import main, plan_lines, plan_of, rows_of
 from tools.findings_rows import CLAIMS, ROWS, RUNS, Finding, Level, runs_of
 from tools.findings_verdict import FAILS, HOLDS, OPEN, judge, judge_all, verdict_of
+from tools.train.evaluate import EvaluateConfig, EvaluateError, write_suite
 
 TWO_S = LatencyProfile.constant(2.0)
 
@@ -30,10 +35,13 @@ def outcomes(*reached: int, task: str = "") -> list[EpisodeResult]:
     return [(result if hit else missed)(f"e{n:02d}", task=task or f"t{n}") for n, hit in enumerate(reached)]
 
 
-def models(root: Path, *names: str) -> Path:
+def models(root: Path, *names: str, alike: bool = False) -> Path:
+    """Exported models; each with graphs of its own, or (`alike`) all with the same."""
     for name in names:
         (root / name).mkdir(parents=True)
-        (root / name / "manifest.json").write_text("{}")
+        files = {"action_expert.onnx": {"sha256": "same" if alike else name}, "report.html": {"sha256": name}}
+        sections = {key: {} for key in _SECTIONS} | {"schema_version": SCHEMA_VERSION, "files": files}
+        (root / name / "manifest.json").write_text(json.dumps(seal(sections)))
     return root
 
 
@@ -138,11 +146,8 @@ def test_runs_of_the_same_conditions_are_run_once(tmp_path: Path) -> None:
     assert plan.folders["rl-2s"] == plan.folders["rl"] == "rl" and plan.folders["rl-3s"] == "rl-3s"
     assert len(set(plan.folders.values())) == 2 + 2 * 4
     assert any("the same as rl" in line for line in plan_lines(plan, 85))
-    # The row about the offset lacks one of its models.
-    assert (
-        list(plan.missing) == ["no-motion-offset"]
-        and "no-motion-offset: no artifacts" in plan.missing["no-motion-offset"]
-    )
+    # The row about the offset lacks its models.
+    assert list(plan.missing) == ["no-motion-offset", "full"] and "full: no artifacts" in plan.missing["full"]
 
 
 def test_a_profile_keeps_its_shape_at_every_latency(tmp_path: Path) -> None:
@@ -159,6 +164,27 @@ def test_the_conditions_are_those_that_the_claims_are_about(tmp_path: Path) -> N
     reasoning = told["rl-no-reasoning"]
     assert reasoning.mode == "no-reasoning" and reasoning.latency == LatencyProfile.constant(0.25)
     assert told["expert"].policy.kind == "expert"
+
+
+def test_ablations_are_compared_with_what_was_trained_as_they_were() -> None:
+    pairs = {claim.row: claim.pairs for claim in CLAIMS if isinstance(claim, Finding)}
+    assert {pairs[row][0][1] for row in ("latency", "interface", "offset")} == {"full"}
+    assert RUNS["full"].variant == "full"
+
+
+def test_reasoning_is_judged_by_a_model_trained_without_it_where_there_is_one(tmp_path: Path) -> None:
+    both = plan_of(models(tmp_path / "both", "rl", "full", "no-reasoning"), ["reasoning"], TWO_S)
+    assert set(both.conditions) == {"no-reasoning", "full"} and both.conditions["no-reasoning"].mode == "no-reasoning"
+    assert both.conditions["full"].mode == "async"
+    alone = plan_of(models(tmp_path / "alone", "rl"), ["reasoning"], TWO_S)
+    assert set(alone.conditions) == {"rl-no-reasoning", "rl"} and set(alone.missing) == {"no-reasoning", "full"}
+
+
+def test_rows_that_compare_equal_weights_are_left_out(tmp_path: Path) -> None:
+    plan = plan_of(models(tmp_path, "rl", "no-rl", alike=True), ["score", "async", "rl"], TWO_S)
+    assert set(plan.conditions) == {"rl", "rl-sync"}
+    assert plan.missing == {"row rl": "no-rl and rl have the same weights: there is nothing to compare"}
+    assert not any(claim.row == "rl" for claim in plan.claims)
 
 
 def test_artifacts_alone_are_the_shipped_model(tmp_path: Path) -> None:
@@ -244,6 +270,39 @@ def test_a_run_that_lacks_episodes_does_not_end_the_others(
     root, out = models(tmp_path / "models", "rl"), tmp_path / "out"
     assert run(root, out, suite, "--rows", "score,async,words") == EXIT_CHECK_FAILED
     assert bench.ran == ["rl", "rl-sync", "rl-swapped"]
+
+
+def test_a_run_that_does_not_suit_is_told_and_does_not_end_the_others(
+    tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench({})
+    bench.ends = ConditionsError("swapped instructions: expected two tasks or more in hall, found 1")
+    monkeypatch.setattr(findings, "run_episodes", bench)
+    out = tmp_path / "out"
+    assert run(models(tmp_path / "models", "rl"), out, suite, "--rows", "score,words") == EXIT_DONE
+    assert "* rl-swapped: swapped instructions: expected two tasks" in (out / "findings.md").read_text()
+
+
+def test_the_suite_that_training_writes_is_taken(tmp_path: Path, capsys: Any) -> None:
+    suite = write_suite(tmp_path / "evaluate", EvaluateConfig(episodes=2, kinds={"corridor": 1.0}))
+    root = models(tmp_path / "models", "rl")
+    assert run(root, tmp_path / "out", suite, "--dry-run") == EXIT_DONE
+    assert "runs of 2 episodes" in capsys.readouterr().err
+    episodes = load_suite(suite)
+    assert {load_scene(each.scene).name for each in episodes} == {Path(each.scene).stem for each in episodes}
+    for name in ("rl-swapped", "rl-training-words"):
+        conditions = RUNS[name].conditions(root, TWO_S)
+        other = reworded(episodes, conditions, lambda: load_suite(suite))
+        assert all(a.instructions != b.instructions for a, b in zip(episodes, other, strict=True))
+
+
+def test_a_suite_of_other_numbers_is_not_taken_for_this_one(tmp_path: Path) -> None:
+    few = EvaluateConfig(episodes=1, kinds={"corridor": 1.0})
+    path = write_suite(tmp_path, few)
+    before = path.stat().st_mtime_ns
+    assert write_suite(tmp_path, replace(few, latency_s=1.0)) == path and path.stat().st_mtime_ns == before
+    with pytest.raises(EvaluateError, match="delete"):
+        write_suite(tmp_path, replace(few, episodes=2))
 
 
 def test_a_dry_run_leaves_nothing(tmp_path: Path, suite: Path, capsys: Any) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
 from tools.findings_models import main, models_of
@@ -13,11 +15,13 @@ from tools.train.recipe import load_recipe
 from tools.train.variants import VARIANTS
 
 
-def run_of(folder: Path, *stages: str, variant: str = "full") -> Path:
-    """A run that has left weights of some stages."""
+def run_of(folder: Path, *stages: str, variant: str = "full", policy: float | None = None) -> Path:
+    """A run that has left weights of some stages; `policy`: the same action expert in all of them."""
     for stage in stages:
         (folder / stage).mkdir(parents=True)
-        (folder / stage / "model.safetensors").write_bytes(stage.encode())
+        of = float(sum(map(ord, stage)))
+        tensors = {"action.out": np.array([of if policy is None else policy]), "value.head": np.array([of])}
+        save_file(tensors, folder / stage / "model.safetensors")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "recipe.toml").write_text(load_recipe("tiny", VARIANTS[variant]).to_toml())
     return folder
@@ -39,6 +43,18 @@ def test_a_run_gives_the_model_before_and_after_ppo_and_its_ablations(tmp_path: 
     assert set(found) == {"no-rl", "rl", "no-latency"}
     assert found["rl"].weights == run / "rl" / "model.safetensors"
     assert not found["no-latency"].recipe.model.action.latency_aware
+
+
+@pytest.mark.parametrize("stages", [("imitate",), ("imitate", "rl")])
+def test_without_a_policy_of_its_own_ppo_has_left_imitations(stages: tuple[str, ...], tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", *stages, policy=1.0)
+    found = {model.name: model.weights for model in models_of(run, None)}
+    assert found == dict.fromkeys(("no-rl", "rl"), run / "imitate" / "model.safetensors")
+
+
+def test_that_ppo_has_left_nothing_is_said(tmp_path: Path, command: list[str], capsys: Any) -> None:
+    assert main(["--run", str(run_of(tmp_path / "run", "imitate")), "--out", str(tmp_path / "m")], command) == EXIT_DONE
+    assert "rl: reinforcement learning has left no policy of its own" in capsys.readouterr().err
 
 
 def test_every_model_has_a_folder_of_its_own(tmp_path: Path, command: list[str]) -> None:

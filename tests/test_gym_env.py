@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from sim_hil.benchmark.gym_env import ENV_ID, DynaNavEnv
 from sim_hil.benchmark.outcome import Outcome
+from sim_hil.benchmark.reward import APART_STEPS, Contacts
 from tests.benchmark_episodes import block, corridor_episode, hall
 
 FORWARD = np.array((0.8, 0.0, 0.0), np.float32)
@@ -69,6 +70,24 @@ def test_reaching_the_goal_terminates_with_the_goals_reward_and_an_outcome(env: 
     assert terminated and not truncated
     assert rewards[-1] > 400.0 and max(rewards[:-1]) < 2.0
     assert isinstance(info["outcome"], Outcome) and info["outcome"].success
+
+
+def _begun(*touching: str) -> list[bool]:
+    contacts = Contacts()
+    return [contacts.began(frozenset(labels.split())) for labels in touching]
+
+
+def test_a_collision_that_goes_on_or_comes_back_at_once_is_one() -> None:
+    assert _begun("", "wall", "wall", "", "wall") == [False, True, False, False, False]
+
+
+def test_after_a_second_apart_it_is_another_one() -> None:
+    assert _begun("wall", *[""] * APART_STEPS, "wall")[-1]
+    assert not _begun("wall", *[""] * (APART_STEPS - 1), "wall")[-1]
+
+
+def test_another_thing_is_another_collision() -> None:
+    assert _begun("wall", "wall person", "person") == [True, True, False]
 
 
 def test_a_detour_round_a_wall_is_progress_though_the_goal_grows_no_nearer() -> None:

@@ -29,6 +29,8 @@ from tools.train.anchors import (
     confused,
     draw,
     frames_at,
+    too_far,
+    waiting,
 )
 from tools.train.trace_words import Trace
 
@@ -153,14 +155,50 @@ def test_before_is_what_was_true_when_the_last_generation_looked(anchors: dict[i
 
 
 def test_wrong_words_are_as_rare_as_told_and_always_wrong(anchors: dict[int, Anchor]) -> None:
-    config = DrawConfig(before_min_s=1.0, before_max_s=1.0, before_wrong=0.2, waypoints_only=0.3)
+    config = DrawConfig(before_min_s=1.0, before_max_s=1.0, before_late=0.0, before_wrong=0.2, waypoints_only=0.3)
     rng = np.random.default_rng(0)
     drawn = [draw(anchors[60], config, rng) for _ in range(2000)]
-    wrong = [each for each in drawn if each.before != anchors[60].before(1.0)]
-    assert len(wrong) / 2000 == pytest.approx(0.2, abs=0.03)
-    assert {each.before for each in wrong} == set(confused(anchors[60].earlier[-2]))
+    right = anchors[60].before(1.0)
+    wrong = [each.before for each in drawn if each.before != right]
+    assert right is not None and len(wrong) / 2000 == pytest.approx(0.2, abs=0.03)
+    assert set(confused(right)) <= set(wrong) <= {*confused(right), *anchors[60].earlier}
+    assert np.mean([each in too_far(right) for each in wrong]) > 0.5
     assert np.mean([each.waypoints_only for each in drawn]) == pytest.approx(0.3, abs=0.04)
     assert {each.wording for each in drawn} == set(WORDINGS)
+
+
+def test_some_generations_have_taken_long(anchors: dict[int, Anchor]) -> None:
+    config = DrawConfig(before_max_s=1.0, before_late=0.3, before_latest_s=5.0, before_wrong=0.0)
+    rng = np.random.default_rng(0)
+    drawn = [draw(anchors[100], config, rng).before for _ in range(500)]
+    soon = {anchors[100].before(1.0)}
+    late = {anchors[100].before(float(age)) for age in range(2, 6)} - soon
+    assert np.mean([each in late for each in drawn]) == pytest.approx(0.3, abs=0.1)
+
+
+def test_the_way_is_told_as_another_odometry_would(anchors: dict[int, Anchor]) -> None:
+    config, rng = DrawConfig(way_point_m=0.0), np.random.default_rng(0)
+    recorded = np.array(anchors[100].way)
+    told = np.array([draw(anchors[100], config, rng).way for _ in range(400)])
+    assert np.allclose(told, np.round(told, 1))
+    assert np.hypot(*(told - recorded).T).max() < 0.15 * np.hypot(*recorded.T).max() + 0.1
+    assert np.allclose(told.mean(0), recorded, atol=0.1) and told.std(0).max() > 0.02
+    exact = DrawConfig(way_turn_rad=0.0, way_scale=0.0, way_point_m=0.0)
+    assert draw(anchors[100], exact, rng).way == anchors[100].way
+
+
+def test_a_robot_that_waits_has_said_it_before_and_sees_one_place(anchors: dict[int, Anchor]) -> None:
+    waited = waiting(anchors[0], 2)
+    assert waited.frames == (0, 0) and waited.before(2.0) == anchors[0].progress
+    assert draw(waited, DrawConfig(), np.random.default_rng(0)).way == anchors[0].way
+    with pytest.raises(ValueError, match="first anchor"):
+        waiting(anchors[10], 1)
+
+
+def test_anchors_decide_near_which_the_progress_changes(anchors: dict[int, Anchor]) -> None:
+    for anchor in anchors.values():
+        near = [other.progress for other in anchors.values() if abs(other.k - anchor.k) <= 30]
+        assert anchor.decides == (near[0] != near[-1])
 
 
 @pytest.mark.parametrize("progress", [Progress(1, 1, 0), Progress(2, 3, 2), Progress(4, 3, 0), Progress(1, 0, 0)])

@@ -214,8 +214,8 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:
         order = Order(str(here.folder), "e", 7, 3, 0, 1, (), config)
         begun, made = list(messages(order.as_json()))
-        workers, told = collection.Workers(collection.WORKER, 1, tmp_path), []
-        workers.start("e", replace(order, folder=str(there.folder)).as_json())
+        workers, told = collection.Workers(collection.WORKER, 1), []
+        workers.start("e", replace(order, folder=str(there.folder)).as_json(), tmp_path / "e.log")
         while workers.running():
             told += [each.message for each in workers.wait(1.0)]
         workers.close()

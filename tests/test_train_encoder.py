@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +14,21 @@ from safetensors.torch import load_file
 from export.model.network import build
 from tests.train_drives import tiny_model
 from tests.train_encoder_rank import CONFIG, encoder_job
+from tests.train_stage_contract import Run, StageContract
 from tools.train.encoder import EncoderConfig, EncoderError, budget, run
 from tools.train.encoder_data import FramesConfig
-from tools.train.job import QuietProgress, StopFlag
 from tools.train.optim import OptimConfig
 from tools.train.recipe import Recipe
 from tools.train.tokens import encoder_sha256
 
-ROOT = Path(__file__).parents[1]
 STEPS = 8
-
-Run = tuple[dict[str, torch.Tensor], list[dict[str, Any]], dict[str, Any]]
 
 
 def trained(out: Path, **options: Any) -> Run:
     """Weights, log and result of a run."""
     job = encoder_job(out, **options)
     result = run(job)
-    return load_file(job.run_dir.model_path), list(job.run_dir.lines()), result
+    return Run(load_file(job.run_dir.model_path), list(job.run_dir.lines()), result)
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,18 +38,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run that nobody ended."""
     return trained(tmp_path_factory.mktemp("whole"))
-
-
-class StopAfter(QuietProgress):
-    """Asks to end after so many steps of learning."""
-
-    def __init__(self, steps: int) -> None:
-        self.flag = StopFlag()
-        self._steps = steps
-
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        if "loss" in numbers and done == self._steps:
-            self.flag.ask()
 
 
 def test_it_learns_to_see_better_than_whoever_does_not_look(tmp_path: Path) -> None:
@@ -73,17 +54,17 @@ def test_it_learns_to_see_better_than_whoever_does_not_look(tmp_path: Path) -> N
 
 def test_only_the_encoder_is_changed(whole: Run) -> None:
     before = build(tiny_model(), 1).state_dict()
-    moved = {name for name, tensor in whole[0].items() if not torch.equal(tensor, before[name])}
+    moved = {name for name, tensor in whole.weights.items() if not torch.equal(tensor, before[name])}
     assert {name.split(".")[0] for name in moved} == {"vision"}
     assert {name for name in before if name.startswith("vision.")} == moved
 
 
 def test_its_log_has_a_line_a_step_and_looks_at_held_out_pictures(whole: Run) -> None:
-    learned = [line for line in whole[1] if "lr" in line]
+    learned = [line for line in whole.lines if "lr" in line]
     assert [line["step"] for line in learned] == list(range(1, STEPS + 1))
-    assert [line["step"] for line in whole[1] if "held_loss" in line] == [3, 6, 8]
+    assert [line["step"] for line in whole.lines if "held_loss" in line] == [3, 6, 8]
     assert all(np.isfinite(line["loss"]) for line in learned)
-    assert whole[2]["steps"] == STEPS and whole[2]["pictures"] == 40
+    assert whole.result["steps"] == STEPS and whole.result["pictures"] == 40
 
 
 def test_the_result_names_the_encoder_that_was_left(tmp_path: Path) -> None:
@@ -93,51 +74,29 @@ def test_the_result_names_the_encoder_that_was_left(tmp_path: Path) -> None:
     assert result["encoder_sha256"] == encoder_sha256(network.vision)
 
 
-@pytest.mark.parametrize("steps", [1, 4, 7])
-def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(tmp_path: Path, whole: Run, steps: int) -> None:
-    stopping = StopAfter(steps)
-    with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path, progress=stopping, stop=stopping.flag)
-    weights, lines, result = trained(tmp_path, resume=True)
-    assert lines == whole[1] and result == whole[2]
-    assert all(torch.equal(tensor, whole[0][name]) for name, tensor in weights.items())
+class TestStage(StageContract):
+    rank = "tests.train_encoder_rank"
+    error = EncoderError
+    other = dataclasses.replace(CONFIG, batch=7)
 
+    def prepare(self, out: Path) -> list[str]:
+        encoder_job(out)  # two processes would write the same pictures at once
+        return []
 
-def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path: Path, whole: Run) -> None:
-    class Killed(QuietProgress):
-        def update(self, done: int, total: int, **numbers: float) -> None:
-            if "loss" in numbers and done == 5:
-                raise OSError
-
-    with pytest.raises(OSError):
-        trained(tmp_path, progress=Killed())
-    _, lines, result = trained(tmp_path, resume=True)
-    assert lines == whole[1] and result == whole[2]
-
-
-def test_a_finished_run_is_not_trained_again(tmp_path: Path, whole: Run) -> None:
-    trained(tmp_path)
-    weights, lines, result = trained(tmp_path, resume=True)
-    assert lines == whole[1] and result == whole[2]
-    assert all(torch.equal(tensor, whole[0][name]) for name, tensor in weights.items())
-
-
-def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path) -> None:
-    trained(tmp_path)
-    with pytest.raises(EncoderError, match="another recipe"):
-        trained(tmp_path, config=dataclasses.replace(CONFIG, batch=7), resume=True)
+    def train(self, out: Path, config: EncoderConfig | None = None, **options: Any) -> Run:
+        return trained(out, config=config or CONFIG, **options)
 
 
 def test_how_many_processes_render_makes_no_difference(tmp_path: Path, whole: Run) -> None:
     trained(tmp_path)
     more = dataclasses.replace(CONFIG, frames=dataclasses.replace(CONFIG.frames, jobs=3))
-    assert trained(tmp_path, config=more, resume=True)[2] == whole[2]
+    assert trained(tmp_path, config=more, resume=True).result == whole.result
 
 
 def test_bfloat16_gives_about_the_same_losses(tmp_path: Path, whole: Run) -> None:
     half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
-    losses = [line["loss"] for line in trained(tmp_path, config=half)[1] if "lr" in line]
-    expected = [line["loss"] for line in whole[1] if "lr" in line]
+    losses = [line["loss"] for line in trained(tmp_path, config=half).lines if "lr" in line]
+    expected = [line["loss"] for line in whole.lines if "lr" in line]
     assert losses == pytest.approx(expected, rel=0.05) and losses != expected
 
 
@@ -152,32 +111,6 @@ def test_without_pictures_the_encoder_stays_as_it_is(tmp_path: Path) -> None:
     before = build(tiny_model(), 1)
     assert lines == [] and result == {"steps": 0, "encoder_sha256": encoder_sha256(before.vision)}
     assert all(torch.equal(tensor, before.state_dict()[name]) for name, tensor in weights.items())
-
-
-def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path, whole: Run) -> None:
-    encoder_job(tmp_path)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    fixed = {
-        "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1",
-        "GLOO_SOCKET_IFNAME": "lo",
-    }  # fmt: skip
-    command = [sys.executable, "-m", "tests.train_encoder_rank", str(tmp_path)]
-    ranks = [
-        subprocess.Popen(command, cwd=ROOT, env={**os.environ, **fixed, "RANK": str(rank), "LOCAL_RANK": str(rank)})
-        for rank in range(2)
-    ]
-    try:
-        assert [rank.wait(timeout=100) for rank in ranks] == [0, 0]
-    finally:
-        for rank in ranks:
-            rank.kill()
-    lines = list(encoder_job(tmp_path).run_dir.lines())
-    assert [line["step"] for line in lines] == [line["step"] for line in whole[1]]
-    for key in ("loss", "held_loss"):
-        expected = [line[key] for line in whole[1] if key in line]
-        assert [line[key] for line in lines if key in line] == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_network_whose_tokens_have_no_labels_is_refused(tmp_path: Path) -> None:

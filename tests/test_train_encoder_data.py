@@ -93,7 +93,8 @@ def test_both_robots_and_crowds_of_all_sizes_are_in_every_kind_of_scene() -> Non
     shards = plan(FramesConfig(), 1, 8)
     for kind in ("hospital", "office", "warehouse", "sidewalk"):
         own = [shard for shard in shards if shard.kind == kind and not shard.held]
-        assert {shard.robot for shard in own} == {"go2", "carter"}
+        robots = [shard.robot for shard in own]
+        assert abs(robots.count("go2") - robots.count("carter")) <= 1
         assert max(shard.people for shard in own) > 40
         assert min(shard.people for shard in own) < 50
     assert all(shard.people >= 20 for shard in shards if shard.kind == "sidewalk")
@@ -107,7 +108,7 @@ def test_a_plan_is_the_same_again_and_another_seed_gives_another() -> None:
 
 
 def test_more_pictures_keep_those_that_are_there() -> None:
-    few, many = (plan(FramesConfig(count=count, held=0), 1, 8) for count in (4_000, 9_000))
+    few, many = (plan(FramesConfig(count=count, held=0), 1, 8) for count in (4_200, 9_000))
     assert many[: len(few)] == few
 
 

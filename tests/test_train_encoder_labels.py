@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import closing
 from math import atan, hypot, pi, radians, sin, tan
@@ -35,6 +36,7 @@ from tools.train.encoder_labels import (
     area_map,
     bearing_rad,
     label_shapes,
+    mirrored_label,
 )
 from tools.train.encoder_poses import quaternion_xyzw
 
@@ -259,3 +261,34 @@ def test_cells_of_the_floor_plan_know_their_area(grid: NavGrid) -> None:
     areas = area_map(SCENE, grid)
     assert areas[grid.cell(0.0, 0.0)] == 0 and areas[grid.cell(10.0, 1.0)] == 1
     assert set(np.unique(areas)) == {0, 1}
+
+
+def test_a_doorway_far_ahead_at_the_side_is_an_opening(twin: IdWorld) -> None:
+    walls = [each for each in SCENE.walls if each.label != "north"]
+    walls += [wall("north 1", (-2.0, 2.0), (4.5, 2.0)), wall("north 2", (5.7, 2.0), (12.0, 2.0))]
+    walls += [wall(f"side {x}", (x, 2.0), (x, 6.0)) for x in (2.0, 8.0)] + [wall("back", (2.0, 6.0), (8.0, 6.0))]
+    room = Area("room 2", "room", ((2.0, 2.0), (8.0, 2.0), (8.0, 6.0), (2.0, 6.0)), "office")
+    scene = dataclasses.replace(
+        SCENE, floor_max_m=(12.0, 6.0), walls=tuple(walls), areas=(*SCENE.areas, room), objects=()
+    )
+    robot = state(x=0.5, y=-0.5)
+    ids = np.zeros((PIXELS, PIXELS), np.uint16)
+    seen = SceneLabels(scene, robot_grid(scene, "go2"), SIDE).of(
+        ids, view_of(robot, twin.mount), np.zeros((0, RENDER_FIELDS)), (0.5, -0.5)
+    )
+    left = np.flatnonzero(seen["open_kind"][: COLUMNS // 2 - 2] == OPENINGS.index("room"))
+    assert len(left)
+    assert seen["open_m"][left] == pytest.approx(5.0, abs=1.0)
+
+
+def test_labels_of_the_mirrored_picture_are_those_of_the_mirrored_place(twin: IdWorld, grid: NavGrid) -> None:
+    there = labelled(twin, grid, state((3.0, 0.6, 0.4)))
+    mirrored = {name: mirrored_label(name, label) for name, label in there.items()}
+    assert np.array_equal(mirrored["main"], there["main"][:, ::-1])
+    assert np.array_equal(mirrored["free_m"], there["free_m"][::-1])
+    assert mirrored["place"] == there["place"]
+    facing, other = there["facing"][:, ::-1], mirrored["facing"]
+    assert np.array_equal(other == NONE, facing == NONE)
+    assert set((facing[facing != NONE].astype(int) + other[other != NONE]) % 8) == {0}
+    again = {name: mirrored_label(name, label) for name, label in mirrored.items()}
+    assert all(np.array_equal(again[name], label) for name, label in there.items())

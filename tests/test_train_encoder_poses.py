@@ -102,3 +102,14 @@ def test_a_body_sways_a_little_about_its_height(robot: str, height: float) -> No
     up = np.array([rotation_matrix(tuple(state[3:7]))[2, 2] for state in states])
     assert up.min() > 0.95
     assert (states[:, 2].std() > 0) == (robot == "go2")
+
+
+def test_most_poses_have_a_way_ahead(grid: NavGrid) -> None:
+    poses = Poses(SCENE, grid, np.random.default_rng(3))
+    drawn = [poses.draw(NOBODY) for _ in range(200)]
+    gone = np.arange(0.1, 2.05, 0.1)
+    blind = 0
+    for x, y, heading in drawn:
+        ways = [np.array((x, y)) + gone[:, None] * (np.cos(heading + a), np.sin(heading + a)) for a in (-0.6, 0.0, 0.6)]
+        blind += not any((grid.clearances_at(way) >= 0.2).all() for way in ways)
+    assert blind / len(drawn) < 0.25

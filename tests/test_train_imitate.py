@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +17,7 @@ from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.train_drives import MadeUpTokens, tiny_model
 from tests.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, trained
+from tests.train_stage_contract import Run, StageContract
 from tools.train.chain import Step, run_step
 from tools.train.drive import Dataset
 from tools.train.imitate import (
@@ -35,13 +32,12 @@ from tools.train.imitate import (
 from tools.train.imitate_eval import ImitateEvalConfig
 from tools.train.imitation_data import NoStates, SampleConfig, SampleError
 from tools.train.imitation_pupils import ExpertPupil, PointGoalPupil
-from tools.train.job import QuietProgress, StopFlag
-from tools.train.network_file import stage_weights
+from tools.train.job import StageJob
+from tools.train.network_file import finish_network, stage_weights
 from tools.train.optim import OptimConfig
 from tools.train.point_goal_net import PointGoalFileError, build_point_goal, load_point_goal
 from tools.train.recipe import load_recipe
 
-ROOT = Path(__file__).parents[1]
 LONG = dataclasses.replace(
     CONFIG,
     samples=16 * 120,
@@ -62,11 +58,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, dataset: Dataset) -> tuple[Any, list[dict[str, Any]]]:
-    """Weights and log of a run that nobody ended."""
-    job = imitate_job(tmp_path_factory.mktemp("whole"))
-    network, _ = trained(dataset, job)
-    return network.state_dict(), list(job.run_dir.lines())
+def whole(tmp_path_factory: pytest.TempPathFactory, dataset: Dataset) -> Run:
+    """A run that nobody ended."""
+    return run_of(dataset, imitate_job(tmp_path_factory.mktemp("whole")))
+
+
+def run_of(dataset: Dataset, job: StageJob) -> Run:
+    network, result = trained(dataset, job)
+    return Run(network.state_dict(), list(job.run_dir.lines()), result)
 
 
 def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_path: Path, dataset: Dataset) -> None:
@@ -82,98 +81,27 @@ def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_pat
     assert (job.run_dir.curves / "imitate_held_out.png").stat().st_size > 1000
 
 
-def test_all_of_the_action_expert_learns_and_nothing_else(whole: tuple[Any, list[dict[str, Any]]]) -> None:
+def test_all_of_the_action_expert_learns_and_nothing_else(whole: Run) -> None:
     before = build(tiny_model(), 1).state_dict()
-    moved = {name for name, tensor in whole[0].items() if not torch.equal(tensor, before[name])}
+    moved = {name for name, tensor in whole.weights.items() if not torch.equal(tensor, before[name])}
     parameters = {name for name, _ in build(tiny_model(), 1).named_parameters() if name.startswith("action.")}
     assert moved == parameters
 
 
-class StopAfter(QuietProgress):
-    """Asks to end after so many steps."""
-
-    def __init__(self, steps: int) -> None:
-        self.flag = StopFlag()
-        self._steps = steps
-
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        if done == self._steps:
-            self.flag.ask()
-
-
-@pytest.mark.parametrize("steps", [1, 3, 4])
-def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]], steps: int
-) -> None:
-    stopping = StopAfter(steps)
-    with pytest.raises(KeyboardInterrupt):
-        trained(dataset, imitate_job(tmp_path, progress=stopping, stop=stopping.flag))
-    job = imitate_job(tmp_path, resume=True)
-    assert [line["step"] for line in job.run_dir.lines()] == list(range(1, steps + 1))
-    network, _ = trained(dataset, job)
-    assert list(job.run_dir.lines()) == whole[1]
-    for name, tensor in network.state_dict().items():
-        assert torch.equal(tensor, whole[0][name]), name
-
-
-def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]]
-) -> None:
-    class Killed(QuietProgress):
-        def update(self, done: int, total: int, **numbers: float) -> None:
-            if done == 5:
-                raise OSError
-
-    with pytest.raises(OSError):
-        trained(dataset, imitate_job(tmp_path, progress=Killed()))
-    job = imitate_job(tmp_path, resume=True)
-    assert len(list(job.run_dir.lines())) == 5
-    trained(dataset, job)
-    assert list(job.run_dir.lines()) == whole[1]
-
-
-def test_a_finished_run_is_not_trained_again(tmp_path: Path, dataset: Dataset) -> None:
-    first, result = trained(dataset, imitate_job(tmp_path))
-    again, same = trained(dataset, imitate_job(tmp_path, resume=True))
-    assert result == same
-    assert all(torch.equal(tensor, again.state_dict()[name]) for name, tensor in first.state_dict().items())
-
-
-def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path, dataset: Dataset) -> None:
-    trained(dataset, imitate_job(tmp_path))
+class TestStage(StageContract):
+    rank = "tests.train_imitate_rank"
+    error = ImitateError
     other = dataclasses.replace(CONFIG, inject_delay=False)
-    with pytest.raises(ImitateError, match="another recipe"):
-        trained(dataset, imitate_job(tmp_path, other, resume=True))
 
+    @pytest.fixture(autouse=True)
+    def _drives(self, dataset: Dataset) -> None:
+        self._dataset = dataset
 
-def test_two_processes_have_the_loss_curve_of_one(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]]
-) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    fixed = {
-        "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-        "OMP_NUM_THREADS": "1",
-        "GLOO_SOCKET_IFNAME": "lo",
-    }
-    command = [sys.executable, "-m", "tests.train_imitate_rank", str(dataset.folder), str(tmp_path)]
-    ranks = [
-        subprocess.Popen(command, cwd=ROOT, env={**os.environ, **fixed, "RANK": str(rank), "LOCAL_RANK": str(rank)})
-        for rank in range(2)
-    ]
-    try:
-        assert [rank.wait(timeout=150) for rank in ranks] == [0, 0]
-    finally:
-        for rank in ranks:
-            rank.kill()
-    lines = list(imitate_job(tmp_path).run_dir.lines())
-    assert [line["step"] for line in lines] == [line["step"] for line in whole[1]]
-    for key in ("loss", "held_loss"):
-        expected = [line[key] for line in whole[1] if key in line]
-        assert [line[key] for line in lines if key in line] == pytest.approx(expected, rel=1e-3)
+    def prepare(self, out: Path) -> list[str]:
+        return [str(self._dataset.folder)]
+
+    def train(self, out: Path, config: ImitateConfig | None = None, **options: Any) -> Run:
+        return run_of(self._dataset, imitate_job(out, config or CONFIG, **options))
 
 
 def with_action(**changed: Any) -> TicVlaConfig:
@@ -254,6 +182,17 @@ def test_the_stage_reads_the_runs_drives_and_goes_on_after_a_round_of_dagger(tmp
     before, after = (load(stage_weights(tmp_path, name)) for name in ("imitate-0", "imitate"))
     name = "action.layers.0.fc1.weight"
     assert 0 < (after[name] - before[name]).abs().max() < 4e-3
+
+
+def test_imitation_goes_on_with_the_language_model_that_has_gone_on(tmp_path: Path) -> None:
+    side_dataset(tmp_path / "collect")
+    config = dataclasses.replace(CONFIG, samples=16, evaluate=ImitateEvalConfig(samples=4, batch=4))
+    job = imitate_job(tmp_path, config)
+    run_step(job, Step("imitate"))
+    finish_network(job, "sft", build(tiny_model(), 77))
+    run_step(job, Step("imitate", 1))
+    spoken, after = (load(stage_weights(tmp_path, name)) for name in ("sft", "imitate"))
+    assert all(torch.equal(after[name], tensor) for name, tensor in spoken.items() if name.startswith("language."))
 
 
 def load(path: Path) -> dict[str, torch.Tensor]:

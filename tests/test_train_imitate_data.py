@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.controller import arc_to
 from edge.geometry import SE2
 from edge.guidance import waypoints_now
 from export.model.config import TicVlaConfig
@@ -268,6 +269,22 @@ def test_texts_are_cut_anywhere_and_a_model_that_says_nothing_leaves_its_prompt(
     assert 0.1 < np.mean([length < whole for length, whole in some]) < 0.4
 
 
+def test_some_states_are_of_the_prompt_alone(dataset: Dataset) -> None:
+    states = SideStates(dataset)
+
+    def silent(config: SampleConfig) -> float:
+        samples = of(dataset, config)
+        told = [
+            group.guidance.shape[1] == states.at(samples.drives[chosen.drive].id, chosen.anchor).prompt_tokens
+            for chosen, group in drawn(samples, 400)
+        ]
+        return float(np.mean(told))
+
+    beside = silent(PLAIN)
+    assert silent(dataclasses.replace(PLAIN, prompt_only=1.0)) == 1.0
+    assert 0.1 < silent(dataclasses.replace(PLAIN, prompt_only=0.2)) - beside < 0.3
+
+
 def test_odometry_noise_grows_with_the_way_and_leaves_the_age(dataset: Dataset) -> None:
     samples = of(dataset, dataclasses.replace(PLAIN, offset_noise_m_per_m=0.05, offset_noise_deg_per_m=3.0))
     by_way: dict[bool, list[float]] = {False: [], True: []}
@@ -334,3 +351,15 @@ def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
         of(dataset, delays=late)
     with pytest.raises(DriveFramesError, match="10 to 50"):
         DriveFrames.of(dataset.load("left-a", pictures=False), 51, EVEN)
+
+
+def test_a_label_that_backs_off_stands_and_turns_as_the_expert_does() -> None:
+    drive = side_drive("left-a")
+    future = drive.future.copy()
+    future[7] = np.arange(1, 51)[:, None] * np.array((-0.02, -0.005, 0.04))
+    future[8] = np.arange(1, 51)[:, None] * np.array((0.05, 0.0, 0.0))
+    target = DriveFrames.of(dataclasses.replace(drive, future=future), 30, EVEN).target
+    assert not target[7, :, :2].any() and target[7, 9, 2] == pytest.approx(0.4)
+    np.testing.assert_allclose(target[8], future[8, :30])
+    command = arc_to(SE2(*map(float, target[7, 9])), 1.0)
+    assert command[0] == 0.0 and command[1] == pytest.approx(0.4)

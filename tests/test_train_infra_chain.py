@@ -68,9 +68,11 @@ def stage_that(leaves: str) -> Callable[[str], Callable[[StageJob], dict[str, An
 def test_all_goes_through_every_stage_with_imitation_again_after_each_round() -> None:
     recipe = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1))
     assert [step.name for step in steps_of("all", recipe)] == [
-        "collect", "encoder", "sft", "imitate", "dagger-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate",
+        "collect", "encoder", "sft", "imitate",
+        "dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate",
     ]  # fmt: skip
-    assert [step.name for step in steps_of("dagger", recipe)] == ["dagger-1", "imitate-1", "dagger-2", "imitate-2"]
+    silent = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1, sft_rounds=0))
+    assert [step.name for step in steps_of("dagger", silent)] == ["dagger-1", "imitate-1", "dagger-2", "imitate-2"]
     assert [step.name for step in steps_of("sft", recipe)] == ["sft"]
 
 

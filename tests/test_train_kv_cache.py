@@ -23,7 +23,10 @@ from tools.train.kv_cache import KvCache, KvCacheError
 
 CONTENT = NANO_TOKENIZER.read_bytes()
 TOKENS = MadeUpTokens()
-RIGHT = DrawConfig(waypoints_only=0.0, before_wrong=0.0, before_min_s=1.0, before_max_s=1.0)
+RIGHT = DrawConfig(
+    waypoints_only=0.0, before_wrong=0.0, before_min_s=1.0, before_max_s=1.0, before_late=0.0,
+    way_turn_rad=0.0, way_scale=0.0, way_point_m=0.0,
+)  # fmt: skip
 CONFIG = KvConfig(batch=3, max_new_tokens=4, words=RIGHT)
 ROUNDING = 4e-3
 
@@ -96,6 +99,15 @@ def test_a_state_with_its_own_text_is_of_that_text(
         upto = state.prompt_tokens
         assert upto == truth.prompt_tokens
         np.testing.assert_allclose(state.kv[:upto], truth.kv[:upto], atol=ROUNDING)
+
+
+def test_a_policys_drive_has_a_share_of_its_own_words_for_itself(tmp_path: Path, network: TicVla) -> None:
+    drives = [made_up_drive("a", 40), made_up_drive("b", 40, driver="policy:0123")]
+    theirs = dataclasses.replace(CONFIG, own_share=0.0, own_share_policy=1.0)
+    dataset = write_dataset(tmp_path / "drives", drives)
+    states = made(tmp_path, network, dataset, theirs)
+    assert not any(states.at("a", k).own for k in states.anchors("a"))
+    assert all(states.at("b", k).own for k in states.anchors("b"))
 
 
 def test_draws_of_an_anchor_differ_and_none_depends_on_how_many_there_are(

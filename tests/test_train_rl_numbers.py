@@ -16,7 +16,7 @@ from edge.controller import arc_to, limit_share
 from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.policies import robot_config
-from tools.train.command_policy import CommandLimits, command_mean, entropy, log_prob
+from tools.train.command_policy import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
 from tools.train.gae import advantages
 from tools.train.ppo import PpoConfig, PpoOptimiser
 
@@ -72,6 +72,25 @@ def test_the_gradient_of_the_mean_is_finite_wherever_the_target_is() -> None:
     trajectory.requires_grad_()
     command_mean(trajectory, 0.1, CommandLimits(1.0, 1.0)).sum().backward()
     assert trajectory.grad is not None and bool(torch.isfinite(trajectory.grad).all())
+
+
+def test_a_plan_beyond_the_limit_of_speed_can_be_taught_to_go_slower() -> None:
+    trajectory = torch.zeros(1, 30, 3)
+    trajectory[0, 9, 0] = 2.0
+    trajectory.requires_grad_()
+    limits = CommandLimits(1.0, 1.0)
+    speed = command_mean(trajectory, 0.1, limits)[0, 0]
+    speed.backward()
+    assert float(speed.detach()) == 1.0
+    assert trajectory.grad is not None and float(trajectory.grad[0, 9, 0]) > 0.1
+
+
+def test_an_arc_is_not_limited_and_its_command_is() -> None:
+    trajectory = torch.zeros(2, 30, 3)
+    trajectory[:, 9, 0] = torch.tensor([3.0, 0.5])
+    arc = arc_command(trajectory, 0.1)
+    assert arc[:, 0].tolist() == pytest.approx([3.0, 0.5])
+    assert within_limits(arc, CommandLimits(1.0, 1.0))[:, 0].tolist() == pytest.approx([1.0, 0.5])
 
 
 def _limits() -> LimitsConfig:

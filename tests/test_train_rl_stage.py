@@ -18,6 +18,7 @@ from tools.train.ppo import PpoConfig
 from tools.train.recipe import Recipe
 from tools.train.rl import STAGE, RlConfig, RlError, improve, run
 from tools.train.rl_learners import TailLearner
+from tools.train.rl_state import Score, State
 from tools.train.rl_worker import RolloutOrder
 from tools.train.run_dir import RunDir
 
@@ -37,6 +38,9 @@ def _imitated(job: StageJob) -> Path:
     return finish_network(job, "imitate", _network())
 
 
+FINAL = {"final-start": -1, "final-best": -2}
+
+
 def _driver(network: TicVla, success: Callable[[int], bool], stop: tuple[StopFlag, int] | None = None) -> Any:
     """Rollouts by the number of the call; evaluations succeed as `success` of their iteration says."""
     calls = 0
@@ -48,7 +52,7 @@ def _driver(network: TicVla, success: Callable[[int], bool], stop: tuple[StopFla
             raise KeyboardInterrupt
         folder = Path(order.out)
         folder.mkdir(parents=True, exist_ok=True)
-        iteration = int(folder.name.split("-")[-1])
+        iteration = FINAL.get(folder.name) or int(folder.name.split("-")[-1])
         steps, end = _episode(network, 8, order.seed % 97, reward=0.3)
         if not order.explore:
             end = rollout.EpisodeEnd(**{**vars(end), "success": success(iteration)})
@@ -75,13 +79,14 @@ def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) ->
     assert result["iterations"] == 4 and result["steps"] == 32
 
 
-def test_a_run_that_was_ended_goes_on_exactly(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ended", [4, 9])  # in between, and before the last call: the best on fresh scenarios
+def test_a_run_that_was_ended_goes_on_exactly(ended: int, tmp_path: Path) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=1, ppo=PPO, fall_back=1.0)
-    whole, result = _improved(tmp_path / "whole", config, _driver(_network(), lambda k: k == 4))
+    whole, result = _improved(tmp_path / "whole", config, _driver(_network(), lambda k: k in (4, -2)))
     with pytest.raises(KeyboardInterrupt):
-        _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k == 4, (StopFlag(), 4)))
-    parts, again = _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k == 4), resume=True)
-    assert again == result
+        _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k in (4, -2), (StopFlag(), ended)))
+    parts, again = _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k in (4, -2)), resume=True)
+    assert again == result and result["kept"] == "best"
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, parts.state_dict()[name]), name
 
@@ -95,6 +100,63 @@ def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
     assert tails and all(torch.equal(network.state_dict()[name], began[name]) for name in tails)
     (last,) = [line for line in RunDir(tmp_path).lines() if line["step"] == 2]
     assert last["fell_back"] == 1.0
+
+
+def test_what_fell_back_goes_on_with_new_moments(tmp_path: Path) -> None:
+    job = _job(tmp_path, RlConfig(ppo=PPO))
+    state = State(job, TailLearner(_network(), LIMITS, (-1.0, -1.0)), RlConfig(ppo=PPO, fall_back=0.1))
+    state.best = Score(0.8, 0.1, 0.5)
+    state.begin()
+    before = state.optimiser
+    assert not state.judge(Score(0.72, 0.1, 0.5)) and state.optimiser is before
+    assert state.judge(Score(0.6, 0.1, 0.5)) and state.optimiser is not before
+
+
+def test_more_success_by_less_than_the_margin_is_luck(tmp_path: Path) -> None:
+    config = RlConfig(ppo=PPO, keep_margin=0.06)
+    state = State(_job(tmp_path, config), TailLearner(_network(), LIMITS, (-1.0, -1.0)), config)
+    state.best = Score(0.5, 0.2, 0.4)
+    state.begin()
+    state.judge(Score(0.55, 0.0, 0.5))
+    assert not state.improved and state.best.success == 0.5
+    state.judge(Score(0.57, 0.2, 0.5))
+    assert state.improved and state.best.success == 0.57
+
+
+def test_success_counts_first_and_collisions_where_it_is_no_less() -> None:
+    some = Score(0.5, 0.2, 0.4)
+    assert Score(0.6, 0.9, 0.4).ahead_of(some) and not Score(0.4, 0.0, 0.4).ahead_of(some)
+    assert Score(0.5, 0.1, 0.4).ahead_of(some) and not Score(0.5, 0.1, 0.4).ahead_of(some, by=0.1)
+    assert not some.ahead_of(some)
+
+
+@pytest.mark.parametrize(("fresh", "kept"), [((-2,), "best"), ((-1,), "start"), ((-1, -2), "start"), ((), "start")])
+def test_the_best_is_kept_only_if_it_is_ahead_on_fresh_scenarios(
+    fresh: tuple[int, ...], kept: str, tmp_path: Path
+) -> None:
+    config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
+    network, result = _improved(tmp_path, config, _driver(_network(), lambda k: k == 2 or k in fresh))
+    began, now = _network().state_dict(), network.state_dict()
+    same = all(torch.equal(now[name], began[name]) for name in began if name.startswith("action."))
+    assert result["kept"] == kept and same == (kept == "start")
+    assert set(result["final"]) == {"start", "best"}
+
+
+def test_what_chooses_and_what_decides_are_other_scenarios_and_spread_over_layouts(tmp_path: Path) -> None:
+    orders: list[RolloutOrder] = []
+    driver = _driver(_network(), lambda k: k == 2)
+
+    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
+        orders.append(order)
+        return driver(order, **told)
+
+    config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, final_episodes=5)
+    _improved(tmp_path, config, drive)
+    explored = {order.scenario_seed for order in orders if order.explore}
+    looked = [order for order in orders if not order.explore]
+    by_seed = {order.scenario_seed: len(order.numbers) for order in looked}
+    assert len(by_seed) == 2 and set(by_seed.values()) == {24, 5} and not explored & set(by_seed)
+    assert {order.tasks_per_scene for order in looked} == {2}
 
 
 def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> None:

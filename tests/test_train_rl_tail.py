@@ -196,3 +196,19 @@ def test_a_penalty_on_leaving_the_imitated_commands_is_zero_where_nothing_has_mo
     with torch.no_grad():
         network.action.out.bias += 0.01
     assert float(learner.act(torch.arange(4))[2].detach()) > 0.0
+
+
+def test_a_plan_that_leaves_beyond_the_limits_pays_though_its_command_is_the_same(tmp_path: Path) -> None:
+    network = _network()
+    with torch.no_grad():  # straight ahead, faster than the robot can
+        network.action.out.weight.zero_()
+        network.action.out.bias.copy_(torch.tensor([0.3, 0.0, 0.0]).repeat(len(network.action.out.bias) // 3))
+    learner = TailLearner(network, LIMITS, (-1.0, -1.0), imitation=1.0)
+    learner.take(_rollout(network, tmp_path))
+    rows = torch.arange(4)
+    with torch.no_grad():
+        before, asked = learner.means(rows), learner.arcs(rows)
+        assert float(asked[:, 0].min()) > LIMITS.vx_max_mps
+        network.action.out.bias *= 2.0
+        assert torch.allclose(learner.means(rows), before, atol=1e-5)
+    assert float(learner.act(rows)[2].detach()) > 0.0

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import socket
-import subprocess
-import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,16 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
+from tokenizers import Tokenizer
 
 from export.model.network import build
-from tests.train_drives import made_up_drive, small_dataset, tiny_model, write_dataset
+from export.model.tokenizer import NANO_TOKENIZER
+from tests.train_drives import MadeUpTokens, made_up_drive, small_dataset, tiny_model, write_dataset
 from tests.train_sft_rank import CONFIG, sft_job, trained
+from tests.train_stage_contract import Run, StageContract
+from tools.train.anchors import Prompts, anchors_of
+from tools.train.chain import Step, run_step
 from tools.train.drive import Dataset
-from tools.train.job import QuietProgress, StopFlag
+from tools.train.job import StageJob
+from tools.train.mirror import Views
+from tools.train.network_file import stage_weights
 from tools.train.optim import OptimConfig
-from tools.train.sft import SftConfig, SftError, run
-
-ROOT = Path(__file__).parents[1]
+from tools.train.sft import Samples, SftConfig, SftError, run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,11 +46,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, dataset: Dataset) -> tuple[Any, list[dict[str, Any]]]:
-    """Weights and log of a run that nobody ended."""
-    job = sft_job(tmp_path_factory.mktemp("whole"))
-    network, _ = trained(dataset, job)
-    return network.state_dict(), list(job.run_dir.lines())
+def whole(tmp_path_factory: pytest.TempPathFactory, dataset: Dataset) -> Run:
+    """A run that nobody ended."""
+    return run_of(dataset, sft_job(tmp_path_factory.mktemp("whole")))
+
+
+def run_of(dataset: Dataset, job: StageJob) -> Run:
+    network, result = trained(dataset, job)
+    return Run(network.state_dict(), list(job.run_dir.lines()), result)
 
 
 def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Path, dataset: Dataset) -> None:
@@ -62,111 +68,37 @@ def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Pat
 
 
 def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
-    whole: tuple[Any, list[dict[str, Any]]],
+    whole: Run,
 ) -> None:
     before = build(tiny_model(), 1).state_dict()
-    moved = {name for name, tensor in whole[0].items() if not torch.equal(tensor, before[name])}
+    moved = {name for name, tensor in whole.weights.items() if not torch.equal(tensor, before[name])}
     assert {name.split(".")[0] for name in moved} == {"language"}
     assert {"language.merge.1.weight", "language.embed.weight", "language.lm_head.weight"} <= moved
 
 
-class StopAfter(QuietProgress):
-    """Asks to end after so many steps."""
+class TestStage(StageContract):
+    rank = "tests.train_sft_rank"
+    error = SftError
+    other = dataclasses.replace(CONFIG, batch=7)
 
-    def __init__(self, steps: int) -> None:
-        self.flag = StopFlag()
-        self._steps = steps
+    @pytest.fixture(autouse=True)
+    def _drives(self, dataset: Dataset) -> None:
+        self._dataset = dataset
 
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        if done == self._steps:
-            self.flag.ask()
+    def prepare(self, out: Path) -> list[str]:
+        return [str(self._dataset.folder)]
 
-
-@pytest.mark.parametrize("steps", [1, 3, 5])
-def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]], steps: int
-) -> None:
-    stopping = StopAfter(steps)
-    with pytest.raises(KeyboardInterrupt):
-        trained(dataset, sft_job(tmp_path, progress=stopping, stop=stopping.flag))
-    job = sft_job(tmp_path, resume=True)
-    assert [line["step"] for line in job.run_dir.lines()] == list(range(1, steps + 1))
-    network, _ = trained(dataset, job)
-    assert list(job.run_dir.lines()) == whole[1]
-    for name, tensor in network.state_dict().items():
-        assert torch.equal(tensor, whole[0][name]), name
+    def train(self, out: Path, config: SftConfig | None = None, **options: Any) -> Run:
+        return run_of(self._dataset, sft_job(out, config or CONFIG, **options))
 
 
-def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]]
-) -> None:
-    class Killed(QuietProgress):
-        def update(self, done: int, total: int, **numbers: float) -> None:
-            if done == 5:
-                raise OSError
-
-    with pytest.raises(OSError):
-        trained(dataset, sft_job(tmp_path, progress=Killed()))
-    job = sft_job(tmp_path, resume=True)
-    assert len(list(job.run_dir.lines())) == 5
-    trained(dataset, job)
-    assert list(job.run_dir.lines()) == whole[1]
-
-
-def test_a_finished_run_is_not_trained_again(tmp_path: Path, dataset: Dataset) -> None:
-    one = dataclasses.replace(CONFIG, epochs=1)
-    first, result = trained(dataset, sft_job(tmp_path, one))
-    again, same = trained(dataset, sft_job(tmp_path, one, resume=True))
-    assert result == same
-    assert all(torch.equal(tensor, again.state_dict()[name]) for name, tensor in first.state_dict().items())
-
-
-def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path, dataset: Dataset) -> None:
-    one = dataclasses.replace(CONFIG, epochs=1)
-    trained(dataset, sft_job(tmp_path, one))
-    with pytest.raises(SftError, match="another recipe"):
-        trained(dataset, sft_job(tmp_path, dataclasses.replace(one, batch=7), resume=True))
-
-
-def test_bfloat16_gives_about_the_same_losses(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]]
-) -> None:
+def test_bfloat16_gives_about_the_same_losses(tmp_path: Path, dataset: Dataset, whole: Run) -> None:
     half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
     job = sft_job(tmp_path, half)
     trained(dataset, job)
     losses = [line["loss"] for line in job.run_dir.lines()]
-    assert losses == pytest.approx([line["loss"] for line in whole[1]], rel=0.02)
-    assert losses != [line["loss"] for line in whole[1]]
-
-
-def test_two_processes_have_the_loss_curve_of_one(
-    tmp_path: Path, dataset: Dataset, whole: tuple[Any, list[dict[str, Any]]]
-) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    fixed = {
-        "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-        "OMP_NUM_THREADS": "1",
-        "GLOO_SOCKET_IFNAME": "lo",
-    }
-    command = [sys.executable, "-m", "tests.train_sft_rank", str(dataset.folder), str(tmp_path)]
-    ranks = [
-        subprocess.Popen(command, cwd=ROOT, env={**os.environ, **fixed, "RANK": str(rank), "LOCAL_RANK": str(rank)})
-        for rank in range(2)
-    ]
-    try:
-        assert [rank.wait(timeout=240) for rank in ranks] == [0, 0]
-    finally:
-        for rank in ranks:
-            rank.kill()
-    lines = list(sft_job(tmp_path).run_dir.lines())
-    assert [line["step"] for line in lines] == [line["step"] for line in whole[1]]
-    for key in ("loss", "held_loss"):
-        expected = [line[key] for line in whole[1] if key in line]
-        assert [line[key] for line in lines if key in line] == pytest.approx(expected, rel=1e-3)
+    assert losses == pytest.approx([line["loss"] for line in whole.lines], rel=0.02)
+    assert losses != [line["loss"] for line in whole.lines]
 
 
 def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
@@ -184,6 +116,26 @@ def test_the_stage_reads_the_runs_drives_and_leaves_the_runs_network(tmp_path: P
     assert result["held_out"]["taught"]["answers"] == 2 and result["held_out"]["own"]["answers"] == 4
     assert [line["progress_share"] for line in job.run_dir.lines() if "progress_share" in line] == [0.0]
     assert (tmp_path / "sft" / "model.safetensors").read_bytes() == job.run_dir.model_path.read_bytes()
+
+
+def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=2, evaluate=silent, go_on_share=0.5, go_on_lr_share=0.1))
+    steps = run_step(job, Step("sft"))["steps"]
+    assert run_step(job, Step("sft", 1))["steps"] == steps / 2
+    before, after = (load_file(stage_weights(tmp_path, name)) for name in ("sft-0", "sft"))
+    name = "language.layers.0.down.weight"
+    assert 0 < (after[name] - before[name]).abs().max() < steps * CONFIG.optim.lr * 0.1
+
+
+def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> None:
+    anchors = [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in anchors_of(drive)]
+    prompts = Prompts(Tokenizer.from_file(str(NANO_TOKENIZER)), tiny_model())
+    samples = Samples(anchors, prompts, Views(MadeUpTokens()), CONFIG.words, deciding=3)
+    shown = Counter(sample.anchor for sample in samples.draw(np.random.default_rng(0)))
+    assert {anchors[i].decides for i in shown} == {True, False}
+    assert all(count == (3 if anchors[i].decides else 1) for i, count in shown.items()) and len(shown) == len(anchors)
 
 
 def test_the_recipes_numbers_are_checked() -> None:

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from sim_hil.benchmark.worker_process import worker_main
 from tools.train.drive import About, Drive, Entry
-from tools.train.workers import worker_main
 
 BEGUN = "begun.txt"
 

@@ -28,6 +28,7 @@ CONFIG = SftConfig(
     words=DrawConfig(waypoints_only=0.3),
     optim=OptimConfig(lr=3e-3, warmup_steps=0),
     held_anchors=5,
+    deciding=1,
     checkpoint_steps=2,
     evaluate=EvalConfig(anchors=0, epoch_anchors=0, drives=0),
 )

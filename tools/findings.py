@@ -34,7 +34,7 @@ from sim_hil.benchmark.store import StoreError, read_results
 from sim_hil.scene import SceneError
 from tools.benchmark_runs import RESULT, RunsError, read_result, run_episodes
 from tools.findings_report import write_findings
-from tools.findings_rows import ROWS, RUNS, runs_of
+from tools.findings_rows import ROWS, RUNS, Finding, Level, claims_of, runs_of
 from tools.findings_verdict import judge_all
 
 COMMAND: Final = "findings"
@@ -44,8 +44,10 @@ EXAMPLES: Final = """examples:
   python -m tools.findings --artifacts out/nano --out out/findings --rows score,words,wordings   # one model alone
   python -m tools.findings --artifacts out/models --out out/findings --latency profile:orin.latency.json --dry-run
 
---artifacts holds a folder a model, made by edge-export: rl (shipped), no-rl (before PPO), no-latency, no-motion-offset,
-waypoints. Rows whose models are not there are named in the report. Run it again to go on where it stopped.
+--artifacts holds a folder a model, made by edge-export: rl (shipped), no-rl (before PPO), and of `edge-train imitate
+--from`: full, no-latency, no-motion-offset, waypoints, no-reasoning. Rows whose models are not there, or are the same,
+are named in the report. --suite takes the file that `edge-train evaluate` makes (RUN/evaluate/training.toml) too. Run
+it again to go on where it stopped.
 exit codes: 0 done (whatever holds), 1 an episode has no result, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
@@ -54,11 +56,15 @@ _BAD_INPUT = (ConditionsError, LatencyError, SuiteError, SceneError, StoreError,
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs that can be done, by name, where each goes (the same conditions are run once), and why others cannot."""
+    """Runs that can be done, by name, where each goes (the same conditions are run once), and why others cannot.
+
+    `claims`: what is to be judged by them.
+    """
 
     conditions: Mapping[str, Conditions]
     folders: Mapping[str, str]
     missing: Mapping[str, str]
+    claims: Sequence[Finding | Level]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -110,6 +116,7 @@ def _main(args: argparse.Namespace) -> int:
         return EXIT_DONE
     args.out.mkdir(parents=True, exist_ok=True)
     broken: list[RunsError] = []
+    unfit: dict[str, str] = {}
     try:
         with stop_flag() as stop:
             for name in dict.fromkeys(plan.folders.values()):
@@ -118,10 +125,13 @@ def _main(args: argparse.Namespace) -> int:
                 except RunsError as error:  # the other runs still tell
                     broken.append(error)
                     _say(str(error))
+                except ConditionsError as error:  # not of this suite, or not by this model
+                    unfit[name] = str(error)
+                    _say(f"{name}: {error}")
     except KeyboardInterrupt:
-        _report(args, plan, base, len(episodes))
+        _report(args, plan, base, len(episodes), unfit)
         raise
-    result = _report(args, plan, base, len(episodes))
+    result = _report(args, plan, base, len(episodes), unfit)
     write_result(args.json, result)
     if args.json != "-":
         for each in result["findings"]:
@@ -146,9 +156,10 @@ def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile) -> Plan:
     """What can be run of some rows."""
     conditions: dict[str, Conditions] = {}
     folders: dict[str, str] = {}
-    missing: dict[str, str] = {}
+    claims, left_out = claims_of(root)
+    missing = {row: why for row, why in left_out.items() if row.removeprefix("row ") in rows}
     by_conditions: dict[str, str] = {}
-    for name in runs_of(rows):
+    for name in runs_of(rows, claims):
         try:
             asked = RUNS[name].conditions(root, base)
         except ConditionsError as error:
@@ -156,7 +167,7 @@ def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile) -> Plan:
             continue
         conditions[name] = asked
         folders[name] = by_conditions.setdefault(json.dumps(asked.as_json(), sort_keys=True), name)
-    return Plan(conditions, folders, missing)
+    return Plan(conditions, folders, missing, claims)
 
 
 def plan_lines(plan: Plan, episodes: int) -> list[str]:
@@ -188,7 +199,9 @@ def _run(
     _say(f"{name}: done in {duration((time.monotonic_ns() - started_ns) / 1e9)}")
 
 
-def _report(args: argparse.Namespace, plan: Plan, base: LatencyProfile, asked: int) -> dict[str, Any]:
+def _report(
+    args: argparse.Namespace, plan: Plan, base: LatencyProfile, asked: int, unfit: Mapping[str, str]
+) -> dict[str, Any]:
     """Of all runs that are whole by now."""
     results: dict[str, list[EpisodeResult]] = {}
     missing, trained = dict(plan.missing), True
@@ -197,7 +210,7 @@ def _report(args: argparse.Namespace, plan: Plan, base: LatencyProfile, asked: i
         found = read_results(path) if path.is_dir() else []
         told = read_result(path) if (path / RESULT).is_file() else {"summary": {"finished": False}}
         if not found or not told["summary"]["finished"]:
-            missing[name] = f"{len(found)} of {asked} episodes so far"
+            missing[name] = unfit.get(folder, f"{len(found)} of {asked} episodes so far")
             continue
         results[name] = found
         trained = trained and bool(told["trained"])
@@ -210,7 +223,7 @@ def _report(args: argparse.Namespace, plan: Plan, base: LatencyProfile, asked: i
         "trained": trained,
     }
     described = {name: plan.conditions[name].describe() for name in results}
-    return write_findings(args.out, about, judge_all(results), results, described, missing)
+    return write_findings(args.out, about, judge_all(results, plan.claims), results, described, missing)
 
 
 def _say(line: str) -> None:

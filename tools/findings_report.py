@@ -24,6 +24,13 @@ Each run drives the same episodes; a difference is taken episode by episode. Int
 bootstraps over tasks and their episodes (10 000 resamples, seeded). A claim *holds* when its whole interval is on its
 side of the bound, *does not hold* when its whole interval is on the other, and is *undecided* in between. All numbers
 are measured.
+
+Every model was trained once, from one seed. Intervals are of episodes, not of trainings: two trainings of the same
+network differ too. Ablations are compared with `full`, which has the same drives, encoder, language model and amount of
+imitation.
+
+Of the claims about PPO the one over 3 to 5 s, all of them together, is the primary one. Those at one latency are shown
+beside it; with five of them one may hold by chance.
 """
 
 

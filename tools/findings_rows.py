@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from edge.artifact_files import MANIFEST_NAME
+from edge.artifact_files import MANIFEST_NAME, ArtifactError, read_manifest
 from sim_hil.benchmark.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.latency import LatencyProfile
 from sim_hil.benchmark.variants import artifact_directory
 
 AFTER, BEFORE = "rl", "no-rl"
 """Folders of the shipped model and of the same one before reinforcement (docs/benchmark.md)."""
+WHOLE, SILENT = "full", "no-reasoning"
+"""Folders of the network as it is, trained as its ablations are, and of one trained on prompts without reasoning."""
 SWEEP_S: Final = (1, 2, 3, 4, 5)
 LONG_S: Final = (3, 4, 5)
 SWAP_SEED: Final = 1
@@ -70,6 +72,8 @@ class Finding:
     metric: str = "sr"
     least: float = 0.0
     minus: tuple[Pair, ...] = ()
+    instead_of: tuple[str, ...] = ()
+    """Folders of models: judged only where one of them is not there, in place of a claim about them."""
 
     @property
     def runs(self) -> tuple[str, ...]:
@@ -104,7 +108,8 @@ RUNS: Final = MappingProxyType(
         "rl-severe-drift": Run(AFTER, drift="severe"),
         "rl-swapped": Run(AFTER, swap=SWAP_SEED),
         "rl-training-words": Run(AFTER, wordings="training"),
-        "no-rl": Run(BEFORE),
+        "full": Run(WHOLE),
+        "no-reasoning": Run(SILENT, mode="no-reasoning"),
         "no-latency": Run("no-latency"),
         "no-motion-offset": Run("no-motion-offset"),
         "waypoints": Run("waypoints"),
@@ -122,11 +127,11 @@ CLAIMS: Final[Sequence[Finding | Level]] = (
     Level("score", "CR of the shipped model is at most 28 %", "Table 1", "rl", "cr", 28.0, -1),
     Level("score", "SPL of the shipped model is at least 50 %", "Table 1", "rl", "spl", 50.0),
     Finding("async", "asynchronous inference beats synchronous", "Table 1", (("rl-sync", "rl"),)),
-    Finding("latency", "trained with latency beats trained without", "Table 2", (("no-latency", "no-rl"),)),
-    Finding("interface", "keys and values guide better than waypoints", "Table 2", (("waypoints", "no-rl"),)),
-    Finding("offset", "with motion offset beats without", "Table 6", (("no-motion-offset", "no-rl"),)),
-    *(Finding("rl", f"after PPO beats before, at {s} s", "Figure 5", (_SWEEP[s],)) for s in SWEEP_S),
+    Finding("latency", "trained with latency beats trained without", "Table 2", (("no-latency", "full"),)),
+    Finding("interface", "keys and values guide better than waypoints", "Table 2", (("waypoints", "full"),)),
+    Finding("offset", "with motion offset beats without", "Table 6", (("no-motion-offset", "full"),)),
     Finding("rl", "after PPO beats before, over 3 to 5 s", "Figure 5", tuple(_SWEEP[s] for s in LONG_S)),
+    *(Finding("rl", f"after PPO beats before, at {s} s", "Figure 5", (_SWEEP[s],)) for s in SWEEP_S),
     Finding(
         "rl",
         "PPO gains more at 3 to 5 s than at 1 to 2 s",
@@ -134,7 +139,11 @@ CLAIMS: Final[Sequence[Finding | Level]] = (
         tuple(_SWEEP[s] for s in LONG_S),
         minus=tuple(_SWEEP[s] for s in _SHORT_S),
     ),
-    Finding("reasoning", "with reasoning beats without", "Table 4", (("rl-no-reasoning", "rl"),)),
+    Finding("reasoning", "trained with reasoning beats trained without", "Table 4", (("no-reasoning", "full"),)),
+    Finding(
+        "reasoning", "the shipped model with reasoning beats itself without", "Table 4", (("rl-no-reasoning", "rl"),),
+        instead_of=(WHOLE, SILENT),
+    ),
     Finding(
         "drift", "typical drift costs less than 10 points of SR", "Table 14", (("rl", "rl-typical-drift"),),
         least=DRIFT_LEAST,
@@ -153,13 +162,48 @@ EXTRA: Final = MappingProxyType({"drift": ("rl-severe-drift",), "ceiling": ("exp
 ROWS: Final = tuple(dict.fromkeys([*(claim.row for claim in CLAIMS), *EXTRA]))
 
 
-def runs_of(rows: Sequence[str]) -> list[str]:
+def runs_of(rows: Sequence[str], claims: Sequence[Finding | Level] = CLAIMS) -> list[str]:
     """Names of all runs of some rows, in the rows' order."""
     names: list[str] = []
     for row in rows:
-        names += [name for claim in CLAIMS if claim.row == row for name in claim.runs]
+        names += [name for claim in claims if claim.row == row for name in claim.runs]
         names += EXTRA.get(row, ())
     return list(dict.fromkeys(names))
+
+
+def claims_of(root: Path) -> tuple[list[Finding | Level], dict[str, str]]:
+    """Claims that can be made about the models in `root`, and why others cannot, by their row."""
+    claims: list[Finding | Level] = []
+    left_out: dict[str, str] = {}
+    for claim in CLAIMS:
+        if isinstance(claim, Finding):
+            if claim.instead_of and all((root / name / MANIFEST_NAME).is_file() for name in claim.instead_of):
+                continue
+            alike = next((pair for pair in (*claim.pairs, *claim.minus) if _same_run(root, pair)), None)
+            if alike is not None:
+                one, other = (RUNS[name].variant for name in alike)
+                left_out[f"row {claim.row}"] = f"{one} and {other} have the same weights: there is nothing to compare"
+                continue
+        claims.append(claim)
+    return claims, left_out
+
+
+def _same_run(root: Path, pair: Pair) -> bool:
+    """Whether two runs differ in nothing but the name of their model."""
+    one, other = (RUNS[name] for name in pair)
+    if None in (one.variant, other.variant) or replace(one, variant=other.variant) != other:
+        return False
+    graphs = [_graphs(root / str(run.variant)) for run in (one, other)]
+    return bool(graphs[0]) and graphs[0] == graphs[1]
+
+
+def _graphs(directory: Path) -> dict[str, str]:
+    """Hashes of what a model computes with, by file; none where its manifest tells none. Exports are byte-identical."""
+    try:
+        files = read_manifest(directory).get("files", {})
+        return {name: str(file["sha256"]) for name, file in files.items() if not name.startswith("report.")}
+    except (ArtifactError, OSError, AttributeError, KeyError, TypeError):
+        return {}
 
 
 def at_mean(base: LatencyProfile, mean_s: float) -> LatencyProfile:

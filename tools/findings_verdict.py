@@ -55,9 +55,9 @@ def verdict_of(interval: Range | None, least: float) -> str:
     return FAILS if interval[1] < least else OPEN
 
 
-def judge_all(results: Results) -> list[Judged]:
+def judge_all(results: Results, claims: Sequence[Finding | Level] = CLAIMS) -> list[Judged]:
     """Every claim whose runs are all there."""
-    return [judge(claim, results) for claim in CLAIMS if all(results.get(name) for name in claim.runs)]
+    return [judge(claim, results) for claim in claims if all(results.get(name) for name in claim.runs)]
 
 
 def judge(claim: Finding | Level, results: Results) -> Judged:

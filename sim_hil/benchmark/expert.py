@@ -53,12 +53,14 @@ class ExpertPolicy:
     needs_image = False
 
     def __init__(
-        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = ()
+        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (), patient: bool = False
     ) -> None:  # fmt: skip
         """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
 
         `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
+        `patient`: it keeps its distance to people even after standing long, for it is its pupil that stands.
         """
+        self._patient = patient
         self._told = told
         self._margin_m = margin_m
         self._speed_mps = speed_mps
@@ -133,7 +135,7 @@ class ExpertPolicy:
     def _patience(self) -> float:
         """1 while it comes on; less and less, down to 0.3, the longer it is stuck."""
         ticks = round(_STUCK_S / CONTROL_S)
-        if len(self._left) <= ticks:
+        if self._patient or len(self._left) <= ticks:
             return 1.0
         stuck = 0
         for back in range(ticks, len(self._left), ticks):
@@ -145,7 +147,7 @@ class ExpertPolicy:
     def plan(self, times_s: Sequence[float] = PLAN_TIMES_S) -> list[Vec2]:
         """Where it means to be at these times from now, m in the base frame (x forward, y left); costs next to nothing.
 
-        Until the end of the future it has chosen, that; then the way ahead at the comfortable speed.
+        Along its way, at the comfortable speed as soon as it can be reached: where to go, not how to pass people.
         """
         world, driving = self._running(), self._driving
         pose = world.pose()

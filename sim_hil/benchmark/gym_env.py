@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode, load_suite
 from sim_hil.benchmark.observation import Observation
-from sim_hil.benchmark.reward import PAPER, RewardWeights, reward
+from sim_hil.benchmark.reward import PAPER, Contacts, RewardWeights, reward
 from sim_hil.benchmark.robots import robot_grid
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
 from sim_hil.nav_grid import NavGrid
@@ -106,7 +106,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self._close_world()
         self._world = EpisodeWorld(episode, self._options, scene=self._scenes.get(episode.scene))
         self._instruction = episode.instructions[wording % len(episode.instructions)]
-        self._collisions: frozenset[str] = frozenset()
+        self._contacts = Contacts()
         self._grid = self._grid_of(self._world)
         self._field = self._grid.distance_field(episode.goal_xy)
         self._left_m = self._way_m(float("nan"))
@@ -121,17 +121,16 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         vx, vy, wz = (float(v) for v in np.clip(action, LOW, HIGH))
         before, left_before_m = world.pose(), self._left_m
         world.step((vx, vy, wz))
-        after, touching = world.pose(), world.touching
+        after = world.pose()
         self._left_m = self._way_m(left_before_m)
         value = reward(
             reached=world.end == "reached",
             distance_before_m=left_before_m,
             distance_after_m=self._left_m,
-            collision_began=bool(touching - self._collisions),
+            collision_began=self._contacts.began(world.touching),
             speed_mps=10.0 * hypot(after.x_m - before.x_m, after.y_m - before.y_m),
             weights=self._weights,
         )
-        self._collisions = touching
         return self._observed(), value, world.end in ("reached", "fell"), world.end == "timeout", self._info()
 
     def _grid_of(self, world: EpisodeWorld) -> NavGrid:

@@ -1,14 +1,19 @@
 """The paper's reward, equation 5, as a pure function of one control step; weights and target speed from appendix D.
 
 The paper names the four terms but does not write them out. Ours: goal is 1 in the step that reaches it; progress is
-how much shorter the way to the goal, round walls and things, became, m; collision is 1 in a step in which one begins;
-speed is how far the speed is off the target, m/s.
+how much shorter the way to the goal, round walls and things, became, m; collision is 1 in a step in which one begins
+(`Contacts`); speed is how far the speed is off the target, m/s.
 """
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from math import isfinite
+from typing import Final
+
+APART_STEPS: Final = 10
+"""Control steps, 1 s, without touching a thing after which touching it is another collision."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,21 @@ class RewardWeights:
 
 
 PAPER = RewardWeights()
+
+
+class Contacts:
+    """Tells collisions that begin from those that go on: scraping along a wall, or by a person's edge, is one."""
+
+    def __init__(self) -> None:
+        self._step = 0
+        self._touched: dict[str, int] = {}
+
+    def began(self, touching: Set[str]) -> bool:
+        """Whether a collision begins in this control step, which is called once each; labels of what is touched."""
+        self._step += 1
+        last = {label: self._touched.get(label) for label in touching}
+        self._touched.update(dict.fromkeys(touching, self._step))
+        return any(step is None or self._step - step > APART_STEPS for step in last.values())
 
 
 def reward(

@@ -1,19 +1,10 @@
-"""The process of one episode: a task in, progress and one result out, both as lines of JSON.
-
-Its standard output belongs to the libraries (the physics engine prints), so lines go to a descriptor that it is given.
-"""
+"""The process of one episode: a task in, progress and one result out, both as lines of JSON."""
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import sys
 import time
-from collections.abc import Mapping
-from typing import Any
-
-import cv2
 
 from edge.artifact_files import ArtifactError
 from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
@@ -24,7 +15,7 @@ from sim_hil.benchmark.episode import SuiteError
 from sim_hil.benchmark.external_protocol import ExternalError
 from sim_hil.benchmark.run_episode import run_episode
 from sim_hil.benchmark.task import EpisodeTask
-from sim_hil.benchmark.worker_process import end_with_parent
+from sim_hil.benchmark.worker_process import line_to_parent
 from sim_hil.scene import SceneError
 
 TELL_EVERY_NS = 500_000_000
@@ -43,18 +34,7 @@ def refusal_of(error: Exception) -> tuple[str, int] | None:
 
 def main(argv: list[str] | None = None) -> int:
     """Read one task from standard input and run it; exit code 0 once the result or a refusal has been told."""
-    parser = argparse.ArgumentParser(prog="python -m sim_hil.benchmark.worker", description=__doc__)
-    parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
-    parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
-    args = parser.parse_args(argv)
-    end_with_parent(args.parent)
-    cv2.setNumThreads(1)
-    with os.fdopen(args.fd, "w", encoding="utf-8") as lines:
-
-        def tell(content: Mapping[str, Any]) -> None:
-            lines.write(json.dumps(content) + "\n")
-            lines.flush()
-
+    with line_to_parent("python -m sim_hil.benchmark.worker", argv) as tell:
         told_ns = time.monotonic_ns()
 
         def tell_time(time_s: float) -> None:

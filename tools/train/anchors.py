@@ -12,14 +12,16 @@ goes on. The prompt that asks for reasoning stays as it is.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import cos, sin
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from tokenizers import Tokenizer
 
 from edge.geometry import SE2
-from edge.path_memory import PathMemory, Way
+from edge.path_memory import FARTHEST_M, MAX_POINTS, PathMemory, Way
 from edge.prompt import PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
@@ -32,6 +34,9 @@ FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 WAYPOINTS_START: Final = "waypoints:"
 """An assistant's turn that begins so has no reasoning: the model is asked for the points alone."""
 _NS: Final = 1_000_000_000
+_NEAR: Final = 3  # traces, before and after
+_AHEAD_SHARE: Final = 0.5  # of wrong words
+_STALE_S: Final = 20.0
 
 
 @dataclass(frozen=True)
@@ -41,16 +46,25 @@ class DrawConfig:
     waypoints_only: float = 0.2
     """Share of answers that are waypoints without reasoning."""
     before_min_s: float = 0.3
-    before_max_s: float = 6.0
+    before_max_s: float = 4.0
     """The last generation's newest frame is so long ago: what a generation takes."""
-    before_wrong: float = 0.1
+    before_late: float = 0.15
+    before_latest_s: float = 10.0
+    """A share of generations takes longer, up to this."""
+    before_wrong: float = 0.25
     """Share of wrong words about the progress so far: a model that trusted them blindly could never mend a mistake."""
+    way_turn_rad: float = 0.035
+    way_scale: float = 0.02
+    way_point_m: float = 0.05
+    """Standard deviations of what odometry tells of the way, beyond what it was recorded with."""
 
     def __post_init__(self) -> None:
-        if not (0 <= self.waypoints_only <= 1 and 0 <= self.before_wrong < 1):
-            raise ValueError("expected waypoints_only from 0 to 1 and before_wrong from 0 to below 1")
-        if not 0 < self.before_min_s <= self.before_max_s <= 60:
-            raise ValueError("expected 0 < before_min_s <= before_max_s <= 60")
+        if not (0 <= self.waypoints_only <= 1 and 0 <= self.before_wrong < 1 and 0 <= self.before_late <= 1):
+            raise ValueError("expected waypoints_only and before_late from 0 to 1 and before_wrong from 0 to below 1")
+        if not 0 < self.before_min_s <= self.before_max_s <= self.before_latest_s <= 60:
+            raise ValueError("expected 0 < before_min_s <= before_max_s <= before_latest_s <= 60")
+        if min(self.way_turn_rad, self.way_scale, self.way_point_m) < 0:
+            raise ValueError("expected way_turn_rad, way_scale and way_point_m from 0 on")
 
 
 @dataclass(frozen=True)
@@ -71,9 +85,15 @@ class Anchor:
     progress: Progress
     earlier: tuple[Progress, ...]
     """The progress at every second from the drive's start up to k, which is the last."""
+    decides: bool = False
+    """The progress changes within 3 s: here repeating what was said before does not help."""
+    waited: bool = False
+    """The robot has stood here since the instruction, for a generation or more."""
 
     def before(self, ago_s: float) -> Progress | None:
         """What a generation with its newest frame `ago_s` ago rightly said; None before the drive began."""
+        if self.waited:
+            return self.progress
         at = int(np.floor((self.k - ago_s * RATE_HZ) / TRACE_EVERY))
         return self.earlier[at] if at >= 0 else None
 
@@ -85,6 +105,8 @@ class Drawn:
     wording: str
     before: Progress | None
     waypoints_only: bool = False
+    way: Way | None = None
+    """What odometry tells of the way; None: as it was recorded."""
 
 
 def frames_at(k: int, offsets_s: Sequence[float] = FRAME_OFFSETS_S) -> tuple[int, ...]:
@@ -105,14 +127,15 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
     memory, seen = PathMemory(), 0
     found: list[Anchor] = []
     earlier: list[Progress] = []
-    for trace in drive.traces:
+    said = [Progress(**trace["progress"]) for trace in drive.traces]
+    for number, trace in enumerate(drive.traces):
         k = int(trace["k"])
         if k >= len(drive):
             break
         while seen <= k:
             memory.put(seen * _NS // RATE_HZ, drive.T_odom_base(seen))
             seen += 1
-        earlier.append(Progress(**trace["progress"]))
+        earlier.append(said[number])
         if k % every:
             continue
         points: Waypoints = tuple((float(x), float(y)) for x, y in drive.plan_xy[k])
@@ -127,32 +150,79 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 reasoning=Trace.from_json(trace).text(points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
+                decides=said[max(0, number - _NEAR)] != said[min(number + _NEAR, len(said) - 1)],
             )
         )
     return found
 
 
+def waiting(anchor: Anchor, generations: int) -> Anchor:
+    """A drive's first anchor some generations later, nothing having moved: a robot that waits for its first words."""
+    if anchor.k or generations < 1:
+        raise ValueError(
+            f"waiting: expected the first anchor and 1 generation or more, found {anchor.k}, {generations}"
+        )
+    return replace(anchor, frames=(0,) * min(generations, 1 + len(FRAME_OFFSETS_S)), waited=True)
+
+
 def draw(anchor: Anchor, config: DrawConfig, rng: np.random.Generator) -> Drawn:
     """A sample of an anchor; the same numbers are taken from `rng` whatever comes out."""
-    wording, ago_s, wrong, which, only = rng.uniform(size=5)
-    before = anchor.before(config.before_min_s + ago_s * (config.before_max_s - config.before_min_s))
+    wording, ago, late, wrong, ahead, which, old, only = rng.uniform(size=8)
+    noise = rng.standard_normal((2 + MAX_POINTS, 2))
+    lowest, highest = config.before_min_s, config.before_max_s
+    if late < config.before_late:
+        lowest, highest = highest, config.before_latest_s
+    ago_s = lowest + ago * (highest - lowest)
+    before = anchor.before(ago_s)
     if wrong < config.before_wrong and before is not None:
-        others = confused(before)
+        # Too far is the mistake that a drive never shows: its own words are late at times, never ahead.
+        others: Sequence[Progress | None] = too_far(before) if ahead < _AHEAD_SHARE else ()
+        stale = anchor.before(ago_s + old * _STALE_S)
+        others = others or [*confused(before), *([stale] if stale not in (None, before) else [])]
         before = others[int(which * len(others))]
     return Drawn(
         wording=anchor.wordings[int(wording * len(anchor.wordings))],
         before=before,
         waypoints_only=bool(only < config.waypoints_only),
+        way=_told_way(anchor.way, config, noise),
     )
 
 
-def confused(progress: Progress) -> list[Progress | None]:
-    """What a mistaken generation could have said instead: nothing, one turn or one opening more or less."""
+def _told_way(way: Way, config: DrawConfig, noise: npt.NDArray[np.float64]) -> Way:
+    """The way by another odometry: turned and scaled about the robot, each point a little elsewhere."""
+    turn, scale = float(noise[0, 0]) * config.way_turn_rad, 1.0 + float(noise[0, 1]) * config.way_scale
+    c, s = scale * cos(turn), scale * sin(turn)
+    moved = np.array(way).reshape(-1, 2) @ np.array(((c, s), (-s, c))) + noise[2 : 2 + len(way)] * config.way_point_m
+    # A robot that has not moved knows it.
+    stood = len(way) < 2 and not np.any(way)
+    return way if stood else tuple((_tenth(x), _tenth(y)) for x, y in moved.tolist())
+
+
+def _tenth(value_m: float) -> float:
+    return min(max(round(value_m, 1), -FARTHEST_M), FARTHEST_M) + 0.0
+
+
+def too_far(progress: Progress) -> list[Progress]:
+    """What a generation could have said that was ahead of the truth: a turn or an opening more."""
     step, steps, passed = progress.step, progress.steps, progress.passed
-    others: list[Progress | None] = [None]
-    others += [Progress(other, steps, 0) for other in (step - 1, step + 1) if 1 <= other <= steps + 1]
-    if not progress.is_last_leg:
-        others += [Progress(step, steps, other) for other in (passed - 1, passed + 1) if 0 <= other <= MAX_COUNT]
+    others = [Progress(step + 1, steps, 0)] if step <= steps else []
+    if not progress.is_last_leg and passed < MAX_COUNT:
+        others.append(Progress(step, steps, passed + 1))
+    return others
+
+
+def confused(progress: Progress) -> list[Progress | None]:
+    """What a mistaken generation could have said instead: nothing, a turn or an opening more or less, other turns."""
+    step, steps, passed = progress.step, progress.steps, progress.passed
+    others: list[Progress | None] = [None, *too_far(progress)]
+    if step > 1:
+        others.append(Progress(step - 1, steps, 0))
+    if not progress.is_last_leg and passed > 0:
+        others.append(Progress(step, steps, passed - 1))
+    for told in (steps - 1, steps + 1):
+        if 0 <= told <= MAX_COUNT:
+            at = min(step, told + 1)
+            others.append(Progress(at, told, passed if at == step <= told else 0))
     return others
 
 
@@ -183,7 +253,7 @@ class Prompts:
         """All that is fed before the answer. Raises InstructionError for a wording that cannot be given."""
         count = len(anchor.frames)
         head = [i for number in range(1, count + 1) for i in self._frame_ids(number, drawn.wording)]
-        tail = self._builder.tail(anchor.way, drawn.before)
+        tail = self._builder.tail(anchor.way if drawn.way is None else drawn.way, drawn.before)
         return (*head, *tail.ids, *(self._start if drawn.waypoints_only else ()))
 
     def answer(self, text: str) -> tuple[int, ...]:

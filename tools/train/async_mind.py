@@ -7,14 +7,17 @@ generation itself is `LockstepReasoner`'s, as in the benchmark, so nothing is sc
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from edge.assembly import semantic_config
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts
+from edge.monitors.semantic import SemanticMonitor
 from edge.policy import Policy, fit_frame
 from edge.reasoning_loop import Mode, SemanticSlot
 from edge.ring import EncodedFrame, TokenRing
@@ -42,6 +45,8 @@ class Models:
 
     def __init__(self, artifacts: Artifacts) -> None:
         self.artifacts = artifacts
+        # By their age alone: how well a text is written is not what is learned here.
+        self.ages = replace(semantic_config(artifacts, Mode.ASYNC), judge_text=False)
         self.policy = Policy(artifacts, threads=1)
         self.language = LanguageModel(artifacts, threads=1)
 
@@ -56,6 +61,7 @@ class AsyncMind:
     def __init__(self, models: Models, instruction: str, draw: Callable[[], Timing]) -> None:
         runtime = models.artifacts.runtime
         self._models = models
+        self._ages, self._monitor = models.ages, SemanticMonitor(models.ages)
         self._slot = SemanticSlot()
         self._ring = TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, models.policy.tokens_shape)
         stand_in: Any = _TrainedElsewhere()
@@ -89,12 +95,21 @@ class AsyncMind:
         return self._slot.state
 
     def metadata(self, time_s: float, T_odom_base: SE2) -> tuple[float, float, float, float]:
-        """(Δt s, Δx m, Δy m, Δθ rad) of that state now; zeros before the first (Algorithm 4, line 19)."""
+        """(Δt s, Δx m, Δy m, Δθ rad) of that state now; zeros before the first (Algorithm 4, line 19).
+
+        As in the runner, Δt is never beyond what the policy was trained for.
+        """
         state = self._slot.state
         if state is None:
             return (0.0, 0.0, 0.0, 0.0)
         offset = state.motion_offset(T_odom_base)
-        return (state.delay_s(START_NS + round(time_s * 1e9)), *offset.as_tuple())
+        delay_s = state.delay_s(START_NS + round(time_s * 1e9))
+        return (self._ages.given_delay_s(delay_s), *offset.as_tuple())
+
+    def speed_scale(self, time_s: float) -> float:
+        """Share of the limits, 0 to 1, that the runner would leave now: an answer that is too old slows it down."""
+        found = self._monitor.step(self._slot.state, 0, START_NS + round(time_s * 1e9))
+        return min((each.speed_scale or 0.0 for each in found), default=1.0)
 
     @property
     def failure(self) -> str | None:

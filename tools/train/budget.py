@@ -63,14 +63,15 @@ def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
         return [("episodes", count, "policy-drive")]
     told = getattr(importlib.import_module(STAGES[step.stage][0]), "budget", None)
     work = [] if told is None else list(told(recipe))
-    return _again(recipe, work) if step.stage == "imitate" and step.round else work
+    return _again(recipe, step.stage, work) if step.round else work
 
 
-def _again(recipe: Recipe, work: Sequence[tuple[str, int, str]]) -> list[tuple[str, int, str]]:
-    """Imitation after a round of DAgger: states of the new drives alone, and as many samples as it goes on for."""
+def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> list[tuple[str, int, str]]:
+    """What goes on after a round of DAgger: what is cached of the new drives, and the share that is learned again."""
     more = recipe.dagger.episodes / recipe.collect.episodes if recipe.collect is not None else 1.0
-    share = (recipe.imitate.go_on_share or 1.0) if recipe.imitate is not None else 1.0
-    return [(what, round(count * (more if key == "kv" else share)), key) for what, count, key in work]
+    config = recipe.imitate if stage == "imitate" else recipe.sft
+    share = (config.go_on_share or 1.0) if config is not None else 1.0
+    return [(what, round(count * (more if key in ("kv", "encode") else share)), key) for what, count, key in work]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:

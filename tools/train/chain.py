@@ -17,12 +17,15 @@ ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate"
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
 """Stages that torchrun may run in several processes."""
 
+GO_ON: Final = ("sft", "imitate")
+"""Stages that go on, over more drives, after a round of DAgger."""
+
 StageRun = Callable[[StageJob], dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage, or round number `round` of DAgger; imitation after that round has its number too."""
+    """A stage, or round number `round` of DAgger; what goes on after that round has its number too."""
 
     stage: str
     round: int = 0
@@ -35,11 +38,10 @@ class Step:
 
 def steps_of(command: str, recipe: Recipe) -> list[Step]:
     """What a command does, in order."""
-    rounds = [
-        step
-        for number in range(1, recipe.dagger.rounds + 1)
-        for step in (Step("dagger", number), Step("imitate", number))
-    ]
+    rounds: list[Step] = []
+    for number in range(1, recipe.dagger.rounds + 1):
+        spoken = [Step("sft", number)] if number <= recipe.dagger.sft_rounds else []
+        rounds += [Step("dagger", number), *spoken, Step("imitate", number)]
     if command == "dagger":
         return rounds
     if command != "all":
@@ -50,10 +52,10 @@ def steps_of(command: str, recipe: Recipe) -> list[Step]:
     return steps
 
 
-def retired(run_dir: RunDir) -> int:
-    """How many imitations were kept aside for another one after a round of DAgger."""
+def retired(run_dir: RunDir, stage: str) -> int:
+    """How often a stage was kept aside, to go on after a round of DAgger."""
     number = 0
-    while run_dir.begun(f"imitate-{number}"):
+    while run_dir.begun(f"{stage}-{number}"):
         number += 1
     return number
 
@@ -62,7 +64,7 @@ def is_done(run_dir: RunDir, step: Step) -> bool:
     """Whether a step has finished."""
     if step.stage == "dagger":
         return run_dir.result(step.name) is not None
-    if step.stage == "imitate" and step.round != (now := retired(run_dir)):
+    if step.stage in GO_ON and step.round != (now := retired(run_dir, step.stage)):
         return step.round < now
     return run_dir.result(step.stage) is not None
 
@@ -72,7 +74,7 @@ def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
     where = step.name if step.stage == "dagger" else step.stage
     if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
         raise RunDirError(f"{run_dir.out}: its drives are another run's (--from); set dagger.rounds=0")
-    again = step.stage == "imitate" and step.round > retired(run_dir)
+    again = step.stage in GO_ON and step.round > retired(run_dir, step.stage)
     if run_dir.begun(where) and not resume and not again:
         raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
 
@@ -84,9 +86,9 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
         if job.ranks.first:
             job.run_dir.finish(step.name, result)
         return result
-    if step.stage == "imitate" and step.round > retired(job.run_dir):
-        # The drives have become more: imitation begins again on all of them, and what it was is kept.
-        job.run_dir.retire("imitate", f"imitate-{step.round - 1}")
+    if step.stage in GO_ON and step.round > retired(job.run_dir, step.stage):
+        # The drives have become more: the stage goes on over all of them, and what it was is kept.
+        job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
         job = replace(job, resume=False)
     result = (stage_run or module_run)(step.stage)(job)
     if job.ranks.first:

@@ -20,6 +20,7 @@ from edge.prompt import InstructionError
 from export.typed import build, plain
 from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
+from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import SceneError
 from tools.train.collect_config import CollectConfig
@@ -29,7 +30,6 @@ from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, S
 from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_episodes
 from tools.train.steering import SteeringNoise, Velocity
 from tools.train.traces import Tracer
-from tools.train.workers import Message, worker_main
 
 MODULE: Final = "tools.train.collect_worker"
 _TAG: Final = 0xC011
@@ -137,7 +137,9 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         pupil=order.policy is not None,
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
-    expert = ExpertPolicy(margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path)
+    expert = ExpertPolicy(
+        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil
+    )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
             recorded, driver = record(plan, expert, policy.steer, _teller(scenario)), policy.name

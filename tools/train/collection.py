@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from sim_hil.benchmark.worker_pool import Told, Workers
 from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import MODULE, Order
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Entry
 from tools.train.scenarios import MAX_SEED
-from tools.train.workers import Told, Workers
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
@@ -72,7 +72,7 @@ def fill(
     under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
     logs = writer.folder / "logs"
     logs.mkdir(exist_ok=True)
-    workers = Workers(command, jobs, logs)
+    workers = Workers(command, jobs)
     try:
         while waiting or under_way:
             if stopped():
@@ -81,7 +81,7 @@ def fill(
                 order = waiting.popleft()
                 key = order.id(order.start)
                 under_way[key] = (order, "")
-                workers.start(key, order.as_json())
+                workers.start(key, order.as_json(), logs / f"{key}.log")
             for told in workers.wait(_POLL_S):
                 _take(told, writer, under_way, waiting)
             done, dropped = len(writer.entries(collection.prefix)), len(writer.dropped(collection.prefix))

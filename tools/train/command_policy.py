@@ -31,6 +31,11 @@ class CommandLimits:
 
 def command_mean(trajectory: Tensor, step_s: float, limits: CommandLimits) -> Tensor:
     """(v m/s, ω rad/s) [B, 2] of trajectories [B, steps, 3]: `arc_to` of the target 1 s ahead, within the limits."""
+    return within_limits(arc_command(trajectory, step_s), limits)
+
+
+def arc_command(trajectory: Tensor, step_s: float) -> Tensor:
+    """(v m/s, ω rad/s) [B, 2] of the same arc, however fast it would have to be driven."""
     index = min(trajectory.shape[1], max(1, round(TARGET_TIME_S / step_s))) - 1
     x, y, theta = trajectory[:, index].unbind(-1)
     distance = torch.sqrt(x * x + y * y + 1e-12)
@@ -46,8 +51,17 @@ def command_mean(trajectory: Tensor, step_s: float, limits: CommandLimits) -> Te
     turn = 2 * bearing / TARGET_TIME_S
     turn = torch.where(behind, torch.sign(bearing) * (math.pi / 2) / TARGET_TIME_S, turn)
     turn = torch.where(near, theta / TARGET_TIME_S, turn)
-    over = torch.maximum(speed / limits.vx_max_mps, turn.abs() / limits.wz_max_radps).clamp(min=1.0)
-    return torch.stack([speed / over, turn / over], dim=-1)
+    return torch.stack([speed, turn], dim=-1)
+
+
+def within_limits(arc: Tensor, limits: CommandLimits) -> Tensor:
+    """Commands [B, 2] slowed down on their arcs until they are within the limits.
+
+    The share is a constant to gradients: otherwise a plan at the limit of speed could not be taught to go slower.
+    """
+    speed, turn = arc.unbind(-1)
+    over = torch.maximum(speed / limits.vx_max_mps, turn.abs() / limits.wz_max_radps).clamp(min=1.0).detach()
+    return arc / over[..., None]
 
 
 def log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

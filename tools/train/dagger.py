@@ -31,6 +31,7 @@ def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, An
     from tools.train.collection import CollectError, Collection, fill, job_count, result_of
     from tools.train.dagger_driver import PolicyOptions
     from tools.train.dataset import DatasetWriter
+    from tools.train.drive import POLICY_DRIVER
 
     if round_number < 1:
         raise ValueError(f"dagger: rounds count from 1, found {round_number}")
@@ -43,7 +44,7 @@ def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, An
     prefix = prefix_of(round_number)
     collection = Collection(prefix, job.recipe.dagger.episodes, job.seed, round_number, config, policy)
     with DatasetWriter(job.run_dir.stage("collect")) as writer:
-        if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"policy:{sha256[:12]}"}):
+        if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"{POLICY_DRIVER}{sha256[:12]}"}):
             raise CollectError(f"dagger round {round_number}: begun with {others[0]}; go on with the same artifacts")
         fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
         return {**result_of(writer, prefix), "beta": beta, "policy": sha256}

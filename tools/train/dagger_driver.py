@@ -14,6 +14,7 @@ from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.latency import LatencyProfile
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.policies import robot_config
+from tools.train.drive import POLICY_DRIVER
 from tools.train.steering import Shared, Velocity
 
 SHORTEST_S: Final = 0.5  # no generation is faster
@@ -53,7 +54,7 @@ class PolicyDriver:
         self._policy = ArtifactsPolicy(directory, mode="async", latency=latency, robot=robot_config())
         if self._policy.manifest_sha256 != options.manifest_sha256:
             raise ArtifactError(f"{directory}: not the artifacts that this round was started with")
-        self.name = f"policy:{options.manifest_sha256[:12]}"
+        self.name = f"{POLICY_DRIVER}{options.manifest_sha256[:12]}"
         self._shared = Shared(rng, options.beta)
         instruction = episode.instructions[int(rng.integers(len(episode.instructions)))]
         self._policy.reset(episode, instruction, None, episode.seed)

@@ -31,6 +31,8 @@ TRACE_EVERY: Final = 10  # frames: reasoning is written down once a second
 PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)
 PICTURE_PX: Final = 128
 EXPERT, NOISE, POLICY = 0, 1, 2  # who commanded a frame: values of `by`
+POLICY_DRIVER: Final = "policy:"
+"""What the name of a driver begins with that is a policy (DAgger); its hash follows."""
 INDEX, DRIVES = "dataset.json", "drives"
 FORMAT: Final = 1
 VAL_EVERY: Final = 8  # one layout in so many is for validation

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2
-from tools.train.drive import EXPERT, FUTURE_STEPS, RATE_HZ, Drive
+from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, RATE_HZ, Drive
 from tools.train.trace_words import NOBODY
 
 Array = NDArray[np.float64]
@@ -19,6 +19,7 @@ LEAST_KNOWN: Final = RATE_HZ  # steps: a label that ends before the controller's
 TURN_RAD: Final = 0.5
 _LABEL_STEPS: Final = 30
 _STANDS: Final = 0.1  # m/s and rad/s
+_BACKS_OFF_M: Final = 0.05
 
 
 class DriveFramesError(ValueError):
@@ -84,6 +85,7 @@ class DriveFrames:
         # A pose's heading is within half a turn; a plan's is the sum of its steps and may go beyond.
         start = np.zeros((len(drive), 1))
         future[..., 2] = np.unwrap(np.concatenate([start, future[..., 2]], axis=1), axis=1)[:, 1:]
+        _never_backwards(future)
         moved = np.hypot(*np.diff(drive.pose_odom[:, :2], axis=0, prepend=drive.pose_odom[:1, :2]).T)
         away = np.array(drive.about.goal_xy) - drive.pose[:, :2]
         c, s = np.cos(drive.pose[:, 2]), np.sin(drive.pose[:, 2])
@@ -105,6 +107,15 @@ class DriveFrames:
         return T_odom_anchor.inverse() @ T_odom_base
 
 
+def _never_backwards(future: Array) -> None:
+    """Let labels stand, and turn as the expert turns, where it backs off: the controller cannot, in place.
+
+    Told of a target behind it, it would turn towards that, which is as a rule away from where the expert turns.
+    """
+    x, y = future[:, LEAST_KNOWN - 1, :2].T
+    future[(x < 0) & (np.hypot(x, y) >= _BACKS_OFF_M), :, :2] = 0.0
+
+
 def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> Array:
     known = np.arange(_LABEL_STEPS) < drive.future_steps[:, None]
     turns = np.max(np.abs(future[:, :_LABEL_STEPS, 2]) * known, axis=1) > TURN_RAD
@@ -123,7 +134,7 @@ def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> 
         (people, config.people),
         (near, config.goal),
         (led_back, config.recovery),
-        (drive.about.driver.startswith("policy:"), config.policy),
+        (drive.about.driver.startswith(POLICY_DRIVER), config.policy),
     ):
         weight[np.broadcast_to(holds, weight.shape)] *= factor
     weight[drive.future_steps < LEAST_KNOWN] = 0.0

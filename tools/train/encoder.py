@@ -30,7 +30,7 @@ from tools.train.augment import AugmentConfig, augmented
 from tools.train.distributed import BatchOrder
 from tools.train.encoder_data import FramesConfig, FrameSet, Shard, fill, frames_sha256, made, plan
 from tools.train.encoder_heads import Balance, EncoderHeads, as_tensors, losses, total
-from tools.train.encoder_labels import COLUMNS, PIXELS
+from tools.train.encoder_labels import COLUMNS, PIXELS, mirrored_label
 from tools.train.encoder_score import Fixed, Score, decide
 from tools.train.job import StageJob
 from tools.train.network_file import finish_network, start_network
@@ -63,6 +63,8 @@ class EncoderConfig:
         )
     )
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    mirrored: float = 0.5
+    """Share of pictures that are shown as a mirror shows them: later stages learn from drives in the mirror."""
     checkpoint_steps: int = 500
     """Steps between two checkpoints."""
     look_steps: int = 500
@@ -73,6 +75,8 @@ class EncoderConfig:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, self.checkpoint_steps, self.look_steps) < 1 or self.look_frames < 0:
             raise ValueError("expected epochs, batch, checkpoint_steps and look_steps from 1 on, look_frames from 0 on")
+        if not 0 <= self.mirrored <= 1:
+            raise ValueError(f"expected mirrored to be a share from 0 to 1, found {self.mirrored}")
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
@@ -171,7 +175,7 @@ class _Pupil:
         optimiser = Optimiser(self._parameters, config.optim, order.steps, job.ranks)
         loss, held_loss = self._load(optimiser)
         look = np.sort(job.rng(_LOOK).permutation(len(held))[: config.look_frames])
-        with _Batches(job, data, order, config.augment, self._px) as batches:
+        with _Batches(job, data, order, config, self._px) as batches:
             while optimiser.step_count < order.steps:
                 lr = optimiser.lr
                 loss = self._step(optimiser, *batches.at(optimiser.step_count))
@@ -244,8 +248,9 @@ class _Pupil:
 class _Batches:
     """This rank's shares of the batches; the next one is made while the network learns from one."""
 
-    def __init__(self, job: StageJob, data: FrameSet, order: BatchOrder, augment: AugmentConfig, px: int) -> None:
-        self._job, self._data, self._order, self._augment, self._px = job, data, order, augment, px
+    def __init__(self, job: StageJob, data: FrameSet, order: BatchOrder, config: EncoderConfig, px: int) -> None:
+        self._job, self._data, self._order, self._px = job, data, order, px
+        self._augment, self._mirrored = config.augment, config.mirrored
         self._pool = ThreadPoolExecutor(1)
         self._ahead: tuple[int, Future[tuple[NDArray[np.uint8], Mapping[str, Any]]]] | None = None
 
@@ -267,10 +272,15 @@ class _Batches:
         own = self._job.ranks.share(self._order.indices(step))
         epoch = step // self._order.steps_per_epoch
         pictures = np.zeros((len(own), self._px, self._px, 3), np.uint8)
+        labels = {name: array[own] for name, array in self._data.labels.items()}
         for row, index in enumerate(own.tolist()):
             rng = np.random.default_rng((self._job.seed, _AUGMENT, epoch, index))
             pictures[row] = fit_frame(augmented(self._data.picture(index), self._augment, rng), self._px)[0]
-        return pictures, {name: array[own] for name, array in self._data.labels.items()}
+            if rng.uniform() < self._mirrored:
+                pictures[row] = pictures[row, :, ::-1].copy()
+                for name, array in labels.items():
+                    array[row] = mirrored_label(name, array[row])
+        return pictures, labels
 
 
 def _watched(score: Score) -> dict[str, float]:

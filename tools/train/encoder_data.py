@@ -23,14 +23,14 @@ from safetensors import SafetensorError, safe_open
 from edge.cli import write_whole
 from export.typed import build, plain
 from sim_hil.benchmark.episode import ROBOTS
+from sim_hil.benchmark.worker_pool import Told, Workers
 from tools.train.augment import Picture, decoded
 from tools.train.drive import file_sha256
 from tools.train.encoder_labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
 from tools.train.job import StageProgress
 from tools.train.sites import CORRIDOR, KINDS, OUTDOORS
-from tools.train.workers import Told, Workers
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder_worker"
 FIRST_LAYOUT: Final = 10_000_000_000
 """Of layouts that pictures are taken in: above every seed that drives are recorded in (`tools.train.scenarios`)."""
@@ -57,7 +57,7 @@ class FramesConfig:
     """To learn from; 0: the encoder stays as it is."""
     held: int = 6_000
     """In layouts that are never learned from."""
-    per_scene: int = 1_000
+    per_scene: int = 600
     kinds: tuple[str, ...] = (
         "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "sidewalk",
         "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "corridor",
@@ -160,7 +160,9 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
         kind = kinds[(number + number // len(kinds)) % len(kinds)]
         layout_seed = FIRST_LAYOUT + seed % 1_000 * _OF_A_SEED + (_HELD_FROM if held else 0) + number
         frames = min(per_scene, left)
-        robot, people = ROBOTS[int(rng.integers(len(ROBOTS)))], _people(config, kind, rng)
+        # In turn within each kind: by chance one would have most of the scenes of one kind.
+        robot = ROBOTS[sum(shard.kind == kind for shard in shards) % len(ROBOTS)]
+        people = _people(config, kind, rng)
         name = f"{'held' if held else 'train'}-{number:04d}-{kind}-{robot}"
         shards.append(
             Shard(
@@ -209,14 +211,15 @@ def fill(
     progress.update(before, total)
     # The slowest first, so that no core idles at the end.
     waiting = sorted(missing, key=lambda shard: (shard.people * shard.frames, shard.name))
-    workers = Workers([sys.executable, "-m", WORKER], jobs or len(os.sched_getaffinity(0)), logs)
+    workers = Workers([sys.executable, "-m", WORKER], jobs or len(os.sched_getaffinity(0)))
     try:
         while waiting or workers.running():
             if should_stop():
                 raise KeyboardInterrupt
             while waiting and workers.free():
                 shard = waiting.pop()
-                workers.start(shard.name, {"folder": str(folder), "shard": plain(shard)})
+                job = {"folder": str(folder), "shard": plain(shard)}
+                workers.start(shard.name, job, logs / f"{shard.name}.log")
             for told in workers.wait(_POLL_S):
                 _note(told, taken)
             progress.update(before + sum(taken.values()), total)

@@ -31,7 +31,7 @@ from tools.train.encoder_labels import (
 WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(
     {
         "main": 0.3, "thing": 1.0, "colour": 0.4, "facing": 0.2, "near_m": 0.5, "thing_m": 0.5,
-        "free_m": 1.0, "open_kind": 0.5, "open_m": 0.3, "place": 0.2,
+        "free_m": 1.0, "open_kind": 0.8, "open_m": 0.3, "place": 0.2,
     }
 )  # fmt: skip
 """How much each label's loss counts."""

@@ -41,9 +41,11 @@ BACKGROUND, THING, DOOR, LANDMARK, SOMEBODY = range(5)
 """How much a cell's things matter: the highest that is there names the cell's `thing`."""
 
 _DOORS: Final = frozenset(("door", "double_door", "elevator", "loading_door"))
-_CLEAR_M: Final = 0.2  # of a free way to each side: what a far doorway still has for more than one column
+_CLEAR_M: Final = 0.2  # of a free way to each side
+_RAYS: Final = 5  # of a column: a doorway far ahead at the side is narrower than one
+_THROUGH_M: Final = 0.05  # to each side of a look through an opening
 _STEP_M: Final = 0.1
-_BEYOND: Final = 3  # steps that a way goes on into an opening, or it is only touched
+_BEYOND: Final = 1  # steps that a look goes on into an opening
 _PERSON_HALF_M: Final = 0.15
 _PIXEL: Final = 0.04  # of the twin's pictures, m at a distance of 1 m
 _NOWHERE: Final = (1e9, 1e9, 1e9, 1.0, 0.0, 0.0, 0.0, 0.0)  # a box that no ray meets
@@ -192,19 +194,22 @@ class SceneLabels:
         return found
 
     def _columns(self, view: View, base_xy: tuple[float, float]) -> dict[str, NDArray[np.generic]]:
-        across = ((np.arange(COLUMNS) + 0.5) / COLUMNS * 2 - 1) * view.half_width
+        rays = COLUMNS * _RAYS
+        across = ((np.arange(rays) + 0.5) / rays * 2 - 1) * view.half_width
         ways = view.ahead[:2] + across[:, None] * view.right[:2]
         ways /= np.hypot(ways[:, 0], ways[:, 1])[:, None]
         gone = np.arange(1, round(FREE_M / _STEP_M) + 1) * _STEP_M
         points = view.eye[:2] + ways[:, None, :] * gone[None, :, None]
-        blocked = self._grid.clearances_at(points) < _CLEAR_M
-        first = np.where(blocked.any(axis=1), blocked.argmax(axis=1), len(gone))
-        free = first * _STEP_M
+        clear = self._grid.clearances_at(points)
+        free = _first(clear[_RAYS // 2 :: _RAYS] < _CLEAR_M) * _STEP_M
+        first = _first(clear < _THROUGH_M)
         areas = self._area_at(points)
         own = int(self._area_at(view.eye[None, :2])[0])
         leads = (areas != own) & (areas >= 0) & (np.arange(len(gone)) + _BEYOND < first[:, None])
-        opens, at = leads.any(axis=1), leads.argmax(axis=1)
-        kinds = self._kinds[areas[np.arange(COLUMNS), at]]
+        # Of a column's rays the one that comes into another area soonest.
+        nearest = np.arange(COLUMNS) * _RAYS + _first(leads).reshape(COLUMNS, _RAYS).argmin(axis=1)
+        opens, at = leads[nearest].any(axis=1), leads[nearest].argmax(axis=1)
+        kinds = self._kinds[areas[nearest, at]]
         here = int(self._area_at(np.array((base_xy,)))[0])
         return {
             "free_m": free.astype(np.float16),
@@ -221,6 +226,21 @@ class SceneLabels:
         inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])
         found = self._areas[np.where(inside, row, 0), np.where(inside, column, 0)]
         return np.where(inside, found, -1)
+
+
+def _first(there: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """[n]: where a row of [n, m] is true first; m where it never is."""
+    found: NDArray[np.int64] = np.where(there.any(axis=1), there.argmax(axis=1), there.shape[1])
+    return found
+
+
+def mirrored_label(name: str, label: NDArray[np.generic]) -> NDArray[np.generic]:
+    """A picture's label of a `label_shapes` name as it is of the mirrored picture."""
+    flipped = label[..., ::-1] if label.ndim else label
+    if name != "facing":
+        return flipped
+    turned = (OCTANTS - flipped.astype(np.int64)) % OCTANTS
+    return np.where(flipped == NONE, NONE, turned).astype(label.dtype)
 
 
 def area_map(scene: Scene, grid: NavGrid) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ from sim_hil.scene import Scene, SceneObject
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]  # x m, y m, heading rad
 
-SHARES: Final = (("way", 0.36), ("anywhere", 0.20), ("thing", 0.22), ("person", 0.14), ("wall", 0.08))
+SHARES: Final = (("way", 0.50), ("anywhere", 0.14), ("thing", 0.20), ("person", 0.12), ("wall", 0.04))
 """How often a pose of each sort is drawn."""
 _TRIES: Final = 24  # of one sort, before another is taken
 _MORE_TRIES: Final = 200
@@ -26,9 +26,15 @@ _ROOM_M: Final = 0.6  # between the robot's middle and a person's
 _OFF_WAY_RAD: Final = 0.3
 _AIM_RAD: Final = 0.75  # what is looked at is within this of the middle: the camera sees 0.87 to each side
 _FRONT_RAD: Final = 0.8
-_THING_M: Final = (0.8, 9.0)
+_THING_M: Final = (0.8, 12.0)
 _PERSON_M: Final = (0.7, 5.0)
 _WALL_M: Final = 0.25  # beyond what the robot needs
+# A robot on its way seldom faces a wall: of poses with no way ahead most are drawn again.
+_AHEAD_RAD: Final = (-0.6, -0.3, 0.0, 0.3, 0.6)
+_AHEAD_M: Final = 2.0
+_AHEAD_CLEAR_M: Final = 0.2
+_BLIND_SHARE: Final = 0.2
+_STEP_M: Final = 0.1
 # Height of the base above the ground, m, how it bobs, and how far roll and pitch sway, rad (one standard deviation).
 _BODIES: Final = {"go2": (0.31, 0.012, 0.020, 0.025), "carter": (0.0, 0.0, 0.006, 0.008)}
 _ROUGH_SHARE, _ROUGH = 0.1, 3.0  # of the time it sways so much more: steps, ramps, being pushed
@@ -54,7 +60,7 @@ class Poses:
         sort = str(self._rng.choice(names, p=shares))
         for attempt in range(_MORE_TRIES):
             pose = self._drawn(sort if attempt < _TRIES else "anywhere", people)
-            if self._grid.is_free(pose[0], pose[1]) and _roomy(pose, people):
+            if self._grid.is_free(pose[0], pose[1]) and _roomy(pose, people) and self._worth_seeing(pose):
                 return pose
         return self._cell(self._cells)  # so full that somebody is close wherever one is
 
@@ -71,6 +77,16 @@ class Poses:
             x, y = people[int(rng.integers(len(people))), :2]
             return self._towards(float(x), float(y), float(rng.uniform(-pi, pi)), float(rng.uniform(*_PERSON_M)))
         return self._cell(self._at_walls if sort == "wall" else self._cells)
+
+    def _worth_seeing(self, pose: Pose) -> bool:
+        chance = float(self._rng.uniform())
+        x, y, heading = pose
+        bearings = heading + np.array(_AHEAD_RAD)
+        gone = np.arange(1, round(_AHEAD_M / _STEP_M) + 1) * _STEP_M
+        ways = np.stack((np.cos(bearings), np.sin(bearings)), -1)
+        points = np.array((x, y)) + ways[:, None, :] * gone[None, :, None]
+        clear = self._grid.clearances_at(points) >= _AHEAD_CLEAR_M
+        return bool(clear.all(axis=1).any()) or chance < _BLIND_SHARE
 
     def _thing(self) -> SceneObject:
         pool = self._landmarks if self._landmarks and self._rng.uniform() < 0.75 else self._things

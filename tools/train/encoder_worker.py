@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.camera import CameraWorld
 from sim_hil.layouts import LayoutError
 from sim_hil.people import UPDATE_HZ, People, appearances
@@ -27,7 +28,6 @@ from tools.train.encoder_ids import ASPECT, IdWorld, view_of
 from tools.train.encoder_labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder_poses import Poses, body_state
 from tools.train.sites import Site
-from tools.train.workers import Message, worker_main
 
 Array = NDArray[np.float64]
 

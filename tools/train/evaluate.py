@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -91,13 +92,19 @@ def run(job: StageJob) -> dict[str, Any]:
 
 
 def write_suite(folder: Path, config: EvaluateConfig) -> Path:
-    """The episodes as a suite's file, with their scenes beside it; one that is there is taken as it is."""
+    """The episodes as a suite's file, with their scenes beside it; one of the same numbers is taken as it is.
+
+    Raises EvaluateError where there is one of other numbers: its results would be taken for these.
+    """
     from sim_hil.benchmark.episode import suite_to_toml
     from sim_hil.scene import scene_to_toml
     from tools.train.scenarios import SHARES, training_episodes
 
-    path = folder / SUITE
-    if path.exists():
+    path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
+    numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
+    if path.exists() and mark.exists():
+        if (found := json.loads(mark.read_text(encoding="utf-8"))) != numbers:
+            raise EvaluateError(f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to begin anew")
         return path
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
@@ -109,4 +116,5 @@ def write_suite(folder: Path, config: EvaluateConfig) -> Path:
             write_whole(scene, scene_to_toml(scenario.scene))
         episodes.append(replace(scenario.episode, scene=str(scene.absolute())))
     write_whole(path, suite_to_toml("training", 1, episodes))
+    write_whole(mark, json.dumps(numbers) + "\n")
     return path

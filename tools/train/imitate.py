@@ -166,7 +166,7 @@ def _said(
         tokenizer_for(network.config, None),
         dataset,
         tokens,
-        replace(config, draws=1, own_share=1.0) if own else config,
+        replace(config, draws=1, own_share=1.0, own_share_policy=1.0) if own else config,
         # Of the run, not of the stage: ablations of one seed share their states.
         seed=job.recipe.seed,
         ids=ids,
@@ -192,11 +192,13 @@ def _point_goal(
 
 def _start(job: StageJob, config: ImitateConfig) -> tuple[TicVla, float]:
     """The network to begin with, and the share of `samples` that it is trained for."""
-    rounds = retired(job.run_dir)
+    network, rounds = start_network(job, STAGE), retired(job.run_dir, STAGE)
     if not rounds or not config.go_on_share or config.policy == POINT_GOAL:
-        return start_network(job, STAGE), 1.0
+        return network, 1.0
     path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
-    return read_network(path, job.recipe.model, job.recipe.seed), config.go_on_share
+    # The action expert alone: the language model may have gone on since.
+    network.action.load_state_dict(read_network(path, job.recipe.model, job.recipe.seed).action.state_dict())
+    return network, config.go_on_share
 
 
 def fit(

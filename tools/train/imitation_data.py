@@ -46,6 +46,8 @@ class SampleConfig:
     """False: states end with their prompt, as those of a model that says nothing."""
     cut_text: float = 0.1
     """Share of states whose text ends early: a power budget may cut it at any token."""
+    prompt_only: float = 0.05
+    """Share of states of a prompt without any text: what the mode without reasoning drives by."""
     standing_start: float = 0.5
     """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
     offset_noise_m_per_m: float = 0.02
@@ -56,8 +58,10 @@ class SampleConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.group <= 64:
             raise ValueError(f"group: expected 1 to 64 frames, found {self.group}")
-        if not (0 <= self.cut_text <= 1 and 0 <= self.standing_start <= 1):
-            raise ValueError("expected cut_text and standing_start from 0 to 1")
+        if not (min(self.cut_text, self.prompt_only) >= 0 and self.cut_text + self.prompt_only <= 1):
+            raise ValueError("expected cut_text and prompt_only from 0 on, together 1 at most")
+        if not 0 <= self.standing_start <= 1:
+            raise ValueError("expected standing_start from 0 to 1")
         if not (0 <= self.offset_noise_m_per_m <= 1 and 0 <= self.offset_noise_deg_per_m <= 90):
             raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
 
@@ -65,8 +69,9 @@ class SampleConfig:
         """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
         even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
         return replace(
-            self, cut_text=0.0, standing_start=0.0, offset_noise_m_per_m=0.0, offset_noise_deg_per_m=0.0, weights=even
-        )
+            self, cut_text=0.0, prompt_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
+            offset_noise_deg_per_m=0.0, weights=even,
+        )  # fmt: skip
 
 
 class States(Protocol):
@@ -227,7 +232,7 @@ class Samples:
     def _length(self, state: CachedState, cut: float, end: float) -> int:
         """Tokens of a state that the policy is given."""
         said = len(state.kv) - state.prompt_tokens
-        if not self.config.reasoning:
+        if not self.config.reasoning or cut >= 1 - self.config.prompt_only:
             return state.prompt_tokens
         return state.prompt_tokens + (int(end * (said + 1)) if cut < self.config.cut_text else said)
 

@@ -17,7 +17,7 @@ from tokenizers import Tokenizer
 from export.model.network import TicVla
 from tools.train.anchors import WAYPOINTS_START, Anchor, DrawConfig, Drawn, Prompts, anchors_of, draw
 from tools.train.distributed import SINGLE, Ranks
-from tools.train.drive import TRACE_EVERY, Dataset
+from tools.train.drive import POLICY_DRIVER, TRACE_EVERY, Dataset
 from tools.train.greedy import decode
 from tools.train.job import QuietProgress, StageProgress
 from tools.train.kv_cache import FORMAT, KvCache, KvCacheError, Made, begin, write_states
@@ -36,6 +36,8 @@ class KvConfig:
     """States of each anchor, each with words and a `before` of its own."""
     own_share: float = 0.0
     """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
+    own_share_policy: float = 0.8
+    """The same along a policy's drives (DAgger): off the way the truth leads back, but on the robot nobody says it."""
     max_new_tokens: int = 72
     """Of its own texts."""
     every: int = TRACE_EVERY
@@ -44,8 +46,10 @@ class KvConfig:
     words: DrawConfig = field(default_factory=lambda: DrawConfig(waypoints_only=0.0))
 
     def __post_init__(self) -> None:
-        if not (1 <= self.draws <= 64 and 0 <= self.own_share <= 1 and self.batch >= 1 and self.max_new_tokens >= 0):
-            raise ValueError("expected 1 to 64 draws, own_share from 0 to 1, a batch and max_new_tokens from 0 on")
+        if not (1 <= self.draws <= 64 and self.batch >= 1 and self.max_new_tokens >= 0):
+            raise ValueError("expected 1 to 64 draws, a batch and max_new_tokens from 0 on")
+        if not all(0 <= share <= 1 for share in (self.own_share, self.own_share_policy)):
+            raise ValueError("expected own_share and own_share_policy from 0 to 1")
         if self.every < 1 or self.every % TRACE_EVERY:
             raise ValueError(f"expected every to be a multiple of {TRACE_EVERY} frames, found {self.every}")
 
@@ -107,7 +111,8 @@ def build_kv_cache(
     prompts = Prompts(Tokenizer.from_buffer(tokenizer), network.config)
     for done, entry in enumerate(own, 1):
         anchors = anchors_of(dataset.load(entry.id, pictures=False), config.every)
-        states = _states(network, prompts, tokens, anchors, config, seed)
+        share = config.own_share_policy if entry.driver.startswith(POLICY_DRIVER) else config.own_share
+        states = _states(network, prompts, tokens, anchors, config, share, seed)
         write_states(place, entry.id, entry.sha256, states, network.config.kv_dim)
         (progress or QuietProgress()).update(done, len(own))
     ranks.barrier()
@@ -133,10 +138,13 @@ class _Wanted:
 
 
 def _states(
-    network: TicVla, prompts: Prompts, tokens: FrameTokens, anchors: Sequence[Anchor], config: KvConfig, seed: int
-) -> list[Made]:
+    network: TicVla, prompts: Prompts, tokens: FrameTokens, anchors: Sequence[Anchor], config: KvConfig,
+    own_share: float, seed: int,
+) -> list[Made]:  # fmt: skip
     """All states of one drive by frame and draw; made in batches of about one length."""
-    wanted = [_wanted(prompts, anchor, n, config, seed) for anchor in anchors for n in range(config.draws)]
+    wanted = [
+        _wanted(prompts, anchor, n, config.words, own_share, seed) for anchor in anchors for n in range(config.draws)
+    ]
     made: list[Made] = []
     for own in (False, True):
         some = sorted((each for each in wanted if each.own is own), key=lambda each: each.tokens)
@@ -145,11 +153,11 @@ def _states(
     return sorted(made, key=lambda state: (state.k, state.draw))
 
 
-def _wanted(prompts: Prompts, anchor: Anchor, number: int, config: KvConfig, seed: int) -> _Wanted:
+def _wanted(prompts: Prompts, anchor: Anchor, number: int, words: DrawConfig, own_share: float, seed: int) -> _Wanted:
     """Drawn from a generator of its own: what a state is made with does not depend on which others are made."""
     rng = np.random.default_rng((seed, _TAG, crc32(anchor.drive_id.encode()), anchor.k, number))
-    own = bool(rng.uniform() < config.own_share)
-    drawn = draw(anchor, config.words, rng)
+    own = bool(rng.uniform() < own_share)
+    drawn = draw(anchor, words, rng)
     prompt, answer = prompts.of(anchor, drawn)
     return _Wanted(anchor, number, drawn, own, prompt, () if own else answer)
 

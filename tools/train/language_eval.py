@@ -36,7 +36,7 @@ class EvalConfig:
     """Anchors that are answered with the right words before them."""
     epoch_anchors: int = 64
     """The same after every epoch, for a curve."""
-    drives: int = 24
+    drives: int = 64
     """Drives along which the model hears only itself."""
     gap_s: float = 2.0
     """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
@@ -54,6 +54,7 @@ class Score:
     """Adds up answers; `numbers` are shares and means over them.
 
     A change is an anchor whose progress is not what it was at the generation before: there, repeating does not help.
+    A false change is another answer than the last one's where nothing has changed.
     """
 
     def __init__(self, gap_s: float) -> None:
@@ -74,6 +75,9 @@ class Score:
         if anchor.before(self._gap_s) not in (None, anchor.progress):
             found["changes"] += 1
             found["change right"] += progress == anchor.progress
+        elif anchor.before(self._gap_s) is not None:
+            found["repeats"] += 1
+            found["false change"] += progress != anchor.progress
         true_side = side_of(anchor.reasoning)
         if true_side is not None:
             found["sides"] += 1
@@ -97,6 +101,7 @@ class Score:
             "progress_right": _share(n["progress right"], n["answers"]),
             "change_right": _share(n["change right"], n["changes"]),
             "changes": n["changes"],
+            "false_change": _share(n["false change"], n["repeats"]),
             "side_right": _share(n["side right"], n["sides"]),
             "sides": n["sides"],
             "landmark_precision": _share(n["landmarks right"], n["landmarks said"]),

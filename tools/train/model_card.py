@@ -13,7 +13,7 @@ from edge.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
 from export.progress import duration
-from tools.train.chain import retired
+from tools.train.chain import GO_ON, retired
 from tools.train.drive import file_sha256
 from tools.train.network_file import START, read_network
 from tools.train.recipe import STAGES, Recipe
@@ -180,7 +180,7 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any]) -> st
         )
     for name in ("encoder", "sft", "imitate", "rl"):
         if name in results:
-            again = retired(run_dir) if name == "imitate" else 0
+            again = retired(run_dir, name) if name in GO_ON else 0
             after = f" (after {again} rounds of DAgger)" if again else ""
             lines += ["", f"### {name}{after}", "", *_facts(results[name])]
     return "\n".join(lines) + "\n"

@@ -57,12 +57,16 @@ class DaggerConfig:
     rounds: int = 2
     episodes: int = 150
     """Drives of one round."""
+    sft_rounds: int = 1
+    """The language model goes on after so many of the first rounds: an expert's drives hardly show it a missed turn."""
     latency_mean_s: float = 2.0
     """Mean generation time in those drives; each drive draws its own between 0 and twice this."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.rounds <= 100 and 1 <= self.episodes <= 100_000 and 0 <= self.latency_mean_s <= 10):
             raise RecipeError("expected 0 to 100 rounds of 1 to 100000 episodes and a mean latency of 0 to 10 s")
+        if self.sft_rounds < 0:
+            raise RecipeError(f"expected sft_rounds from 0 on, found {self.sft_rounds}")
 
 
 @dataclass(frozen=True)

@@ -2,54 +2,48 @@
 
 Where this differs from the paper it says so: rollouts are whole episodes, each in a fresh simulator, instead of 1,024
 steps across them, so that a run resumes exactly and has the same result on any number of processes; rewards are scaled
-for the value network; and a policy whose success on fixed training scenes drops is taken back to its best.
+for the value network; a policy that does worse on fixed training scenes is taken back to its best; and the best, which
+was chosen there by numbers that are partly luck, replaces the policy it began with only if it is ahead on fresh ones.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import torch
 
 from export.model.network import initialise
-from export.model.weights import weights_sha256
 from sim_hil.benchmark.latency import load_profile
 from sim_hil.benchmark.policies import robot_config
-from tools.train import checkpoint
 from tools.train.action_tail import check_tail
 from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
 from tools.train.exported import export_artifacts
 from tools.train.job import StageJob
 from tools.train.network_file import finish_network, read_network, weights_before
 from tools.train.point_goal_net import build_point_goal, save_point_goal
-from tools.train.ppo import PpoConfig, PpoOptimiser
+from tools.train.ppo import PpoConfig
 from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
+from tools.train.rl_state import STAGE, RlError, Score, State
 from tools.train.rl_worker import RolloutOrder
 from tools.train.rollout import Rollout
-from tools.train.scenarios import SHARES
+from tools.train.scenarios import SHARES, TASKS_PER_SCENE
 from tools.train.vector_env import drive
 
 if TYPE_CHECKING:
     from tools.train.recipe import Recipe
 
-STAGE: Final = "rl"
 POLICIES: Final = ("action", "point-goal")
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
-_SCENES, _EVALUATION_SCENES = 9003, 9002  # seeds of scenarios that no other stage draws
+# Seeds of scenarios that no other stage draws: to learn from, to choose the best by, to say whether it is better.
+_SCENES, _EVALUATION_SCENES, _FINAL_SCENES = 9003, 9002, 9004
+_EVALUATION_TASKS: Final = 2  # of one layout: more layouts tell more than more tasks in one
 _DELAYS: Final = 41
 STEPS_PER_EPISODE: Final = 300
 """As a rule: 30 s. For the plan of a run alone."""
-
-
-class RlError(ValueError):
-    """Nothing to improve, or a checkpoint of another run; one line."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +53,10 @@ class RlConfig:
     policy: str = "action"
     """What is trained: the action expert's last layer and head, or the paper's `point-goal` baseline from nothing."""
     iterations: int = 50
-    episodes: int = 12
-    """Whole episodes of one iteration; with some 250 steps each, 3,000 steps (the paper: 1,024)."""
-    episodes_per_job: int = 3
+    episodes: int = 16
+    """Whole episodes of one iteration; with some 250 steps each, 4,000 steps (the paper: 1,024)."""
+    episodes_per_job: int = TASKS_PER_SCENE
+    """One layout's: a job that begins inside a layout has to draw the tasks before its own too."""
     ppo: PpoConfig = field(default_factory=PpoConfig)
     log_std: tuple[float, ...] = (-1.9, -1.5)
     """Of the exploration of v and ω at the start: 0.15 m/s and 0.22 rad/s."""
@@ -74,7 +69,7 @@ class RlConfig:
     rotate_every: int = 100
     """Iterations in one kind of scene before the next; 0: all kinds in every iteration."""
     tasks: int = 3
-    """Tasks (layouts with a start and a goal) of each kind; 0: another one in every episode."""
+    """Tasks (layouts with a start and a goal) of each kind, each time with another crowd; 0: always another one."""
     drift: str = "typical"
     max_s: float = 90.0
     warmup_iterations: int = 3
@@ -83,13 +78,19 @@ class RlConfig:
     """Weight of a penalty on leaving the imitated commands; the paper has none."""
     evaluate_every: int = 10
     evaluate_episodes: int = 24
+    keep_margin: float = 0.06
+    """By how much more the evaluation's success must be than the best's to replace it: the best of many is luck too."""
     fall_back: float = 0.08
-    """By how much the evaluation's success may drop below the best before that one is taken up again."""
+    """By how much success may drop below the best's, or collisions rise at no more success, before that one is taken up
+    again."""
+    final_episodes: int = 32
+    """On fresh scenarios, with the policy it began with and with the best; the best is kept if it is ahead there."""
     jobs: int = 0
     """Worker processes; 0: as many as there are cores. Changes nothing in what comes out."""
 
     def __post_init__(self) -> None:
-        counts = (self.iterations, self.episodes, self.episodes_per_job, self.evaluate_every, self.evaluate_episodes)
+        driven = (self.episodes, self.episodes_per_job, self.evaluate_episodes, self.final_episodes)
+        counts = (self.iterations, self.evaluate_every, *driven)
         if self.policy not in POLICIES:
             raise ValueError(f"policy {self.policy!r}: expected one of {', '.join(POLICIES)}")
         if min(counts) < 1 or min(self.rotate_every, self.tasks, self.warmup_iterations, self.jobs) < 0:
@@ -102,8 +103,8 @@ class RlConfig:
             raise ValueError("expected a rotation of one kind or more, and drift none, typical or severe")
         if not (self.reward_scale > 0 and 0 <= self.mean_delay_s <= 30 and 5 <= self.max_s <= 3600):
             raise ValueError("expected reward_scale above 0, mean_delay_s from 0 to 30 and max_s from 5 to 3600")
-        if not (self.imitation >= 0 and 0 <= self.fall_back <= 1):
-            raise ValueError("expected imitation from 0 on and fall_back from 0 to 1")
+        if not (self.imitation >= 0 and 0 <= self.fall_back <= 1 and 0 <= self.keep_margin <= 1):
+            raise ValueError("expected imitation from 0 on, fall_back and keep_margin from 0 to 1")
 
     def kinds(self, iteration: int) -> dict[str, float]:
         """Shares of the kinds of scenes that an iteration drives in."""
@@ -129,22 +130,8 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     if config is None:
         return []
     evaluations = 1 + -(-config.iterations // config.evaluate_every)
-    episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes
+    episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes + 2 * config.final_episodes
     return [("steps driven and learned from", episodes * STEPS_PER_EPISODE, "ppo")]
-
-
-@dataclass(frozen=True)
-class Score:
-    """Of one evaluation by the mean action."""
-
-    success: float
-    collided: float
-    spl: float
-
-    @property
-    def order(self) -> tuple[float, float]:
-        """The higher the better."""
-        return (self.success - 0.5 * self.collided, self.spl)
 
 
 Drive = Callable[..., Rollout]
@@ -181,14 +168,14 @@ def run(job: StageJob) -> dict[str, Any]:
 def improve(
     job: StageJob, learner: Learner, before: Path, artifacts: Path | None, drive: Drive = drive
 ) -> dict[str, Any]:
-    """Train the learner's policy and value network in place; gives first and best scores. Ends with the best."""
+    """Train the learner's policy and value network in place; gives its scores. Ends with the best, or as it began."""
     config = job.recipe.rl or RlConfig()
-    state = _State(job, learner, PpoOptimiser(learner, config.ppo))
+    state = State(job, learner, config)
     orders = _Orders(job, config, before, artifacts)
     state.load()
     if state.iteration == 0:
-        state.first = state.best = _evaluate(job, config, orders, state, drive)
-        state.keep_best()
+        state.first = state.best = _evaluate(job, config, orders.evaluation(0, state.write_policy()), drive)
+        state.begin()
         state.save()
     while state.iteration < config.iterations:
         iteration = state.iteration
@@ -198,24 +185,41 @@ def improve(
         shutil.rmtree(order.out, ignore_errors=True)
         state.iteration += 1
         if state.iteration % config.evaluate_every == 0 or state.iteration == config.iterations:
-            score = _evaluate(job, config, orders, state, drive)
+            score = _evaluate(job, config, orders.evaluation(state.iteration, state.write_policy()), drive)
             numbers |= {"eval_success": score.success, "eval_collided": score.collided, "eval_spl": score.spl}
-            numbers["fell_back"] = float(state.judge(score, config.fall_back))
+            numbers["fell_back"] = float(state.judge(score))
         job.run_dir.log(STAGE, state.iteration, **numbers)
         job.progress.update(state.iteration, config.iterations, **numbers)
         state.save()
-    state.take_best()
+    final = _choose(job, config, orders, state, drive)
     assert state.first is not None and state.best is not None
     return {
         "iterations": config.iterations,
         "steps": state.steps,
         "before": asdict(state.first),
         "best": asdict(state.best),
+        **final,
         "log_std": [round(float(v), 4) for v in learner.log_std.detach()],
     }
 
 
-def _learn(job: StageJob, config: RlConfig, learner: Learner, state: _State, rollout: Rollout) -> dict[str, float]:
+def _choose(job: StageJob, config: RlConfig, orders: _Orders, state: State, drive: Drive) -> dict[str, Any]:
+    """End with the best if it is ahead of the policy it began with on scenarios that have chosen nothing."""
+    if not state.improved:
+        state.take("start")
+        return {"kept": "start", "final": {}}
+    scores: dict[str, Score] = {}
+    for name in ("start", "best"):
+        state.take(name)
+        scores[name] = _evaluate(job, config, orders.final(name, state.write_policy()), drive)
+    kept = "best" if scores["best"].ahead_of(scores["start"]) else "start"
+    state.take(kept)
+    before, after = scores["start"].success, scores["best"].success
+    job.progress.say(f"on fresh scenarios: success {before:g} before, {after:g} after; the {kept} is kept")
+    return {"kept": kept, "final": {name: asdict(score) for name, score in scores.items()}}
+
+
+def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, rollout: Rollout) -> dict[str, float]:
     ends = rollout.ends
     numbers = {
         "success": float(np.mean([end.success for end in ends])),
@@ -235,8 +239,7 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: _State, rol
     return {**numbers, **{key: float(value) for key, value in asdict(stats).items()}}
 
 
-def _evaluate(job: StageJob, config: RlConfig, orders: _Orders, state: _State, drive: Drive) -> Score:
-    order = orders.evaluation(state.iteration, state.write_policy())
+def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Score:
     ends = drive(order, jobs=config.jobs, per_job=config.episodes_per_job, stopped=job.should_stop).ends
     shutil.rmtree(order.out, ignore_errors=True)
     return Score(
@@ -260,20 +263,26 @@ class _Orders:
         """Exploring, on the iteration's scenarios."""
         seed = int(self.job.rng("rollout", iteration).integers(2**31))
         out = self.job.run_dir.stage(STAGE) / "rollouts" / f"{iteration:05d}"
-        return self._order(
-            policy, out, _SCENES, self.config.numbers(iteration), self.config.kinds(iteration), seed, explore=True
-        )
+        numbers, kinds = self.config.numbers(iteration), self.config.kinds(iteration)
+        return self._order(policy, out, _SCENES, numbers, kinds, seed, TASKS_PER_SCENE, explore=True)
 
     def evaluation(self, iteration: int, policy: Path) -> RolloutOrder:
         """The mean action, always on the same scenarios, all kinds of the rotation."""
         out = self.job.run_dir.stage(STAGE) / "rollouts" / f"evaluation-{iteration:05d}"
-        numbers = tuple(range(self.config.evaluate_episodes))
-        kinds = dict.fromkeys(self.config.rotation, 1.0)
-        return self._order(policy, out, _EVALUATION_SCENES, numbers, kinds, self.job.seed, explore=False)
+        return self._mean(policy, out, _EVALUATION_SCENES, self.config.evaluate_episodes)
+
+    def final(self, name: str, policy: Path) -> RolloutOrder:
+        """The same on scenarios that no evaluation has."""
+        out = self.job.run_dir.stage(STAGE) / "rollouts" / f"final-{name}"
+        return self._mean(policy, out, _FINAL_SCENES, self.config.final_episodes)
+
+    def _mean(self, policy: Path, out: Path, scenes: int, count: int) -> RolloutOrder:
+        numbers, kinds = tuple(range(count)), dict.fromkeys(self.config.rotation, 1.0)
+        return self._order(policy, out, scenes, numbers, kinds, self.job.seed, _EVALUATION_TASKS, explore=False)
 
     def _order(
         self, policy: Path, out: Path, scenes: int, numbers: tuple[int, ...], kinds: dict[str, float], seed: int,
-        *, explore: bool,
+        tasks_per_scene: int, *, explore: bool,
     ) -> RolloutOrder:  # fmt: skip
         return RolloutOrder(
             artifacts="" if self.artifacts is None else str(self.artifacts.absolute()),
@@ -290,89 +299,5 @@ class _Orders:
             drift=self.config.drift,
             max_s=self.config.max_s,
             seed=seed,
+            tasks_per_scene=tasks_per_scene,
         )
-
-
-class _State:
-    """The stage's checkpoint: policy, value network, exploration, moments, the best policy so far."""
-
-    def __init__(self, job: StageJob, learner: Learner, optimiser: PpoOptimiser) -> None:
-        self._job, self._learner, self.optimiser = job, learner, optimiser
-        folder = job.run_dir.stage(STAGE)
-        self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
-        content = {
-            "rl": asdict(job.recipe.rl or RlConfig()),
-            "seed": job.seed,
-            "before": weights_sha256(learner.network),
-        }
-        content["rl"].pop("jobs")
-        self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-        self.iteration = 0
-        self.steps = 0
-        self.first: Score | None = None
-        self.best: Score | None = None
-        self._best: dict[str, torch.Tensor] = {}
-
-    def write_policy(self) -> Path:
-        """What workers drive with now."""
-        log_std = [float(v) for v in self._learner.log_std.detach().clamp(*LOG_STD_RANGE)]
-        checkpoint.save(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
-        return self._policy
-
-    def keep_best(self) -> None:
-        """The policy as it is now is the best."""
-        self._best = self._learner.policy_tensors()
-
-    def take_best(self) -> None:
-        """Go back to the best policy."""
-        self._learner.load_policy(self._best)
-
-    def judge(self, score: Score, fall_back: float) -> bool:
-        """Keep a better policy; take the best up again when it has fallen too far, which is what is returned."""
-        if self.best is None or score.order > self.best.order:
-            self.best = score
-            self.keep_best()
-            return False
-        if score.success < self.best.success - fall_back:
-            self.take_best()
-            return True
-        return False
-
-    def save(self) -> None:
-        """After every iteration."""
-        learner, optimiser = self._learner, self.optimiser
-        tensors = {
-            **checkpoint.with_prefix("policy", learner.policy_tensors()),
-            **checkpoint.with_prefix("best", self._best),
-            **checkpoint.with_prefix("value", learner.network.value.state_dict()),
-            **checkpoint.with_prefix("actor", checkpoint.optimiser_tensors(optimiser.actor)),
-            **checkpoint.with_prefix("critic", checkpoint.optimiser_tensors(optimiser.critic)),
-            "log_std": learner.log_std.detach(),
-        }
-        scores = {name: asdict(score) for name in ("first", "best") if (score := getattr(self, name)) is not None}
-        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, **scores}
-        checkpoint.save(self._path, tensors, meta)
-
-    def load(self) -> None:
-        """Go on if asked to and able to. Raises RlError for another run's checkpoint."""
-        if not (self._job.resume and self._path.exists()):
-            self._job.run_dir.rewind(STAGE, -1)
-            shutil.rmtree(self._path.parent / "rollouts", ignore_errors=True)
-            return
-        tensors, meta = checkpoint.load(self._path)
-        if meta["key"] != self._key:
-            raise RlError(f"{self._path}: of another policy or another recipe; delete it to begin anew")
-        learner, optimiser = self._learner, self.optimiser
-        learner.load_policy(checkpoint.under("policy", tensors))
-        self._best = checkpoint.under("best", tensors)
-        learner.network.value.load_state_dict(checkpoint.under("value", tensors))
-        checkpoint.restore_optimiser(optimiser.actor, checkpoint.under("actor", tensors))
-        checkpoint.restore_optimiser(optimiser.critic, checkpoint.under("critic", tensors))
-        learner.log_std.data.copy_(tensors["log_std"])
-        self.iteration, self.steps = int(meta["iteration"]), int(meta["steps"])
-        self.first, self.best = _score(meta.get("first")), _score(meta.get("best"))
-        self._job.run_dir.rewind(STAGE, self.iteration)
-
-
-def _score(content: Mapping[str, float] | None) -> Score | None:
-    return None if content is None else Score(**content)

@@ -10,10 +10,11 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from edge.controller import grown
+from edge.controller import grown, limit_share
 from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.gym_env import DynaNavEnv
+from sim_hil.benchmark.world import EpisodeWorld
 from tools.train.rollout import EpisodeEnd, EpisodeSteps, goal_features
 from tools.train.scenarios import Scenario
 
@@ -33,6 +34,8 @@ class Chosen:
     queries: Floats | None = None
     latency: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     generation: int = 0
+    speed_scale: float = 1.0
+    """Share of the limits that the runner would leave: less where the last answer is too old."""
 
 
 class Pilot(Protocol):
@@ -89,18 +92,19 @@ def drive_episode(
         [episode], camera=(options.image_px,) * 2, drift=options.drift, scenes={episode.scene: scenario.scene}
     )
     try:
-        seen, info = env.reset(options={"episode": episode.id, "wording": wording})
+        _, info = env.reset(options={"episode": episode.id, "wording": wording})
         pilot = pilot_for(info["instruction"])
         places: deque[tuple[float, float]] = deque(maxlen=round(STUCK_S / CONTROL_S))
         total, cut, ended, timed_out = 0.0, "", False, False
         while not (ended or timed_out or cut):
-            time_s, state, T_odom_base = _known(seen)
+            time_s, image, state, T_odom_base = _known(env.world)
             goal_m = _goal_m(env.world.pose(), episode.goal_xy)
-            visual = pilot.see(time_s, seen["image"], T_odom_base)
+            visual = pilot.see(time_s, image, T_odom_base)
             chosen = pilot.choose(visual, state, goal_m, time_s, T_odom_base)
             pilot.think(time_s)
             action = (0.0, 0.0) if chosen is None else _explored(chosen.mean, std, rng)
-            seen, reward, ended, timed_out, _ = env.step(np.array(wheel.turned(*action), np.float32))
+            scale = 1.0 if chosen is None else chosen.speed_scale
+            _, reward, ended, timed_out, _ = env.step(np.array(wheel.turned(*action, scale), np.float32))
             total += reward
             if chosen is not None:
                 steps.add(visual[0], state, goal_features(*goal_m), action, reward, chosen)
@@ -109,8 +113,8 @@ def drive_episode(
             cut = "no-reasoning" if pilot.failure is not None else "stuck" if _is_stuck(places) else ""
         if not env.world.done:
             env.world.stop()
-        time_s, steps.after_state, T_odom_base = _known(seen)
-        steps.after_visual = pilot.see(time_s, seen["image"], T_odom_base)[0]
+        time_s, image, steps.after_state, T_odom_base = _known(env.world)
+        steps.after_visual = pilot.see(time_s, image, T_odom_base)[0]
         steps.after_goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
         steps.semantic = list(pilot.semantic)
         outcome = env.world.outcome()
@@ -139,10 +143,12 @@ class _Wheel:
         self._limits = limits
         self._last = (0.0, 0.0)
 
-    def turned(self, vx_mps: float, wz_radps: float) -> tuple[float, float, float]:
+    def turned(self, vx_mps: float, wz_radps: float, speed_scale: float = 1.0) -> tuple[float, float, float]:
         limits = self._limits
         vx_mps = min(max(vx_mps, 0.0), limits.vx_max_mps)
         wz_radps = min(max(wz_radps, -limits.wz_max_radps), limits.wz_max_radps)
+        share = limit_share(vx_mps, wz_radps, limits, speed_scale)
+        vx_mps, wz_radps = vx_mps * share, wz_radps * share
         vx_mps = grown(self._last[0], vx_mps, limits.accel_mps2 * CONTROL_S)
         wz_radps = grown(self._last[1], wz_radps, limits.alpha_radps2 * CONTROL_S)
         self._last = (vx_mps, wz_radps)
@@ -158,9 +164,14 @@ def _explored(
     return (mean[0] + float(noise[0]), mean[1] + float(noise[1]))
 
 
-def _known(seen: dict[str, npt.NDArray[np.float32]]) -> tuple[float, tuple[float, ...], SE2]:
-    """Time, s, body velocity and odometry pose of an observation."""
-    return float(seen["time"][0]), tuple(float(v) for v in seen["state"]), SE2(*(float(v) for v in seen["pose"]))
+def _known(world: EpisodeWorld) -> tuple[float, npt.NDArray[np.uint8], tuple[float, ...], SE2]:
+    """Time, s, picture, body velocity and odometry pose now.
+
+    Of the world, as in the benchmark: the environment's are float32, whose rounding releases answers a tick late.
+    """
+    seen = world.observe()
+    assert seen.image is not None  # the environment was asked for one
+    return seen.time_s, seen.image, seen.state, seen.T_odom_base
 
 
 def _goal_m(pose: SE2, goal_xy: tuple[float, float]) -> tuple[float, float]:

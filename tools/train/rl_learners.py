@@ -16,7 +16,7 @@ from torch import Tensor
 
 from export.model.network import TicVla
 from tools.train.action_tail import freeze_all_but_tail, load_tail, now_of, padded, tail, tail_parameters
-from tools.train.command_policy import LOG_STD_RANGE, CommandLimits, command_mean, entropy, log_prob
+from tools.train.command_policy import LOG_STD_RANGE, CommandLimits, arc_command, entropy, log_prob, within_limits
 from tools.train.gae import advantages
 from tools.train.point_goal_net import PointGoalNet
 from tools.train.rollout import GOAL_SCALE_M, Rollout
@@ -54,12 +54,16 @@ class Learner(ABC):
         """Give the policy other weights."""
 
     @abstractmethod
+    def arcs(self, rows: Tensor) -> Tensor:
+        """What steps' plans ask for, (v m/s, ω rad/s) [B, 2], within no limits yet."""
+
     def means(self, rows: Tensor) -> Tensor:
         """Mean commands (v m/s, ω rad/s) [B, 2] of steps."""
+        return within_limits(self.arcs(rows), self._limits)
 
-    def penalty(self, rows: Tensor, mean: Tensor) -> Tensor:
-        """Added to the loss; none as a rule."""
-        return mean.new_zeros(())
+    def penalty(self, rows: Tensor, arc: Tensor) -> Tensor:
+        """Added to the loss, by `arcs` of the steps; none as a rule."""
+        return arc.new_zeros(())
 
     @property
     def actor_parameters(self) -> list[torch.nn.Parameter]:
@@ -83,9 +87,10 @@ class Learner(ABC):
 
     def act(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `ppo.Learner`."""
-        mean = self.means(rows)
+        arc = self.arcs(rows)
+        mean = within_limits(arc, self._limits)
         log_std = self.log_std.clamp(*LOG_STD_RANGE)
-        penalty = self.penalty(rows, mean) if torch.is_grad_enabled() else mean.new_zeros(())
+        penalty = self.penalty(rows, arc) if torch.is_grad_enabled() else arc.new_zeros(())
         return log_prob(self._tensors["action"][rows], mean, log_std), entropy(log_std), penalty
 
     def value(self, rows: Tensor) -> Tensor:
@@ -118,7 +123,7 @@ class TailLearner(Learner):
     def __init__(
         self, network: TicVla, limits: CommandLimits, log_std: Sequence[float], *, imitation: float = 0.0
     ) -> None:
-        """`imitation`: weight of a penalty on leaving the means that the policy began with."""
+        """`imitation`: weight of a penalty on leaving the arcs that the policy began with."""
         super().__init__(network, limits, log_std)
         freeze_all_but_tail(network.action)
         self._imitation = imitation
@@ -139,25 +144,25 @@ class TailLearner(Learner):
         super().take(rollout)
         self._semantic = [torch.from_numpy(each).to(self.log_std.device) for each in rollout.semantic]
 
-    def means(self, rows: Tensor) -> Tensor:
+    def arcs(self, rows: Tensor) -> Tensor:
         """From what the rollout kept of the frozen layers."""
-        return self._means(rows, self.network.action)
+        return self._arcs(rows, self.network.action)
 
-    def penalty(self, rows: Tensor, mean: Tensor) -> Tensor:
-        """Squared distance, in standard deviations, from the commands that were imitated."""
+    def penalty(self, rows: Tensor, arc: Tensor) -> Tensor:
+        """Squared distance, in standard deviations, from the arcs that were imitated: beyond the limits it grows on."""
         if self._reference is None:
-            return mean.new_zeros(())
+            return arc.new_zeros(())
         with torch.no_grad():
-            wanted = self._means(rows, self._reference)
+            wanted = self._arcs(rows, self._reference)
             std = torch.exp(self.log_std.clamp(*LOG_STD_RANGE))
-        return self._imitation * (((mean - wanted) / std) ** 2).sum(-1).mean()
+        return self._imitation * (((arc - wanted) / std) ** 2).sum(-1).mean()
 
-    def _means(self, rows: Tensor, expert: torch.nn.Module) -> Tensor:
+    def _arcs(self, rows: Tensor, expert: torch.nn.Module) -> Tensor:
         t = self._tensors
         now = now_of(expert, t["visual"][rows], t["state"][rows], t["latency"][rows])
         semantic, real = padded([self._semantic[number] for number in t["generation"][rows].tolist()])
         trajectory = tail(expert, t["queries"][rows], now, semantic, real.to(semantic.device))
-        return command_mean(trajectory, self._step_s, self._limits)
+        return arc_command(trajectory, self._step_s)
 
 
 class PointGoalLearner(Learner):
@@ -177,9 +182,9 @@ class PointGoalLearner(Learner):
         """Raises RuntimeError for another network's."""
         self.net.load_state_dict(dict(tensors))
 
-    def means(self, rows: Tensor) -> Tensor:
-        """Of the plan's point 1 s ahead."""
+    def arcs(self, rows: Tensor) -> Tensor:
+        """To the plan's point 1 s ahead."""
         t = self._tensors
         # Kept in tens of metres for the value network.
         plan = self.net(t["visual"][rows], t["state"][rows], GOAL_SCALE_M * t["goal"][rows])
-        return command_mean(plan, self._step_s, self._limits)
+        return arc_command(plan, self._step_s)

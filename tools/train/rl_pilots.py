@@ -68,7 +68,13 @@ class TailPilot:
         x = prefix(self._expert, now, self._tokens)
         with torch.no_grad():
             mean = command_mean(tail(self._expert, x, now, self._tokens), self._step_s, self._limits)[0]
-        return Chosen((float(mean[0]), float(mean[1])), x[0].numpy().copy(), latency, len(self._semantic) - 1)
+        return Chosen(
+            (float(mean[0]), float(mean[1])),
+            x[0].numpy().copy(),
+            latency,
+            len(self._semantic) - 1,
+            self._mind.speed_scale(time_s),
+        )
 
     def think(self, time_s: float) -> None:
         """Start the next generation if none is under way."""

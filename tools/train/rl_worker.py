@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from export.model.config_file import config_from_dict
 from export.model.network import TicVla
 from sim_hil.benchmark.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.policies import robot_config
+from sim_hil.benchmark.worker_process import Message, worker_main
 from tools.train import checkpoint, rollout
 from tools.train.action_tail import check_tail, load_tail
 from tools.train.async_mind import Models
@@ -29,11 +30,10 @@ from tools.train.network_file import read_network
 from tools.train.point_goal_net import PointGoalNet
 from tools.train.rl_drive import DriveOptions, Pilot, drive_episode
 from tools.train.rl_pilots import PointGoalPilot, TailPilot
-from tools.train.scenarios import Scenario, training_episodes
-from tools.train.workers import Message, worker_main
+from tools.train.scenarios import FIRST_SEED, TASKS_PER_SCENE, Scenario, training_episodes
 
 MODULE: Final = "tools.train.rl_worker"
-_TAG: Final = 0x71
+_TAG, _CROWD, _DELAYS = 0x71, 0xC0, 0xDE
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class RolloutOrder:
     `network` are the weights before reinforcement learning, `model` their configuration, `policy` what is trained on
     top of them with its `log_std`, `artifacts` the exported encoder and language model (empty: a point-goal network is
     trained), `kinds` shares of scenes. `explore` False drives the mean. `generation_s`: reasoning times to draw from.
+    `first`: place of the first of `numbers` among all that are driven with this `seed`; all that is random is of seed
+    and place, so that a scenario that comes again is not the same episode again.
     """
 
     artifacts: str
@@ -59,6 +61,8 @@ class RolloutOrder:
     drift: str
     max_s: float
     seed: int
+    first: int = 0
+    tasks_per_scene: int = TASKS_PER_SCENE
 
     def to_json(self) -> dict[str, Any]:
         """What `of_json` reads."""
@@ -82,11 +86,43 @@ def messages(content: Message) -> Iterator[Message]:
     options = DriveOptions(network.config.vision.image_px, log_std, order.drift, order.max_s)
     pilots = _tail_pilots(order, network, tensors) if order.artifacts else _point_goal_pilots(network, tensors)
     driven = []
-    for number, scenario in zip(order.numbers, _scenarios(order), strict=True):
-        rng = np.random.default_rng((order.seed, number, _TAG))
-        driven.append(drive_episode(scenario, pilots(scenario, number), limits, options, rng))
+    for place, scenario in scenarios(order):
+        rng = np.random.default_rng((order.seed, place, _TAG))
+        driven.append(drive_episode(scenario, pilots(scenario, place), limits, options, rng))
         yield asdict(driven[-1][1])
     rollout.save(Path(order.out), driven)
+
+
+def scenarios(order: RolloutOrder) -> Iterator[tuple[int, Scenario]]:
+    """(place, scenario) of each episode. Exploring, each has a crowd and an odometry of its own.
+
+    A scenario is drawn once however often it comes; neighbours, which share a layout, are drawn together.
+    """
+    drawn: dict[int, Scenario] = {}
+    for place, number in enumerate(order.numbers, order.first):
+        if number not in drawn:
+            count = 1
+            while number + count in order.numbers:
+                count += 1
+            made = training_episodes(
+                order.scenario_seed, count, order.kinds, start=number, tasks_per_scene=order.tasks_per_scene
+            )
+            drawn |= dict(enumerate(made, number))
+        scenario = drawn[number]
+        yield place, crowded(scenario, order.seed, place) if order.explore else scenario
+
+
+def crowded(scenario: Scenario, seed: int, place: int) -> Scenario:
+    """The same task among other people: its episode's seed is of an order's seed and a place in it."""
+    crowd = FIRST_SEED + int(np.random.default_rng((seed, place, _CROWD)).integers(2**40))
+    return replace(scenario, episode=replace(scenario.episode, seed=crowd))
+
+
+def delays(order: RolloutOrder, scenario: Scenario, place: int) -> LatencySampler:
+    """Reasoning times of one episode."""
+    profile = LatencyProfile("training", "drawn", order.generation_s)
+    seed = int(np.random.default_rng((order.seed, place, _DELAYS)).integers(2**40))
+    return LatencySampler(profile, seed, scenario.episode.id)
 
 
 PilotFor = Callable[[str], Pilot]
@@ -98,10 +134,9 @@ def _tail_pilots(
     models, expert = Models(load_artifacts(Path(order.artifacts))), network.action
     check_tail(expert)
     load_tail(expert, tensors)
-    profile = LatencyProfile("training", "drawn", order.generation_s)
 
-    def pilots(scenario: Scenario, number: int) -> PilotFor:
-        draw = LatencySampler(profile, order.seed + number, scenario.episode.id).draw
+    def pilots(scenario: Scenario, place: int) -> PilotFor:
+        draw = delays(order, scenario, place).draw
         return lambda instruction: TailPilot(models, expert, _bounds(), instruction, draw)
 
     return pilots
@@ -111,22 +146,12 @@ def _point_goal_pilots(network: TicVla, tensors: Mapping[str, torch.Tensor]) -> 
     net = PointGoalNet(network.config).eval()
     net.load_state_dict(dict(tensors))
     step_s = network.config.action.step_s
-    return lambda scenario, number: lambda instruction: PointGoalPilot(network.vision, net, _bounds(), step_s)
+    return lambda scenario, place: lambda instruction: PointGoalPilot(network.vision, net, _bounds(), step_s)
 
 
 def _bounds() -> CommandLimits:
     limits = robot_config().limits
     return CommandLimits(limits.vx_max_mps, limits.wz_max_radps)
-
-
-def _scenarios(order: RolloutOrder) -> Iterator[Scenario]:
-    """Neighbours are drawn together: they share a layout."""
-    first, count = order.numbers[0], len(order.numbers)
-    if order.numbers == tuple(range(first, first + count)):
-        yield from training_episodes(order.scenario_seed, count, order.kinds, start=first)
-        return
-    for number in order.numbers:
-        yield from training_episodes(order.scenario_seed, 1, order.kinds, start=number)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +21,8 @@ from tokenizers import Tokenizer
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train import checkpoint
-from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw
+from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw, waiting
+from tools.train.chain import retired
 from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
@@ -29,7 +30,7 @@ from tools.train.language_batch import LanguageBatch, Row, buckets, collate, row
 from tools.train.language_eval import EvalConfig, evaluate, glance
 from tools.train.mirror import FOLDER as MIRRORED
 from tools.train.mirror import MirroredDataset, Views, mirrored
-from tools.train.network_file import finish_network, start_network
+from tools.train.network_file import finish_network, read_network, stage_weights, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
 from tools.train.tokens import TokenCache
 
@@ -55,6 +56,11 @@ class SftConfig:
     words: DrawConfig = field(default_factory=DrawConfig)
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
+    go_on_share: float = 0.4
+    go_on_lr_share: float = 0.3
+    """Of epochs and of the learning rate, after a round of DAgger, from the weights before; 0: from the beginning."""
+    deciding: int = 2
+    """How often an anchor is shown in an epoch near which the progress changes; the others once."""
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=1e-3, final_lr_share=0.02, warmup_steps=200, bf16=True)
     )
@@ -68,6 +74,10 @@ class SftConfig:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, self.checkpoint_steps) < 1 or self.held_anchors < 0:
             raise ValueError("expected epochs, batch and checkpoint_steps from 1 on and held_anchors from 0 on")
+        if not (0 <= self.go_on_share <= 1 and 0 < self.go_on_lr_share <= 1):
+            raise ValueError("expected go_on_share from 0 to 1 and go_on_lr_share above 0 to 1")
+        if not 1 <= self.deciding <= 16:
+            raise ValueError(f"expected deciding to be 1 to 16, found {self.deciding}")
         if not 0 <= self.mirrored <= 1:
             raise ValueError(f"expected mirrored to be a share from 0 to 1, found {self.mirrored}")
 
@@ -89,19 +99,25 @@ class Samples:
     """What can be drawn from the anchors of some drives."""
 
     def __init__(
-        self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0
-    ) -> None:
-        """`mirrored`: share of samples that are of the mirrored drive."""
+        self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0,
+        deciding: int = 1,
+    ) -> None:  # fmt: skip
+        """`mirrored`: share of samples that are of the mirrored drive; `deciding`: of an anchor that decides."""
         self.anchors = tuple(anchors)
+        self._shown = [i for i, each in enumerate(self.anchors) for _ in range(deciding if each.decides else 1)]
         self._prompts = prompts
         self._views = views
         self._words = words
         self._mirrored = mirrored
 
+    def __len__(self) -> int:
+        return len(self._shown)
+
     def draw(self, rng: np.random.Generator) -> list[Sample]:
-        """One sample of every anchor."""
+        """One sample of every anchor, `deciding` of those that decide."""
         drawn: list[Sample] = []
-        for index, anchor in enumerate(self.anchors):
+        for index in self._shown:
+            anchor = self.anchors[index]
             in_mirror = bool(rng.uniform() < self._mirrored)
             asked = mirrored(anchor) if in_mirror else anchor
             prompt, answer = self._prompts.of(asked, draw(asked, self._words, rng))
@@ -134,18 +150,30 @@ def run(job: StageJob) -> dict[str, Any]:
     """
     config = _config(job)
     dataset = Dataset.open(job.run_dir.stage("collect"))
-    network = start_network(job, STAGE)
+    network, epochs, optim = _start(job, config)
     plain = TokenCache(dataset, network.vision)
     mirror: TokenCache | None = None
     _encode(job, plain, dataset.ids)
     if config.mirrored > 0:
         mirror = TokenCache(MirroredDataset.of(dataset), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
+    job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
     result = fit(job, network.to(job.device), dataset, Views(plain, mirror))
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
     return result
+
+
+def _start(job: StageJob, config: SftConfig) -> tuple[TicVla, int, OptimConfig]:
+    """The network to begin with, for how many epochs it is trained and how."""
+    rounds = retired(job.run_dir, STAGE)
+    if not rounds or not config.go_on_share:
+        return start_network(job, STAGE), config.epochs, config.optim
+    path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
+    optim = replace(config.optim, lr=config.optim.lr * config.go_on_lr_share)
+    epochs = max(1, round(config.epochs * config.go_on_share))
+    return read_network(path, job.recipe.model, job.recipe.seed), epochs, optim
 
 
 def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
@@ -159,11 +187,12 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[
     config, language = _config(job), network.language
     content = tokenizer_for(network.config, None)
     prompts = Prompts(Tokenizer.from_buffer(content), network.config)
-    data = Samples(list(_anchors(dataset, dataset.train)), prompts, views, config.words, config.mirrored)
+    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train)]
+    data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
         raise SftError(f"{dataset.folder}: no anchors with reasoning to learn from; collect drives first")
-    per_epoch = -(-len(data.anchors) // config.batch)
+    per_epoch = -(-len(data) // config.batch)
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
     optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
@@ -245,6 +274,13 @@ def _held(held: Samples, config: SftConfig, seed: int) -> list[Sample]:
 def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
     for drive in dataset.drives(ids, pictures=False):
         yield from anchors_of(drive)
+
+
+def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
+    """One anchor a drive of a robot that has waited at its start for one generation or more."""
+    for number, drive in enumerate(dataset.drives(ids, pictures=False)):
+        for anchor in anchors_of(drive)[:1]:
+            yield waiting(anchor, 1 + number % 3)
 
 
 def _config(job: StageJob) -> SftConfig:

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from sim_hil.benchmark.worker_pool import Workers
 from tools.train.rl_worker import MODULE, RolloutOrder
 from tools.train.rollout import Rollout, read
-from tools.train.workers import Workers
 
 COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
@@ -22,11 +22,18 @@ class RolloutFailedError(RuntimeError):
 
 
 def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
-    """One order as several of at most `per_job` episodes, each with its own file below `order.out`."""
-    parts = [order.numbers[i : i + per_job] for i in range(0, len(order.numbers), per_job)]
+    """One order as several of at most `per_job` episodes, each with its own file below `order.out`.
+
+    Each knows where its episodes are in the whole order, so that no two of it are driven by the same chance.
+    """
     return [
-        replace(order, numbers=part, out=str(Path(order.out) / f"{number:03d}.safetensors"))
-        for number, part in enumerate(parts)
+        replace(
+            order,
+            numbers=order.numbers[first : first + per_job],
+            first=order.first + first,
+            out=str(Path(order.out) / f"{first // per_job:03d}.safetensors"),
+        )
+        for first in range(0, len(order.numbers), per_job)
     ]
 
 
@@ -47,14 +54,15 @@ def drive(
     folder.mkdir(parents=True, exist_ok=True)
     orders = split(order, per_job)
     waiting = [part for part in orders if not Path(part.out).is_file()]
-    workers = Workers(command, jobs or len(os.sched_getaffinity(0)), folder)
+    workers = Workers(command, jobs or len(os.sched_getaffinity(0)))
     try:
         while waiting or workers.running():
             if stopped():
                 raise KeyboardInterrupt
             while waiting and workers.free():
                 part = waiting.pop(0)
-                workers.start(Path(part.out).stem, part.to_json())
+                stem = Path(part.out).stem
+                workers.start(stem, part.to_json(), folder / f"{stem}.log")
             for line in workers.wait(_POLL_S):
                 if line.message is not None:
                     told(bool(line.message["success"]))

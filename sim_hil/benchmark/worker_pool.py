@@ -1,28 +1,23 @@
 """Jobs in processes of their own: a fresh interpreter each, one core, ended with their parent; JSON both ways.
 
-A worker module reads one job from its standard input and writes lines to the descriptor that it is given: whatever the
-libraries print goes to a log.
+What a worker module is like: `sim_hil.benchmark.worker_process`.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import selectors
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
 
-import cv2
-
-from sim_hil.benchmark.worker_process import SINGLE_THREADED, end_with_parent
+from sim_hil.benchmark.worker_process import SINGLE_THREADED, Message
 
 GRACE_S: Final = 2.0
 SILENT_S: Final = 3600.0
@@ -30,8 +25,6 @@ SILENT_S: Final = 3600.0
 _TAIL_CHARS: Final = 400
 _GREETING: Final = "pybullet build time"  # of every process that loads the engine
 _EXIT_POLL_S: Final = 0.05
-
-Message = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -55,12 +48,12 @@ class _Worker:
 
 
 class Workers:
-    """Up to `jobs` processes of `command` at a time, each with a log in `logs`."""
+    """Up to `jobs` processes of `command` at a time."""
 
-    def __init__(self, command: Sequence[str], jobs: int, logs: Path) -> None:
+    def __init__(self, command: Sequence[str], jobs: int) -> None:
         if jobs < 1:
             raise ValueError(f"workers: expected 1 job or more, found {jobs}")
-        self._command, self._jobs, self._logs = command, jobs, logs
+        self._command, self._jobs = command, jobs
         self._running: dict[str, _Worker] = {}
         self._selector = selectors.DefaultSelector()
 
@@ -72,9 +65,12 @@ class Workers:
         """Processes that have not ended."""
         return len(self._running)
 
-    def start(self, key: str, job: Mapping[str, Any]) -> None:
-        """Start a process on a job. Raises OSError when there can be none."""
-        log = self._logs / f"{key}.log"
+    def pids(self) -> dict[str, int]:
+        """Process id of every job that runs."""
+        return {key: worker.process.pid for key, worker in self._running.items()}
+
+    def start(self, key: str, job: Mapping[str, Any], log: Path) -> None:
+        """Start a process on a job; what it prints is in `log` until it ends well. Raises OSError for none."""
         reading, writing = os.pipe()
         try:
             with log.open("wb") as output:
@@ -122,9 +118,10 @@ class Workers:
         """End all processes: SIGTERM, then SIGKILL."""
         for worker in self._running.values():
             worker.process.terminate()
+        deadline_ns = time.monotonic_ns() + round(GRACE_S * 1e9)
         for worker in self._running.values():
             try:
-                worker.process.wait(GRACE_S)
+                worker.process.wait(max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9))
             except subprocess.TimeoutExpired:
                 worker.process.kill()
                 worker.process.wait()
@@ -136,7 +133,7 @@ class Workers:
         while not worker.at_end and (data := worker.lines.read(1 << 16)) is not None:  # None: nothing yet
             worker.buffer += data
             worker.heard_ns = time.monotonic_ns()
-            if not data:  # a pipe at its end is always readable
+            if not data:  # a pipe at its end is always readable: left registered, it would wake `wait` at once for ever
                 worker.at_end = True
                 self._selector.unregister(worker.lines)
         *whole, rest = bytes(worker.buffer).split(b"\n")
@@ -145,7 +142,7 @@ class Workers:
 
     def _finish(self, worker: _Worker) -> Told:
         del self._running[worker.key]
-        if not worker.at_end:
+        if not worker.at_end:  # a process that the worker has left behind holds its end open
             self._selector.unregister(worker.lines)
         worker.lines.close()
         code = worker.process.returncode
@@ -172,18 +169,3 @@ def _tail(log: Path) -> str:
         return ""
     last = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith(_GREETING)]
     return f": {last[-1]}" if last else ""
-
-
-def worker_main(prog: str, messages: Callable[[Message], Iterable[Mapping[str, Any]]]) -> int:
-    """Of a worker module: run the job from standard input, writing each of its messages as a line; returns 0."""
-    parser = argparse.ArgumentParser(prog=prog)
-    parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
-    parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
-    args = parser.parse_args()
-    end_with_parent(args.parent)
-    cv2.setNumThreads(1)
-    with os.fdopen(args.fd, "w", encoding="utf-8") as lines:
-        for message in messages(json.loads(sys.stdin.read())):
-            lines.write(json.dumps(message) + "\n")
-            lines.flush()
-    return 0
