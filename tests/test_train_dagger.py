@@ -26,7 +26,7 @@ from tools.train.collect_config import CollectConfig
 from tools.train.collection import CollectError, Collection
 from tools.train.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
 from tools.train.distributed import Ranks
-from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY
+from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
 from tools.train.job import QuietProgress
 from tools.train.recipe import DaggerConfig
 from tools.train.record import DrivePlan, Look, record
@@ -163,6 +163,40 @@ def test_a_round_that_was_begun_with_other_artifacts_is_not_gone_on_with(
 def test_the_counts_are_of_the_round_alone(tmp_path: Path, artifacts: Artifacts, filled: list[Collection]) -> None:
     dataset(tmp_path / "collect", drive("e00000", frames=20))
     assert dagger.run_round(_job(tmp_path), artifacts.directory, 2)["drives"] == 0
+
+
+def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
+    tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
+) -> None:
+    job = _job(tmp_path)
+    job.recipe.dagger = DaggerConfig(rounds=2, episodes=30, expert_episodes=7)
+    result = dagger.run_round(job, artifacts.directory, 1)
+    shown, driven = filled
+    assert (shown.prefix, shown.count, shown.policy) == ("n1-", 7, None) and driven.policy is not None
+    assert result["expert"]["drives"] == 0
+    dagger.run_round(job, artifacts.directory, 2)
+    assert len({asked.orders(tmp_path, lambda _: False)[0].scenario_seed for asked in filled}) == 4
+
+
+@pytest.mark.parametrize(("newest_only", "seen"), [(True, ("d2-0", "n2-0")), (False, ("d1-0", "d2-0", "e0", "n2-0"))])
+def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
+    tmp_path: Path, newest_only: bool, seen: tuple[str, ...]
+) -> None:
+    job = _job(tmp_path)
+    job.recipe.dagger = DaggerConfig(newest_only=newest_only)
+    job.run_dir.begun = lambda name: name in ("sft-0", "sft-1")
+    dataset(tmp_path / "collect", *(drive(name, frames=20) for name in ("e0", "d1-0", "d2-0", "n2-0")))
+    assert dagger.drives_after(job, "sft").ids == seen
+    assert len(dagger.drives_after(job, "imitate").ids) == 4  # no round has come before it
+
+
+def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
+    job = _job(tmp_path)
+    job.recipe.dagger = DaggerConfig(newest_only=True)
+    job.run_dir.begun = lambda name: name == "sft-0"
+    dataset(tmp_path / "collect", drive("e0", frames=20))
+    with pytest.raises(DriveError, match="d1- or n1-"):
+        dagger.drives_after(job, "sft")
 
 
 def test_under_torchrun_it_refuses(tmp_path: Path, artifacts: Artifacts) -> None:

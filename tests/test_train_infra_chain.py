@@ -18,7 +18,7 @@ from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights
 from export.shipped import shipped_weights
 from tools.train import chain, cli
-from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
+from tools.train.chain import Step, adopt, is_done, may_begin, retired, run_step, steps_of, steps_until
 from tools.train.exported import ExportError, export_artifacts, model_argument
 from tools.train.job import StageJob
 from tools.train.model_card import CardError, card, ship, write_card
@@ -30,7 +30,7 @@ from tools.train.network_file import (
     start_network,
     weights_before,
 )
-from tools.train.recipe import DaggerConfig, load_recipe
+from tools.train.recipe import DaggerConfig, Recipe, load_recipe
 from tools.train.run_dir import RunDir, RunDirError
 
 TINY = load_recipe("tiny")
@@ -165,6 +165,41 @@ def test_a_run_may_begin_with_weights_that_were_there(run_dir: RunDir, tmp_path:
     )
 
 
+NEWEST = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1, newest_only=True))
+
+
+def adopted(run_dir: RunDir, tmp_path: Path, after: str) -> list[str]:
+    """The names of what is still to be done after adopting somebody's weights there."""
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
+    adopt(run_dir, steps_until(after, NEWEST))
+    return [step.name for step in steps_of("all", NEWEST) if not is_done(run_dir, step)]
+
+
+def test_a_run_goes_on_from_the_weights_that_imitation_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
+    left = adopted(run_dir, tmp_path, "imitate")
+    assert left == ["dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate"]
+    policy = weights_before(run_dir.out, "rl")
+    assert policy == run_dir.out / "imitate" / "model.safetensors"
+    assert policy.read_bytes() == run_dir.model_path.read_bytes()
+
+
+def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
+    assert adopted(run_dir, tmp_path, "imitate-1") == ["dagger-2", "imitate-2", "rl", "evaluate"]
+    assert (retired(run_dir, "sft"), retired(run_dir, "imitate")) == (1, 1)
+    run_step(job(run_dir), Step("imitate", 2), stage_that("after"))
+    assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and retired(run_dir, "imitate") == 2
+
+
+@pytest.mark.parametrize(
+    ("after", "recipe", "says"),
+    [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
+)
+def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
+    with pytest.raises(RunDirError, match=says):
+        steps_until(after, recipe)
+
+
 # Export in between
 
 
@@ -249,6 +284,7 @@ def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, ca
         (("sft", "--preset", "tiny", "--set", "sft.epoch=1", "--out", "x"), "did you mean epochs"),
         (("sft", "--preset", "tiny", "--scores", "f.json", "--out", "x"), "belong to card"),
         (("imitate", "--preset", "tiny", "--delay-profile", "no.json", "--out", "x"), "cannot be read"),
+        (("imitate", "--preset", "tiny", "--after", "imitate", "--out", "x"), "expected --checkpoint with it"),
         (("card", "--out", "x"), "the folder of a run"),
     ],
 )

@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 
 from tests.train_drives import tiny_model
 from tools.train.augment import AugmentConfig, encoded
-from tools.train.distributed import ranks_of_environment
+from tools.train.distributed import leave, ranks_of_environment
 from tools.train.encoder import EncoderConfig, run
 from tools.train.encoder_data import FramesConfig, Shard, finish, path_of, plan
 from tools.train.encoder_labels import CLASSES, COLOUR_WORDS, COLUMNS, LANDMARK, NONE, PERSON, SOMEBODY, label_shapes
@@ -87,3 +87,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    leave(0)

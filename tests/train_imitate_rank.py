@@ -15,7 +15,7 @@ from edge.reasoning_text import format_waypoints
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, build
 from tests.train_drives import VAL_LAYOUT, MadeUpTokens, made_up_drive, tiny_model, write_dataset
-from tools.train.distributed import ranks_of_environment
+from tools.train.distributed import leave, ranks_of_environment
 from tools.train.drive import EXPERT, FUTURE_STEPS, TRACE_EVERY, Dataset, Drive
 from tools.train.futures import label_futures
 from tools.train.imitate import ImitateConfig, fit
@@ -132,3 +132,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    leave(0)

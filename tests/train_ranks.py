@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from tools.train.distributed import BatchOrder, Ranks, ranks_of_environment
+from tools.train.distributed import BatchOrder, Ranks, leave, ranks_of_environment
 from tools.train.optim import OptimConfig, Optimiser
 
 SAMPLES, BATCH, EPOCHS = 50, 8, 3
@@ -47,4 +47,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -12,7 +12,7 @@ import torch
 from export.model.network import TicVla, build
 from tests.train_drives import MadeUpTokens, tiny_model
 from tools.train.anchors import DrawConfig
-from tools.train.distributed import ranks_of_environment
+from tools.train.distributed import leave, ranks_of_environment
 from tools.train.drive import Dataset
 from tools.train.job import StageJob
 from tools.train.language_eval import EvalConfig
@@ -58,3 +58,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    leave(0)

@@ -57,7 +57,10 @@ def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
 
 def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
     if step.stage == "dagger":
-        return [("drives of the policy", recipe.dagger.episodes, "policy-drive")]
+        shown = (
+            [("drives of the expert", recipe.dagger.expert_episodes, "drive")] if recipe.dagger.expert_episodes else []
+        )
+        return [*shown, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
     if step.stage == "evaluate":
         count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
         return [("episodes", count, "policy-drive")]
@@ -68,10 +71,14 @@ def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
 
 def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> list[tuple[str, int, str]]:
     """What goes on after a round of DAgger: what is cached of the new drives, and the share that is learned again."""
-    more = recipe.dagger.episodes / recipe.collect.episodes if recipe.collect is not None else 1.0
+    dagger = recipe.dagger
+    drives = dagger.episodes + dagger.expert_episodes
+    more = drives / recipe.collect.episodes if recipe.collect is not None else 1.0
     config = recipe.imitate if stage == "imitate" else recipe.sft
     share = (config.go_on_share or 1.0) if config is not None else 1.0
-    return [(what, round(count * (more if key in ("kv", "encode") else share)), key) for what, count, key in work]
+    # An epoch is as long as its drives are many; imitation's samples are a number of their own.
+    shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
+    return [(what, round(count * shares.get(key, share)), key) for what, count, key in work]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:

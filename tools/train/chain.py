@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from tools.train.drive import file_sha256
 from tools.train.exported import export_artifacts
 from tools.train.job import StageJob
-from tools.train.network_file import weights_before
+from tools.train.network_file import ORDER, START, stage_weights, weights_before
 from tools.train.recipe import STAGES, Recipe
 from tools.train.run_dir import RunDir, RunDirError
 
@@ -77,6 +79,33 @@ def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
     again = step.stage in GO_ON and step.round > retired(run_dir, step.stage)
     if run_dir.begun(where) and not resume and not again:
         raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
+
+
+def steps_until(name: str, recipe: Recipe) -> list[Step]:
+    """The steps up to that one; raises RunDirError for one that the recipe does not have, or that leaves no policy."""
+    steps = steps_of("all", recipe)
+    policies = [step.name for step in steps if step.stage in ("imitate", "rl")]
+    if name not in policies:
+        raise RunDirError(f"--after {name}: expected one of {', '.join(policies)}")
+    before = steps[: [step.name for step in steps].index(name) + 1]
+    if len(before) < len(steps) and not recipe.dagger.newest_only and steps[len(before)].stage == "dagger":
+        raise RunDirError(f"--after {name}: the drives before it are not here; set dagger.newest_only=true")
+    return before
+
+
+def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
+    """Take the weights that the run began with for what these steps have left: what follows them is next."""
+    start = stage_weights(run_dir.out, START)
+    result = {"adopted": file_sha256(start)}
+    for step in steps:
+        if step.stage in GO_ON and step.round > retired(run_dir, step.stage):
+            run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
+        name = step.name if step.stage == "dagger" else step.stage
+        run_dir.stage(name)
+        if step.stage in ORDER:
+            shutil.copyfile(start, stage_weights(run_dir.out, name))
+        run_dir.finish(name, result)
+    shutil.copyfile(start, run_dir.model_path)
 
 
 def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | None = None) -> dict[str, Any]:

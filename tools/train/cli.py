@@ -28,7 +28,7 @@ from tools.benchmark_runs import RunsError
 from tools.train import budget, chain
 from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.curves import draw_curves
-from tools.train.distributed import Ranks, ranks_of_environment
+from tools.train.distributed import Ranks, leave, ranks_of_environment
 from tools.train.exported import ExportError
 from tools.train.job import StageJob, StopFlag
 from tools.train.model_card import ship, write_card
@@ -52,6 +52,7 @@ EXAMPLES: Final = """examples:
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
   edge-train imitate --out out/run --delay-profile orin.latency.json
   edge-train imitate --from out/run --variant no-latency --out out/no-latency
+  edge-train dagger --preset nano --checkpoint export/weights/nano.safetensors --after imitate --out out/more
   edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to give away
 
 stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
@@ -93,6 +94,9 @@ def parser() -> argparse.ArgumentParser:
         "--checkpoint", type=Path, metavar="PATH", action="append", default=[],
         help="begin with these weights, such as a backbone's (as edge-export reads them); repeatable",
     )  # fmt: skip
+    p.add_argument(
+        "--after", metavar="STEP", help="the weights of --checkpoint are what this step has left: go on after it"
+    )
     p.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where networks are trained (default: cpu)")
     p.add_argument("--delay-profile", type=Path, metavar="FILE", help="imitate under these delays (edge-calib latency)")
     p.add_argument(
@@ -153,9 +157,12 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
         raise UsageError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
         raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
+    if args.after is not None and not args.checkpoint:
+        raise UsageError("--after: expected --checkpoint with it, the weights that the step has left")
+    before = chain.steps_until(args.after, recipe) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
-        return _train(args, recipe, steps, ranks)
+        return _train(args, recipe, steps, before, ranks)
 
 
 def _recipe(args: argparse.Namespace) -> Recipe:
@@ -206,7 +213,9 @@ def deterministic(device: str) -> Iterator[None]:
         torch.utils.deterministic.fill_uninitialized_memory = before[1]
 
 
-def _train(args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], ranks: Ranks) -> dict[str, Any]:
+def _train(
+    args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], before: Sequence[Step], ranks: Ranks
+) -> dict[str, Any]:
     if ranks.world > 1 and args.command not in chain.DISTRIBUTED:
         raise UsageError(f"{args.command}: runs in one process; torchrun is for {', '.join(chain.DISTRIBUTED)}")
     run_dir = RunDir(args.out)
@@ -216,6 +225,8 @@ def _train(args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], rank
             run_dir.borrow(RunDir(args.base), BORROWED, recipe)
         if args.checkpoint and not run_dir.begun(START):
             import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
+            if before:
+                chain.adopt(run_dir, before)
     ranks.barrier()
     results: dict[str, Any] = {}
     with stop_flag() as stop:
@@ -292,4 +303,6 @@ def _fail(code: int, line: str) -> int:
 
 
 if __name__ == "__main__":
+    if "WORLD_SIZE" in os.environ:
+        leave(main())
     sys.exit(main())

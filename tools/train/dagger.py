@@ -1,7 +1,7 @@
 """Rounds in which the policy drives and the expert says what it would have done (DAgger, Ross et al. 2011).
 
 The exported artifacts drive, with delays drawn for every drive, through the code that drives on a robot: what is
-labelled are the states that the deployed policy gets itself into.
+labelled are the states that the deployed policy gets itself into. New drives of the expert may come with them.
 """
 
 from __future__ import annotations
@@ -10,16 +10,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tools.train.collect_config import CollectConfig
+from tools.train.drive import Dataset
 
 if TYPE_CHECKING:
     from tools.train.job import StageJob
 
 BETA: Final = 0.5  # the expert's share of the first round; halved in every one after it
+_EXPERT_TURNS: Final = 1_000  # rounds, of which there are 100 at most, take the turns below
 
 
-def prefix_of(round_number: int) -> str:
-    """How the ids of a round's drives begin; rounds count from 1."""
-    return f"d{round_number}-"
+def prefixes_of(round_number: int) -> tuple[str, str]:
+    """How the ids of a round's drives begin, the policy's and the expert's; rounds count from 1."""
+    return f"d{round_number}-", f"n{round_number}-"
+
+
+def drives_after(job: StageJob, stage: str) -> Dataset:
+    """The drives that a stage learns from: all, or those of the newest round (`dagger.newest_only`). Raises DriveError.
+
+    Before the first round those are the same.
+    """
+    from tools.train.chain import retired
+
+    dataset, rounds = Dataset.open(job.run_dir.stage("collect")), retired(job.run_dir, stage)
+    if rounds and job.recipe.dagger.newest_only:
+        return dataset.of(*prefixes_of(rounds))
+    return dataset
 
 
 def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, Any]:
@@ -37,14 +52,19 @@ def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, An
         raise ValueError(f"dagger: rounds count from 1, found {round_number}")
     if job.ranks.world > 1:
         raise CollectError("dagger starts processes of its own (collect.jobs): run it without torchrun")
-    config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
+    config, numbers = job.recipe.collect if job.recipe.collect is not None else CollectConfig(), job.recipe.dagger
     sha256 = load_artifacts(artifacts).manifest_sha256
-    beta, mean_s = BETA / 2 ** (round_number - 1), job.recipe.dagger.latency_mean_s
+    beta, mean_s = BETA / 2 ** (round_number - 1), numbers.latency_mean_s
     policy = PolicyOptions(str(artifacts.absolute()), sha256, beta, mean_s)
-    prefix = prefix_of(round_number)
-    collection = Collection(prefix, job.recipe.dagger.episodes, job.seed, round_number, config, policy)
+    prefix, beside = prefixes_of(round_number)
+    driven = Collection(prefix, numbers.episodes, job.seed, round_number, config, policy)
+    shown = Collection(beside, numbers.expert_episodes, job.seed, _EXPERT_TURNS + round_number, config)
     with DatasetWriter(job.run_dir.stage("collect")) as writer:
         if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"{POLICY_DRIVER}{sha256[:12]}"}):
             raise CollectError(f"dagger round {round_number}: begun with {others[0]}; go on with the same artifacts")
-        fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
-        return {**result_of(writer, prefix), "beta": beta, "policy": sha256}
+        for collection in (shown, driven) if shown.count else (driven,):
+            fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
+        result: dict[str, Any] = {**result_of(writer, prefix), "beta": beta, "policy": sha256}
+        if numbers.expert_episodes:
+            result["expert"] = writer.summary(beside)
+        return result

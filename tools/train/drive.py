@@ -289,6 +289,13 @@ class Dataset:
         """Ids of the drives in layouts that are never learned from."""
         return tuple(entry.id for entry in self.entries if entry.val)
 
+    def of(self, *prefixes: str) -> Dataset:
+        """The drives whose ids begin with one of these. Raises DriveError where there is none."""
+        entries = tuple(entry for entry in self.entries if entry.id.startswith(prefixes))
+        if not entries:
+            raise DriveError(f"{self.folder}: no drives whose names begin with {' or '.join(prefixes)}; collect again")
+        return Dataset(self.folder, entries)
+
     @property
     def sha256(self) -> str:
         """Of all drives: the same files give the same, in whatever order they were made."""

@@ -18,6 +18,7 @@ import torch
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train.chain import retired
+from tools.train.dagger import drives_after
 from tools.train.delays import DelayConfig, Delays
 from tools.train.drive import Dataset
 from tools.train.drive_frames import DriveFrames
@@ -113,7 +114,7 @@ def run(job: StageJob) -> dict[str, Any]:
     Raises ImitateError, SampleError, LatencyError, DriveError, TokenCacheError, KvCacheError, NetworkFileError.
     """
     config = _config(job)
-    dataset = Dataset.open(job.run_dir.stage("collect"))
+    dataset = drives_after(job, STAGE)
     network, share = _start(job, config)
     tokens = _encoded(job, TokenCache(dataset, network.vision), dataset.ids)
     seconds: TokenCache | None = None

@@ -56,7 +56,11 @@ class DaggerConfig:
 
     rounds: int = 2
     episodes: int = 150
-    """Drives of one round."""
+    """Drives of the policy in one round."""
+    expert_episodes: int = 0
+    """New drives of the expert alone beside them, in other layouts than all before."""
+    newest_only: bool = False
+    """Learn after a round from its drives alone. It then needs nothing of what is before it but the weights."""
     sft_rounds: int = 1
     """The language model goes on after so many of the first rounds: an expert's drives hardly show it a missed turn."""
     latency_mean_s: float = 2.0
@@ -65,8 +69,8 @@ class DaggerConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.rounds <= 100 and 1 <= self.episodes <= 100_000 and 0 <= self.latency_mean_s <= 10):
             raise RecipeError("expected 0 to 100 rounds of 1 to 100000 episodes and a mean latency of 0 to 10 s")
-        if self.sft_rounds < 0:
-            raise RecipeError(f"expected sft_rounds from 0 on, found {self.sft_rounds}")
+        if min(self.sft_rounds, self.expert_episodes) < 0 or self.expert_episodes > 100_000:
+            raise RecipeError("expected sft_rounds from 0 on and expert_episodes of 0 to 100000")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw, waiting
 from tools.train.chain import retired
+from tools.train.dagger import drives_after
 from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
@@ -149,7 +150,7 @@ def run(job: StageJob) -> dict[str, Any]:
     Raises SftError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
     """
     config = _config(job)
-    dataset = Dataset.open(job.run_dir.stage("collect"))
+    dataset = drives_after(job, STAGE)
     network, epochs, optim = _start(job, config)
     plain = TokenCache(dataset, network.vision)
     mirror: TokenCache | None = None
