@@ -33,6 +33,7 @@ from tools.train.exported import ExportError
 from tools.train.job import StageJob, StopFlag
 from tools.train.model_card import ship, write_card
 from tools.train.network_file import START, import_start
+from tools.train.optim import computes_bf16
 from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.run_dir import RunDir
 from tools.train.show import progress_for
@@ -260,6 +261,8 @@ def _step(
                 ranks=ranks,
                 stop=stop,
             )
+            if asks_bf16(recipe, step) and not computes_bf16(args.device):
+                progress.say("computes in float32: this processor has no instructions for bfloat16")
             result = run_step(job, step)
     finally:
         took_s = (time.monotonic_ns() - started_ns) / 1e9
@@ -269,6 +272,12 @@ def _step(
         draw_curves(run_dir)
     _say(ranks, f"{step.name}: done in {duration(took_s)}")
     return result
+
+
+def asks_bf16(recipe: Recipe, step: Step) -> bool:
+    """Whether a stage's numbers ask for bfloat16."""
+    optim = getattr(getattr(recipe, step.stage, None), "optim", None)
+    return bool(getattr(optim, "bf16", False))
 
 
 @contextmanager

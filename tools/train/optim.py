@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 
@@ -100,6 +101,15 @@ def learning_rate(config: OptimConfig, step: int, total_steps: int) -> float:
 
 
 def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
-    """bfloat16 where `bf16` says so; float32 otherwise."""
+    """bfloat16 where `bf16` says so and the device computes in it; float32 otherwise."""
     kind = torch.device(device).type
-    return torch.autocast(kind, dtype=torch.bfloat16) if bf16 else nullcontext()
+    return torch.autocast(kind, dtype=torch.bfloat16) if bf16 and computes_bf16(kind) else nullcontext()
+
+
+@cache
+def computes_bf16(device: str) -> bool:
+    """Whether the device has instructions for bfloat16: without them torch takes some twenty times as long."""
+    if torch.device(device).type != "cpu":
+        return True
+    found = torch.cpu.get_capabilities()
+    return any(found.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))

@@ -14,6 +14,7 @@ from typing import Any, Final
 from edge.cli import write_whole
 from export import model
 from sim_hil.benchmark.code_version import code_sha256
+from tools.train.optim import computes_bf16
 from tools.train.recipe import STAGES, Recipe, load_recipe
 
 VERSIONS: Final = "versions.json"
@@ -187,7 +188,12 @@ def versions() -> dict[str, Any]:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             found[package] = None
-    machine = {"machine": platform.machine(), "cpus": os.cpu_count(), "system": platform.platform()}
+    machine = {
+        "machine": platform.machine(),
+        "bfloat16": computes_bf16("cpu"),
+        "cpus": os.cpu_count(),
+        "system": platform.platform(),
+    }
     code = {"simulation": code_sha256(), "training": _training_sha256()}
     return {"python": platform.python_version(), "packages": found, "code_sha256": code, **machine}
 
