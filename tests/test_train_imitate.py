@@ -18,6 +18,7 @@ from export.model.network import build
 from tests.train_drives import MadeUpTokens, tiny_model
 from tests.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, trained
 from tests.train_stage_contract import Run, StageContract
+from tools.train import optim
 from tools.train.chain import Step, run_step
 from tools.train.drive import Dataset
 from tools.train.imitate import (
@@ -127,8 +128,9 @@ VARIANTS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("model", "config"), VARIANTS, ids=[str({**a, **b})[:60] for a, b in VARIANTS])
 def test_every_variant_of_the_paper_can_be_trained(
-    tmp_path: Path, dataset: Dataset, model: dict[str, Any], config: dict[str, Any]
+    tmp_path: Path, dataset: Dataset, model: dict[str, Any], config: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
     short = dataclasses.replace(CONFIG, samples=16, held_steps=2, evaluate=ImitateEvalConfig(samples=4, batch=4))
     job = imitate_job(tmp_path, dataclasses.replace(short, **config), with_action(**model))
     network, result = trained(dataset, job)

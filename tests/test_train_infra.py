@@ -19,7 +19,7 @@ from tests import train_ranks
 from tools.train import checkpoint
 from tools.train.distributed import SINGLE, BatchOrder, Ranks
 from tools.train.job import StageJob
-from tools.train.optim import OptimConfig, Optimiser, learning_rate
+from tools.train.optim import OptimConfig, Optimiser, autocast, computes_bf16, learning_rate
 from tools.train.recipe import Recipe, load_recipe
 from tools.train.run_dir import RunDir, RunDirError
 
@@ -217,6 +217,23 @@ def test_the_learning_rate_warms_up_and_falls_like_a_cosine() -> None:
 
 def test_a_short_run_warms_up_for_a_tenth_of_it() -> None:
     assert learning_rate(OptimConfig(lr=0.1, warmup_steps=1000), 5, 50) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("has", "kind"),
+    [({"avx2": True}, torch.float32), ({"avx512_bf16": True}, torch.bfloat16), ({"amx_bf16": True}, torch.bfloat16)],
+)
+def test_a_processor_computes_in_bfloat16_only_with_instructions_for_it(
+    has: dict[str, bool], kind: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: has)
+    computes_bf16.cache_clear()
+    try:
+        with autocast("cpu", bf16=True):
+            assert torch.nn.functional.linear(torch.ones(1, 2), torch.ones(1, 2)).dtype is kind
+        assert computes_bf16("cuda")
+    finally:
+        computes_bf16.cache_clear()
 
 
 def test_gradients_are_clipped_by_their_norm() -> None:
