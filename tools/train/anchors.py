@@ -33,6 +33,8 @@ FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """How far before the newest frame the older ones are (paper appendix A), the oldest first."""
 WAYPOINTS_START: Final = "waypoints:"
 """An assistant's turn that begins so has no reasoning: the model is asked for the points alone."""
+AROUND: Final = 3
+"""Frames before and after an anchor at which its words still hold."""
 _NS: Final = 1_000_000_000
 _NEAR: Final = 3  # traces, before and after
 _AHEAD_SHARE: Final = 0.5  # of wrong words
@@ -87,6 +89,8 @@ class Anchor:
     """The progress at every second from the drive's start up to k, which is the last."""
     decides: bool = False
     """The progress changes within 3 s: here repeating what was said before does not help."""
+    around: tuple[Waypoints | None, ...] = ()
+    """`points` of the frames from AROUND before it to AROUND after it; None where the drive has none."""
     waited: bool = False
     """The robot has stood here since the instruction, for a generation or more."""
 
@@ -138,7 +142,8 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         earlier.append(said[number])
         if k % every:
             continue
-        points: Waypoints = tuple((float(x), float(y)) for x, y in drive.plan_xy[k])
+        around = tuple(_points(drive, i) if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1))
+        points = _points(drive, k)
         found.append(
             Anchor(
                 drive_id=drive.id,
@@ -150,10 +155,15 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 reasoning=Trace.from_json(trace).text(points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
+                around=around,
                 decides=said[max(0, number - _NEAR)] != said[min(number + _NEAR, len(said) - 1)],
             )
         )
     return found
+
+
+def _points(drive: Drive, k: int) -> Waypoints:
+    return tuple((float(x), float(y)) for x, y in drive.plan_xy[k])
 
 
 def waiting(anchor: Anchor, generations: int) -> Anchor:

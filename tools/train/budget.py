@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from export.progress import duration
 from tools.train.chain import Step
+from tools.train.optim import computes_bf16
 from tools.train.recipe import STAGES, Recipe
 
 if sys.version_info >= (3, 11):
@@ -42,7 +43,10 @@ class Line:
 def throughputs(model: str, device: str) -> Mapping[str, float]:
     """Measured samples a second by key, for a network and a kind of device; empty where there are none."""
     tables = tomllib.loads(FILE.read_text(encoding="utf-8"))
-    found: Mapping[str, float] = tables.get(model, {}).get(device.partition(":")[0], {}).get("rates", {})
+    kind = device.partition(":")[0]
+    if kind == "cpu" and not computes_bf16(kind):
+        kind = "cpu-float32"
+    found: Mapping[str, float] = tables.get(model, {}).get(kind, {}).get("rates", {})
     return found
 
 

@@ -27,7 +27,8 @@ from tools.train.dagger import drives_after
 from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
-from tools.train.language_batch import LanguageBatch, Row, buckets, collate, row_losses
+from tools.train.language_augment import ShowConfig, disturbed, shifted
+from tools.train.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
 from tools.train.language_eval import EvalConfig, evaluate, glance
 from tools.train.mirror import FOLDER as MIRRORED
 from tools.train.mirror import MirroredDataset, Views, mirrored
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
-_DRAWS, _ORDER, _HELD = 0x5F71, 0x5F72, 0x5F73
+_DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
 
 
 class SftError(ValueError):
@@ -55,6 +56,7 @@ class SftConfig:
     batch: int = 32
     """Samples of all ranks together."""
     words: DrawConfig = field(default_factory=DrawConfig)
+    shown: ShowConfig = field(default_factory=ShowConfig)
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
     go_on_share: float = 0.4
@@ -91,6 +93,9 @@ class Sample:
     in_mirror: bool
     prompt: npt.NDArray[np.int32]
     answer: npt.NDArray[np.int32]
+    frames: tuple[int, ...]
+    noise_seed: int | None = None
+    """Of what disturbs the visual tokens; None: nothing does."""
 
     def __len__(self) -> int:
         return len(self.prompt) + len(self.answer)
@@ -101,15 +106,17 @@ class Samples:
 
     def __init__(
         self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0,
-        deciding: int = 1,
+        deciding: int = 1, shown: ShowConfig | None = None,
     ) -> None:  # fmt: skip
-        """`mirrored`: share of samples that are of the mirrored drive; `deciding`: of an anchor that decides."""
+        """`mirrored`: share of samples that are of the mirrored drive; `deciding`: how often an anchor that decides
+        is drawn; `shown`: how its frames are disturbed (None: not at all)."""
         self.anchors = tuple(anchors)
         self._shown = [i for i, each in enumerate(self.anchors) for _ in range(deciding if each.decides else 1)]
         self._prompts = prompts
         self._views = views
         self._words = words
         self._mirrored = mirrored
+        self._show = shown
 
     def __len__(self) -> int:
         return len(self._shown)
@@ -120,9 +127,15 @@ class Samples:
         for index in self._shown:
             anchor = self.anchors[index]
             in_mirror = bool(rng.uniform() < self._mirrored)
+            seed = None
+            if self._show is not None:
+                near, seed = shifted(anchor, self._show, rng), int(rng.integers(2**31))
+                # In the mirror only whole seconds have tokens.
+                anchor = anchor if in_mirror else near
             asked = mirrored(anchor) if in_mirror else anchor
             prompt, answer = self._prompts.of(asked, draw(asked, self._words, rng))
-            drawn.append(Sample(index, in_mirror, np.array(prompt, np.int32), np.array(answer, np.int32)))
+            ids = np.array(prompt, np.int32), np.array(answer, np.int32)
+            drawn.append(Sample(index, in_mirror, *ids, anchor.frames, seed))
         return drawn
 
     def rows(self, samples: Sequence[Sample]) -> list[Row]:
@@ -131,10 +144,17 @@ class Samples:
             Row(
                 tuple(each.prompt.tolist()),
                 tuple(each.answer.tolist()),
-                self._views.of(self.anchors[each.anchor], in_mirror=each.in_mirror),
+                self._frames(each),
             )
             for each in samples
         ]
+
+    def _frames(self, sample: Sample) -> tuple[Halves, ...]:
+        anchor = replace(self.anchors[sample.anchor], frames=sample.frames)
+        frames = self._views.of(anchor, in_mirror=sample.in_mirror)
+        if self._show is None or sample.noise_seed is None:
+            return frames
+        return disturbed(frames, self._show, np.random.default_rng((_NOISE, sample.noise_seed)))
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
@@ -189,7 +209,7 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[
     content = tokenizer_for(network.config, None)
     prompts = Prompts(Tokenizer.from_buffer(content), network.config)
     anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train)]
-    data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding)
+    data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
         raise SftError(f"{dataset.folder}: no anchors with reasoning to learn from; collect drives first")

@@ -1,0 +1,72 @@
+"""An anchor as a language model is shown it, never twice the same: a few frames earlier or later, through other noise.
+
+A small model learns the tokens of a thousand places by heart long before it reads them. The text of an instant holds
+for a third of a second before and after it; the waypoints are those of the very frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.reasoning_text import format_waypoints
+from tools.train.anchors import AROUND, Anchor, frames_at
+from tools.train.language_batch import Halves
+
+
+@dataclass(frozen=True)
+class ShowConfig:
+    """How much what is shown differs from what was recorded."""
+
+    shift_frames: int = AROUND
+    """The newest frame is up to so many earlier or later (0.1 s each)."""
+    jitter_frames: int = 2
+    """And the older ones up to so many beyond that, each on its own."""
+    noise: float = 0.1
+    """Standard deviation of what is added to a visual token's numbers, in units of theirs."""
+    drop: float = 0.1
+    """Share of visual tokens that are blank."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.shift_frames <= AROUND or not 0 <= self.jitter_frames <= 5:
+            raise ValueError(f"expected shift_frames from 0 to {AROUND} and jitter_frames from 0 to 5")
+        if not (0 <= self.noise <= 1 and 0 <= self.drop < 1):
+            raise ValueError("expected noise from 0 to 1 and drop from 0 to below 1")
+
+
+def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anchor:
+    """The anchor a few frames off, where the drive has them; the same numbers are taken from `rng` whatever comes."""
+    by = int(rng.integers(-config.shift_frames, config.shift_frames + 1))
+    jitter = rng.integers(-config.jitter_frames, config.jitter_frames + 1, 8)
+    points = anchor.around[AROUND + by] if anchor.around else None
+    if anchor.waited or points is None:
+        return anchor
+    lines, _ = anchor.reasoning.rsplit("\n", 1)
+    return replace(
+        anchor,
+        k=anchor.k + by,
+        frames=_jittered(frames_at(anchor.k + by), jitter),
+        points=points,
+        reasoning=f"{lines}\n{format_waypoints(points)}",
+    )
+
+
+def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, ...]:
+    """Older frames a little elsewhere, in their order still."""
+    found: list[int] = []
+    for frame, by in zip(frames[:-1], jitter, strict=False):
+        found.append(min(max(frame + int(by), found[-1] + 1 if found else 0), frames[-1] - 1))
+    return (*found, frames[-1]) if len(set(found)) == len(found) else frames
+
+
+def disturbed(frames: tuple[Halves, ...], config: ShowConfig, rng: np.random.Generator) -> tuple[Halves, ...]:
+    """Visual tokens [N, D] of each frame with noise, some of them blank."""
+    shown: list[Halves] = []
+    for tokens in frames:
+        values = tokens.astype(np.float32)
+        noise = rng.standard_normal(values.shape, np.float32) * np.float32(config.noise * float(values.std()))
+        kept = rng.uniform(size=(len(values), 1)) >= config.drop
+        shown.append(np.asarray((values + noise) * kept, np.float16))
+    return tuple(shown)
