@@ -200,14 +200,14 @@ def test_a_batch_gives_every_row_what_it_gives_alone(head: str) -> None:
 
 
 @pytest.mark.parametrize("head", HEADS)
-def test_padding_on_the_right_changes_no_row(head: str) -> None:
+def test_padding_on_the_left_changes_no_row(head: str) -> None:
     action = expert(head)
     inputs, kv, lengths = instants(3), states(3, 9), (9, 4, 1)
-    mask = torch.arange(9)[None] < torch.tensor(lengths)[:, None]
+    mask = torch.arange(9)[None] >= 9 - torch.tensor(lengths)[:, None]
     with torch.no_grad():
         whole = action(*inputs, *action.context(kv), mask)
         rows = [
-            action(*(x[i : i + 1] for x in inputs), *action.context(kv[i : i + 1, :n])) for i, n in enumerate(lengths)
+            action(*(x[i : i + 1] for x in inputs), *action.context(kv[i : i + 1, 9 - n :])) for i, n in enumerate(lengths)
         ]
     torch.testing.assert_close(whole, torch.cat(rows), atol=1e-5, rtol=1e-4)
 
@@ -216,8 +216,8 @@ def test_padding_on_the_right_changes_no_row(head: str) -> None:
 def test_what_is_in_the_padding_changes_nothing(head: str) -> None:
     action = expert(head)
     kv = states(1, 9)
-    other = torch.cat([kv[:, :4], 7 * kv[:, 4:]], dim=1)
-    mask = torch.arange(9)[None] < 4
+    other = torch.cat([7 * kv[:, :5], kv[:, 5:]], dim=1)
+    mask = torch.arange(9)[None] >= 5
     with torch.no_grad():
         a, b = (action(*instants(1), *action.context(x), mask) for x in (kv, other))
     assert torch.equal(a, b)
@@ -226,18 +226,18 @@ def test_what_is_in_the_padding_changes_nothing(head: str) -> None:
 @pytest.mark.parametrize("head", HEADS)
 def test_instants_in_a_row_may_share_a_state(head: str) -> None:
     action = expert(head)
-    kv, mask = states(2, 6), torch.tensor([[True] * 6, [True] * 3 + [False] * 3])
+    kv, mask = states(2, 6), torch.tensor([[True] * 6, [False] * 3 + [True] * 3])
     with torch.no_grad():
         shared = action(*instants(6), *action.context(kv), mask)
         apart = action(*instants(6), *action.context(kv.repeat_interleave(3, 0)), mask.repeat_interleave(3, 0))
     torch.testing.assert_close(shared, apart, atol=1e-6, rtol=1e-5)
 
 
-def test_a_tokens_place_is_counted_from_the_left() -> None:
+def test_a_tokens_place_is_counted_from_the_end() -> None:
     action = expert("query")
     with torch.no_grad():
-        long, short = (action.semantic_tokens(states(1, 9)[:, :n]) for n in (9, 4))
-    torch.testing.assert_close(long[:, :4], short)
+        long, short = (action.semantic_tokens(states(1, 9)[:, 9 - n :]) for n in (9, 4))
+    torch.testing.assert_close(long[:, 5:], short)
 
 
 @pytest.mark.parametrize("interface", ["kv", "values-only", "waypoints"])

@@ -53,7 +53,8 @@ def write_context(action: ActionExpert, directory: Path, *, precision: Precision
             x = g.cast(x, g.float_type)
         x = mlp(g, x, "semantic_projection", action.semantic_projection)
         table = g.weight(array(action.semantic_position).astype(g.float), "semantic_position")
-        x = g.op("Add", [x, g.op("Slice", [table, g.constant([0]), length, g.constant([1])])])
+        last = [table, g.op("Neg", [length]), g.constant([np.iinfo(np.int64).max]), g.constant([1])]
+        x = g.op("Add", [x, g.op("Slice", last)])
         for i, pair in enumerate(action.key_values):
             assert isinstance(pair, KeyValue)
             k = g.linear(x, f"key_values.{i}.k", array(pair.k.weight), array(pair.k.bias))

@@ -101,13 +101,14 @@ class ActionExpert(nn.Module):
     def semantic_tokens(self, guidance: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Last-layer K‖V [B, T, kv_dim], or waypoints [B, 3, 2] in m in the current robot frame → [B, T, hidden].
 
-        States of different lengths are padded on the right: a token's place is counted from the left. In training,
-        `generator` (else torch's own) says what is dropped out.
+        States of different lengths are padded on the left: a token's place is counted from the end, where the answer's
+        last line, the waypoints, always stands. In training, `generator` (else torch's own) says what is dropped out.
         """
         interface = self.config.action.semantic_interface
         if interface == "values-only":
             guidance = guidance[..., self.config.kv_dim // 2 :]
-        tokens = self.semantic_projection(guidance) + self.semantic_position[:, : guidance.shape[1]]
+        places = self.semantic_position[:, self.semantic_position.shape[1] - guidance.shape[1] :]
+        tokens = self.semantic_projection(guidance) + places
         if self.training and interface != "waypoints":
             # Whole K‖V tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
             chance = drawn(torch.rand, tuple(tokens.shape[:2]), tokens.device, generator)

@@ -1,7 +1,7 @@
 """The action expert over many frames at once, some of which share a semantic state: `ActionExpert.forward`'s numbers.
 
 A semantic state costs more than the rest of a sample, so frames that act on one state share its keys and values. States
-differ in length: they are padded on the right and the padding is masked, which leaves every row what it is alone. What
+differ in length: they are padded on the left and the padding is masked, which leaves every row what it is alone. What
 is dropped out comes with the batch instead of from a generator of the network's own, so that a sample is the same in
 whatever batch, process or resumed run it comes.
 """
@@ -80,7 +80,7 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
         whole = np.zeros((rows, longest, *arrays[0].shape[2:]), arrays[0].dtype)
         at = 0
         for array in arrays:
-            whole[at : at + len(array), : array.shape[1]] = array
+            whole[at : at + len(array), longest - array.shape[1] :] = array
             at += len(array)
         return torch.from_numpy(whole).to(device)
 
@@ -90,7 +90,7 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
         state=joined("state"),
         latency=joined("latency"),
         guidance=padded("guidance").float(),
-        real=torch.arange(longest, device=device) < lengths[:, None],
+        real=torch.arange(longest, device=device) >= longest - lengths[:, None],
         goal=joined("goal"),
         keep_guidance=padded("keep_guidance"),
         keep_state=joined("keep_state"),
