@@ -207,7 +207,8 @@ def test_padding_on_the_left_changes_no_row(head: str) -> None:
     with torch.no_grad():
         whole = action(*inputs, *action.context(kv), mask)
         rows = [
-            action(*(x[i : i + 1] for x in inputs), *action.context(kv[i : i + 1, 9 - n :])) for i, n in enumerate(lengths)
+            action(*(x[i : i + 1] for x in inputs), *action.context(kv[i : i + 1, 9 - n :]))
+            for i, n in enumerate(lengths)
         ]
     torch.testing.assert_close(whole, torch.cat(rows), atol=1e-5, rtol=1e-4)
 

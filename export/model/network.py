@@ -12,6 +12,7 @@ from torch.overrides import TorchFunctionMode
 from export.model.action import ActionExpert
 from export.model.config import TicVlaConfig
 from export.model.language import LanguageModel
+from export.model.places import grid_codes, line_codes
 from export.model.value import ValueNetwork
 from export.model.vision import VisionEncoder
 
@@ -80,7 +81,14 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
         for name, parameter in model.named_parameters():
             if name.split(".")[0] in parts and name.endswith(("position", "cls", "queries")):
                 parameter.normal_(0.0, 1.0 if name.endswith("queries") else INIT_STD, generator=generator)
+        if "vision" in parts:
+            model.vision.position[0, 1:] += grid_codes(
+                model.vision.position.shape[1] - 1, model.vision.position.shape[2]
+            )
         if "action" in parts:
+            visual, semantic = model.action.visual_position[0], model.action.semantic_position[0]
+            visual += grid_codes(*visual.shape)
+            semantic += line_codes(*semantic.shape).flip(0)  # place 0 is the last token
             model.action.start(generator)
 
 
