@@ -101,7 +101,7 @@ def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
 def test_a_policy_loses_by_others_words_what_it_had_by_its_own(samples: Samples) -> None:
     def by_words(batch: ActionBatch) -> torch.Tensor:
         """Goes to the side that it is told; what it is told of its own drive is always right."""
-        side = torch.sign(batch.guidance[:, 0, 0]).repeat_interleave(len(batch) // len(batch.guidance))
+        side = torch.sign(batch.guidance[:, -1, 0]).repeat_interleave(len(batch) // len(batch.guidance))
         true = batch.target.clone()
         true[..., 1:] = true[..., 1:].abs() * side[:, None, None]
         return true
