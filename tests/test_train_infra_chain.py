@@ -277,7 +277,7 @@ def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, ca
     ("arguments", "says"),
     [
         (("sft",), "--out is missing"),
-        (("sft", "--preset", "nono", "--out", "x"), "expected one of 1b, nano, nano-1, tiny"),
+        (("sft", "--preset", "nono", "--out", "x"), "expected one of 1b, nano, tiny"),
         (("sft", "--recipe", "nano", "--out", "x"), "ends in .toml"),
         (("sft", "--recipe", "nowhere.toml", "--out", "x"), "cannot be read"),
         (("sft", "--preset", "tiny", "--device", "tpu", "--out", "x"), "expected cpu, cuda or cuda:N"),
