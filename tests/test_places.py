@@ -35,7 +35,9 @@ def test_a_pictures_codes_tell_row_and_column() -> None:
 
 def test_a_new_network_knows_its_places() -> None:
     model = build(PRESETS["nano"], 1)
-    for position in (model.vision.position[0, 1:], model.action.visual_position[0], model.action.semantic_position[0]):
+    action = model.action
+    places = (action.visual_position, action.semantic_position, action.metadata_position)
+    for position in (model.vision.position[0, 1:], *places):
         assert float(position.detach().square().mean().sqrt()) == pytest.approx(RMS, rel=0.1)
 
 

@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from export.model.action import ActionExpert
 from export.model.config import TicVlaConfig
 from export.model.language import LanguageModel
-from export.model.places import grid_codes, line_codes
+from export.model.places import RMS, grid_codes, line_codes
 from export.model.value import ValueNetwork
 from export.model.vision import VisionEncoder
 
@@ -89,6 +89,8 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
             visual, semantic = model.action.visual_position[0], model.action.semantic_position[0]
             visual += grid_codes(*visual.shape)
             semantic += line_codes(*semantic.shape).flip(0)  # place 0 is the last token
+            # Two tokens among hundreds, state and latency: they are to be found before they are understood.
+            model.action.metadata_position.mul_(RMS / INIT_STD)
             model.action.start(generator)
 
 
