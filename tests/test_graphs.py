@@ -125,6 +125,14 @@ STORED = {
 }
 
 
+def skip_where_bytes_saturate(precision: str, form: str) -> None:
+    """x86 without VNNI or AMX adds two products of bytes in 16 bits, which saturate (export/targets/cpu.toml)."""
+    found = torch.cpu.get_capabilities()
+    exact = found["architecture"] != "x86_64" or any(found[name] for name in ("avx512_vnni", "avx_vnni", "amx_int8"))
+    if precision == "int8" and form == "fused" and not exact:
+        pytest.skip("this processor's products of bytes saturate: int8 is less exact on it")
+
+
 @pytest.mark.parametrize("half", [False, True], ids=["float", "half"])
 @pytest.mark.parametrize("precision", BOUNDS)
 @pytest.mark.parametrize(
@@ -140,6 +148,7 @@ def test_every_combination_runs_as_the_network_and_stores_what_it_says_or_is_ref
             write_graph(small, name, asked, form, tmp_path, half=half)
         assert not list(tmp_path.iterdir())
         return
+    skip_where_bytes_saturate(precision, form)
     assert check(small, tmp_path, name, asked, form, half=half) < BOUNDS[precision]
     stored = {t.name: t.data_type for t in onnx.load(str(tmp_path / f"{name}.onnx")).graph.initializer}
     layers = {n for n in stored if n.endswith(".weight") and "norm" not in n and not n.startswith("embed")}
@@ -167,6 +176,7 @@ def test_a_layer_raised_to_32_bits_in_a_half_graph_is_computed_in_them(nano: Tic
 def test_rounded_weights_cost_accuracy_but_not_the_function(
     nano: TicVla, tmp_path: Path, name: str, precision: str, bound: float
 ) -> None:
+    skip_where_bytes_saturate(precision, "fused")
     assert 0 < check(nano, tmp_path, name, Precision(precision, (("embed", "fp16"),)), "fused") < bound
 
 
