@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.reasoning_text import format_waypoints
+from edge.reasoning_text import Waypoints, format_waypoints
 from tools.train.anchors import Anchor
 from tools.train.drive import TRACE_EVERY, Dataset, Drive
 from tools.train.language_batch import FrameTokens, Halves
@@ -30,15 +30,20 @@ def mirrored_text(text: str) -> str:
 
 def mirrored(anchor: Anchor) -> Anchor:
     """The anchor of the mirrored drive; what is counted, and when, is the same."""
-    points = tuple((x_m, 0.0 - y_m) for x_m, y_m in anchor.points)
+    points = _across(anchor.points)
     lines, _ = anchor.reasoning.rsplit("\n", 1)
     return replace(
         anchor,
         way=tuple((x_m, 0.0 - y_m) for x_m, y_m in anchor.way),
         wordings=tuple(mirrored_text(wording) for wording in anchor.wordings),
         points=points,
+        around=tuple(None if near is None else _across(near) for near in anchor.around),
         reasoning=f"{mirrored_text(lines)}\n{format_waypoints(points)}",
     )
+
+
+def _across(points: Waypoints) -> Waypoints:
+    return tuple((x_m, 0.0 - y_m) for x_m, y_m in points)
 
 
 @dataclass(frozen=True)
