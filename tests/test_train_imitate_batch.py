@@ -14,7 +14,6 @@ from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.train_drives import tiny_model
 from tools.train.action_batch import Group, collate, errors, plan, smooth_l1, trunk
-from tools.train.imitation_pupils import ExpertPupil, LossConfig
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)
@@ -186,50 +185,3 @@ def test_a_network_that_would_drop_out_by_itself_is_refused() -> None:
     config = model_with()
     with pytest.raises(ValueError, match="evaluation mode"):
         trunk(expert(config).train(), collate([group(0, 3, config)], CPU))
-
-
-def told(one: Group, seed: int) -> Group:
-    """The group with waypoints that its state says."""
-    points = np.random.default_rng(seed).normal(0.0, 3.0, (len(one.state), 3, 2)).astype(np.float32)
-    return dataclasses.replace(one, said=points)
-
-
-READING = LossConfig(reading_weight=0.5)
-
-
-def test_reading_counts_only_where_something_was_said() -> None:
-    config = model_with()
-    groups = [told(group(1, 6, config), 1), group(2, 5, config)]
-    batch, generator = collate(groups, CPU), torch.Generator().manual_seed(1)
-    pupil = ExpertPupil(expert(config), READING)
-    with torch.no_grad():
-        driving, lesson = pupil.errors(batch, generator), pupil.lesson(batch, generator)
-        far = torch.nn.functional.smooth_l1_loss(torch.zeros(3, 3, 2), batch.said[:3], reduction="none").mean((1, 2))
-    torch.testing.assert_close(lesson[:3] - driving[:3], 0.5 * far, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(lesson[3:], driving[3:])
-
-
-def test_what_was_said_can_be_learned_to_be_read_and_is_no_part_of_the_network() -> None:
-    config = model_with()
-    batch, generator = collate([told(group(seed, 6, config), seed) for seed in range(4)], CPU), torch.Generator()
-    action = expert(config)
-    names = set(action.state_dict())
-    pupil = ExpertPupil(action, LossConfig(reading_weight=100.0))
-    optimiser = torch.optim.Adam(pupil.module.parameters(), lr=3e-3)
-    losses = []
-    for _ in range(60):
-        optimiser.zero_grad()
-        loss = pupil.lesson(batch, generator).mean()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.6 * losses[0] and set(action.state_dict()) == names
-
-
-def test_without_a_weight_the_lesson_is_the_errors() -> None:
-    config = model_with()
-    batch, generator = collate([told(group(1, 6, config), 1)], CPU), torch.Generator()
-    pupil = ExpertPupil(expert(config), LossConfig())
-    with torch.no_grad():
-        assert torch.equal(pupil.lesson(batch, generator), pupil.errors(batch, generator))
-    assert pupil.module is not None and not [name for name in pupil.module.state_dict() if name.startswith("reader")]

@@ -313,18 +313,6 @@ def test_waypoints_that_guide_are_seen_from_each_frame(dataset: Dataset) -> None
             np.testing.assert_allclose(guidance, waypoints_now(said, offset)[0], atol=1e-6)
 
 
-def test_what_a_whole_text_says_comes_with_each_frame_and_nothing_with_a_cut_one(dataset: Dataset) -> None:
-    samples = of(dataset)
-    for chosen, group in drawn(samples, 30):
-        points, found = samples.said(chosen), group.said
-        assert points is not None and found is not None
-        for k, said in zip(chosen.ks, found, strict=True):
-            offset = samples.drives[chosen.drive].offset(chosen.anchor, k)
-            np.testing.assert_allclose(said, waypoints_now(points, offset)[0], atol=1e-6)
-    for _, group in drawn(of(dataset, dataclasses.replace(PLAIN, prompt_only=1.0)), 10):
-        assert group.said is not None and np.isnan(group.said).all()
-
-
 def test_states_without_waypoints_cannot_guide_by_them(dataset: Dataset) -> None:
     class Silent(SideStates):
         def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:

@@ -44,8 +44,6 @@ class Group:
     keep_state: NDArray[np.bool_]
     target: Array
     known: NDArray[np.bool_]
-    said: Array | None = None
-    """[g, 3, 2] m: where the waypoints of the state's text lie now, each in its frame; None where it has none."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +62,6 @@ class ActionBatch:
     keep_state: Tensor
     target: Tensor
     known: Tensor
-    said: Tensor
-    """[B, 3, 2], NaN where a text has none."""
 
     def __len__(self) -> int:
         return len(self.state)
@@ -88,7 +84,6 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
             at += len(array)
         return torch.from_numpy(whole).to(device)
 
-    said = [np.full((len(g.state), 3, 2), np.nan, np.float32) if g.said is None else g.said for g in groups]
     lengths = torch.tensor([group.guidance.shape[1] for group in groups for _ in group.guidance], device=device)
     return ActionBatch(
         visual_tokens=joined("visual_tokens").float(),
@@ -101,7 +96,6 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
         keep_state=joined("keep_state"),
         target=joined("target"),
         known=joined("known"),
-        said=torch.from_numpy(np.concatenate(said)).to(device),
     )
 
 
@@ -153,18 +147,10 @@ def trunk(action: ActionExpert, batch: ActionBatch) -> SharedTrunk:
 
 def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
     """Planned trajectories [B, steps, 3] (x m, y m, theta rad), each in its frame's robot frame."""
+    layers = trunk(action, batch)
     if action.config.action.head != "query":
-        return action.plan(trunk(action, batch))
-    return planned(action, features(action, batch))
-
-
-def features(action: ActionExpert, batch: ActionBatch) -> Tensor:
-    """What the queries find [B, steps, hidden]."""
-    return action.head(action.norm(trunk(action, batch)(action.queries.expand(len(batch), -1, -1))))
-
-
-def planned(action: ActionExpert, found: Tensor) -> Tensor:
-    """Trajectories of the query head [B, steps, 3] from `features`."""
+        return action.plan(layers)
+    found = action.head(action.norm(layers(action.queries.expand(len(batch), -1, -1))))
     # Summed in float32 whatever the network computes in: thirty steps of bfloat16 would add up to centimetres.
     return integrated(action.out(found).float(), action.config.action.parameterisation)
 
@@ -206,13 +192,6 @@ def _shared(x: Tensor, share: int) -> Tensor:
 def _own(x: Tensor, share: int) -> Tensor:
     """The inverse of `_shared`."""
     return x.unflatten(2, (share, -1)).transpose(1, 2).flatten(0, 1)
-
-
-def reading_errors(read: Tensor, batch: ActionBatch) -> Tensor:
-    """How far read waypoints [B, 3, 2] m are from those that were said, for every frame [B]; 0 where none were."""
-    there = torch.isfinite(batch.said)
-    terms = F.smooth_l1_loss(read.float(), torch.where(there, batch.said, 0.0), reduction="none")
-    return (terms * there).mean((1, 2))
 
 
 def smooth_l1(planned: Tensor, batch: ActionBatch, *, beta: float, heading_weight: float) -> Tensor:

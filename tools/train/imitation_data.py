@@ -201,14 +201,11 @@ class Samples:
         ks = list(chosen.ks)
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
         latency = [(age / RATE_HZ, *offset.as_tuple()) for age, offset in zip(chosen.ages, offsets, strict=True)]
-        said = np.full((count, 3, 2), np.nan, np.float32)
         if self._by_waypoints:
             guidance = self._waypoints(state, offsets)
             keep = np.ones(guidance.shape[:2], bool)
         else:
             rows = state.kv[: self._length(state, cut, end)]
-            if len(rows) == len(state.kv) and state.waypoints is not None:
-                said = self._waypoints(state, offsets)
             guidance = np.array(rows)[None]
             keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
         frames = self._tokens.frames(drive.id)
@@ -222,7 +219,6 @@ class Samples:
             keep_state=keep_state,
             target=drive.target[ks],
             known=np.arange(drive.target.shape[1]) < drive.known[ks][:, None],
-            said=said,
         )
 
     def said(self, chosen: Chosen) -> Waypoints | None:
@@ -248,7 +244,7 @@ class Samples:
 
     def _waypoints(self, state: CachedState, offsets: Sequence[SE2]) -> NDArray[np.float32]:
         points = state.waypoints
-        assert points is not None  # the caller, or `_anchors`, has left the others out
+        assert points is not None  # `_anchors` has left the others out
         return np.concatenate([waypoints_now(points, offset) for offset in offsets])
 
 

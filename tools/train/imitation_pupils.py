@@ -24,13 +24,10 @@ class LossConfig:
     """Below this error it is quadratic, m and rad; torch's own value, the paper names none."""
     heading_weight: float = 1.0
     """Of an error of one radian beside one of a metre."""
-    reading_weight: float = 0.0
-    """Of reading, from what the queries find, where the waypoints that were said lie now. It teaches the action expert
-    where in a state its words stand, and what the motion offset is for; nothing of it is kept. Query head only."""
 
     def __post_init__(self) -> None:
-        if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100 and 0 <= self.reading_weight <= 100):
-            raise ValueError("expected beta above 0, heading_weight and reading_weight from 0 on, all up to 100")
+        if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
+            raise ValueError("expected beta above 0 and heading_weight from 0 on, both up to 100")
 
 
 class Pupil(ABC):
@@ -49,10 +46,6 @@ class Pupil(ABC):
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """What is made small, for every frame [B]."""
 
-    def lesson(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """What is learned by, for every frame [B]: `errors`, and what helps in making them small."""
-        return self.errors(batch, generator)
-
     @abstractmethod
     def begin(self, drives: Iterable[DriveFrames]) -> None:
         """Look at all drives once before the first step."""
@@ -66,13 +59,6 @@ class ExpertPupil(Pupil):
     def __init__(self, action: ActionExpert, loss: LossConfig) -> None:
         self.module = self._action = action.eval()
         self._loss = loss
-        self._reader: nn.Linear | None = None
-        if loss.reading_weight > 0 and action.config.action.head == "query":
-            self._reader = nn.Linear(action.config.action.hidden, 6)
-            nn.init.zeros_(self._reader.weight)
-            nn.init.zeros_(self._reader.bias)
-            self._reader.to(next(action.parameters()).device)
-            self.module = nn.ModuleDict({"action": action, "reader": self._reader})
 
     def plan(self, batch: ActionBatch) -> Tensor:
         """By the network's layers, with what the batch drops out."""
@@ -84,16 +70,6 @@ class ExpertPupil(Pupil):
         return action_batch.errors(
             self._action, batch, generator, beta=loss.beta, heading_weight=loss.heading_weight
         )  # fmt: skip
-
-    def lesson(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """The errors, and those of reading what was said."""
-        if self._reader is None:
-            return self.errors(batch, generator)
-        loss, found = self._loss, action_batch.features(self._action, batch)
-        plans = action_batch.planned(self._action, found)
-        driving = action_batch.smooth_l1(plans, batch, beta=loss.beta, heading_weight=loss.heading_weight)
-        read = self._reader(found.mean(1)).unflatten(1, (3, 2))
-        return driving + loss.reading_weight * action_batch.reading_errors(read, batch)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
         """Heads that work on normalised actions take mean and deviation from the labels."""

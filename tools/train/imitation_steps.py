@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -81,18 +80,16 @@ class Training:
         value, weight = 0.0, float(len(groups))
         if groups:
             batch = collate(groups, self._device)
-            loss = self._errors(self._pupil.lesson, batch, self._optimiser.step_count).mean()
+            loss = self._errors(batch, self._optimiser.step_count).mean()
             loss.backward()
             value = float(loss.detach())
         self._optimiser.step(weight)
         return self._job.ranks.mean(value, weight)
 
-    def _errors(
-        self, of: Callable[[ActionBatch, torch.Generator], torch.Tensor], batch: ActionBatch, step: int
-    ) -> torch.Tensor:
+    def _errors(self, batch: ActionBatch, step: int) -> torch.Tensor:
         generator = self._job.generator(_NOISE, step, self._job.ranks.rank)
         with autocast(self._job.device, self._config.optim.bf16):
-            return of(batch, generator)
+            return self._pupil.errors(batch, generator)
 
     def _look(self, held: Samples) -> float:
         """The loss over held-out samples, always the same ones, shared by the ranks."""
@@ -104,7 +101,7 @@ class Training:
             rngs = [np.random.default_rng((seed, _HELD, number)) for number in range(start, min(start + each, count))]
             batch = collate([held.draw(rng) for rng in rngs], self._device)
             with torch.no_grad():
-                total += float(self._errors(self._pupil.errors, batch, start).sum())
+                total += float(self._errors(batch, start).sum())
             seen += len(batch)
         whole = ranks.sum(seen)
         return ranks.sum(total) / whole if whole else float("nan")
