@@ -1,7 +1,7 @@
 """Codes of places that a network begins with: sines of every length, smooth along a line or over a picture.
 
-Learned from nearly nothing they stay nearly nothing for thousands of steps, beside tokens fifty times as large, and a
-short training never finds out where in a picture or in a sentence a token stands.
+Learned from nearly nothing they were still nearly nothing after a thousand steps, beside tokens forty times as large: a
+short training does not find out where in a picture or in a sentence a token stands.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ _SHORTEST: Final = 4.0  # wavelength, places
 def line_codes(count: int, width: int) -> Tensor:
     """[count, width] float32: codes of the places 0, 1, … on a line."""
     pairs = (width + 1) // 2
-    longest = max(4.0 * count, _SHORTEST)
-    lengths = _SHORTEST * (longest / _SHORTEST) ** (torch.arange(pairs) / max(pairs - 1, 1))
+    lengths = _SHORTEST * float(count) ** (torch.arange(pairs) / max(pairs - 1, 1))
     angle = 2 * pi * torch.arange(count)[:, None] / lengths
     return (RMS * 2**0.5 * torch.stack([angle.sin(), angle.cos()], dim=-1)).flatten(1)[:, :width]
 

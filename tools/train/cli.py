@@ -53,7 +53,7 @@ EXAMPLES: Final = """examples:
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
   edge-train imitate --out out/run --delay-profile orin.latency.json
   edge-train imitate --from out/run --variant no-latency --out out/no-latency
-  edge-train dagger --preset nano --checkpoint export/weights/nano.safetensors --after imitate --out out/more
+  edge-train dagger --preset nano --checkpoint out/run/model.safetensors --after imitate --out out/more
   edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to give away
 
 stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
