@@ -108,7 +108,7 @@ def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
 
 @cache
 def computes_bf16(device: str) -> bool:
-    """Whether the device has instructions for bfloat16: without them torch takes twelve times as long as in float32 (encoder, AVX2)."""
+    """Whether the device has instructions for bfloat16: emulated it takes twelve times as long as float32."""
     if torch.device(device).type != "cpu":
         return True
     found = torch.cpu.get_capabilities()
