@@ -20,6 +20,7 @@ from export.model.network import TicVla, build
 from export.parity import Arrays, references, sample_inputs
 from export.precision import Precision
 from export.ranges import activation_ranges
+from tests.byte_products import skip_where_bytes_saturate
 
 NANO = PRESETS["nano"]
 EXACT = Precision("fp32")
@@ -123,14 +124,6 @@ STORED = {
     "int8": onnx.TensorProto.INT8,
     "int4-b32": onnx.TensorProto.UINT8,
 }
-
-
-def skip_where_bytes_saturate(precision: str, form: str) -> None:
-    """x86 without VNNI or AMX adds two products of bytes in 16 bits, which saturate (export/targets/cpu.toml)."""
-    found = torch.cpu.get_capabilities()
-    exact = found["architecture"] != "x86_64" or any(found[name] for name in ("avx512_vnni", "avx_vnni", "amx_int8"))
-    if precision == "int8" and form == "fused" and not exact:
-        pytest.skip("this processor's products of bytes saturate: int8 is less exact on it")
 
 
 @pytest.mark.parametrize("half", [False, True], ids=["float", "half"])
