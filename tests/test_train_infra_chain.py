@@ -388,3 +388,34 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
     assert shipped_weights(TINY.model, tmp_path / "weights") == path and path.with_suffix(".md").is_file()
     assert shipped_weights(with_overrides(TINY.model, {"action.layers": "2"}), tmp_path / "weights") is None
     assert shipped_weights(TINY.model, tmp_path / "nothing") is None
+
+
+def test_what_is_given_away_has_every_number_beside_it(trained: RunDir, tmp_path: Path) -> None:
+    path = ship(trained, TINY, tmp_path / "weights")
+    assert load_recipe(str(path.with_suffix(".recipe.toml"))) == TINY
+
+
+def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
+    first = ship(trained, TINY, tmp_path / "weights")
+    for number, after in enumerate(("imitate", "imitate-1")):
+        run_dir = RunDir.open(tmp_path / f"more{number}", NEWEST)
+        import_start(run_dir.out, TINY.model, [first], 1)
+        adopt(run_dir, steps_until(after, NEWEST))
+        run_dir.finish("rl", {"iterations": 20 + number})
+        text = card(run_dir, NEWEST, run_dir.model_path)
+        first = ship(run_dir, NEWEST, tmp_path / f"weights{number}")
+    assert "--checkpoint WEIGHTS --after imitate-1`" in text and "adopted" not in text
+    assert text.count("ab12") == 1 and "No weights of anybody else are in it." in text
+    parts = (
+        "* iterations: 21",
+        "## What it went on from",
+        "* iterations: 20",
+        "### What it went on from",
+        "* loss: 0.25",
+    )
+    assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
+
+
+def test_weights_without_a_card_are_those_of_others(run_dir: RunDir, tmp_path: Path) -> None:
+    adopted(run_dir, tmp_path, "imitate")
+    assert "weights of others" in card(run_dir, NEWEST, run_dir.model_path)

@@ -22,6 +22,9 @@ DISTRIBUTED: Final = ("encoder", "sft", "imitate")
 GO_ON: Final = ("sft", "imitate")
 """Stages that go on, over more drives, after a round of DAgger."""
 
+ADOPTED: Final = "adopted"
+"""In a stage's result: it was not run here, the run began with weights that it had left."""
+
 StageRun = Callable[[StageJob], dict[str, Any]]
 
 
@@ -96,7 +99,7 @@ def steps_until(name: str, recipe: Recipe) -> list[Step]:
 def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
     """Take the weights that the run began with for what these steps have left: what follows them is next."""
     start = stage_weights(run_dir.out, START)
-    result = {"adopted": file_sha256(start)}
+    result = {ADOPTED: file_sha256(start), "after": steps[-1].name}
     for step in steps:
         if step.stage in GO_ON and step.round > retired(run_dir, step.stage):
             run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")

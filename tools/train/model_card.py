@@ -1,4 +1,7 @@
-"""The model card: what the weights are, what they were made of, how well they do, and what they are not for."""
+"""The model card: what the weights are, what they were made of, how well they do, and what they are not for.
+
+A run that went on from weights with a card has that card's data and training at its end: nothing of a chain is lost.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,14 @@ from edge.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
 from export.progress import duration
-from tools.train.chain import GO_ON, retired
+from tools.train.chain import ADOPTED, GO_ON, retired
 from tools.train.drive import file_sha256
-from tools.train.network_file import START, read_network
+from tools.train.network_file import START, START_CARD, read_network, stage_weights
 from tools.train.recipe import STAGES, Recipe
 from tools.train.run_dir import VERSIONS, RunDir
 
 NAME: Final = "MODEL_CARD.md"
+_BEFORE: Final = "## What it went on from"
 LIMITS: Final = """\
 * It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
   does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
@@ -44,7 +48,7 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
 
 
 def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
-    """Write the run's weights as they are given away, with their card: float16, without what only training needs.
+    """Write the run's weights as they are given away, with card and recipe: float16, without what only training needs.
 
     Returns the weights' path. Raises CardError, NetworkFileError, OSError.
     """
@@ -57,21 +61,43 @@ def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] =
     info = WeightsInfo(trained=said["trained"] == "true", origin=f"{said['origin']}, float16")
     save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
     write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
+    write_whole(path.with_suffix(".recipe.toml"), run_dir.recipe_path.read_text(encoding="utf-8"))
     return path
 
 
 def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, Any]] = ()) -> str:
     """The card's text; the same run gives the same text."""
-    results = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
+    found = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
+    results = {name: result for name, result in found.items() if ADOPTED not in result}
+    after = next((str(result["after"]) for result in found.values() if ADOPTED in result), None)
+    before = _before(run_dir)
     blocks = [
         f"# {recipe.name}: weights for tic-vla-edge\n",
-        _network(weights, recipe, run_dir.begun(START)),
+        _network(weights, recipe, _licence(run_dir.begun(START), before is not None)),
         "## Scores\n\n" + _scores(results.get("evaluate"), scores),
         "## Data\n\n" + _data(run_dir, results.get("collect")),
-        "## Training\n\n" + _training(run_dir, recipe, results),
+        "## Training\n\n" + _training(run_dir, recipe, results, after),
         "## Limits\n\n" + LIMITS,
+        *([] if before is None else [f"{_BEFORE}\n\n{before}"]),
     ]
     return "\n".join(blocks)
+
+
+def _before(run_dir: RunDir) -> str | None:
+    """Data and training of the card of the weights that the run began with; None where they had none."""
+    path = stage_weights(run_dir.out, START).with_name(START_CARD)
+    if not path.is_file():
+        return None
+    text = path.read_text(encoding="utf-8")
+    sections = [f"## {section.rstrip()}\n" for section in text.split("\n## ")[1:]]
+    kept = [each for each in sections if each.startswith(("## Data\n", "## Training\n", f"{_BEFORE}\n"))]
+    return "\n".join(line.replace("## ", "### ", 1) for each in kept for line in each.split("\n"))
+
+
+def _licence(begun_with_weights: bool, ours: bool) -> str:
+    if begun_with_weights and not ours:
+        return "It began with weights of others (`--checkpoint`), whose licence holds for it."
+    return "Licence: Apache-2.0, as the repository. No weights of anybody else are in it."
 
 
 def score(path: Path) -> dict[str, Any]:
@@ -96,7 +122,7 @@ def parameters(weights: Path) -> dict[str, int]:
     return counts
 
 
-def _network(weights: Path, recipe: Recipe, others: bool) -> str:
+def _network(weights: Path, recipe: Recipe, licence: str) -> str:
     counts, size = parameters(weights), weights.stat().st_size
     named = {
         "vision": "vision encoder",
@@ -105,14 +131,9 @@ def _network(weights: Path, recipe: Recipe, others: bool) -> str:
         "value": "value network",
     }
     rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
-    theirs = (
-        "It began with weights of others (`--checkpoint`), whose licence holds for it."
-        if others
-        else "Licence: Apache-2.0, as the repository. No weights of anybody else are in it."
-    )
     return (
         f"Network `{recipe.model.name}`: camera pictures, odometry and an instruction in plain words become motion.\n"
-        f"{theirs}\n\n"
+        f"{licence}\n\n"
         f"`{weights.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(weights)}`\n\n"
         f"| part | weights |\n|---|---:|\n{rows}\n| all | {sum(counts.values()):,} |\n"
     )
@@ -145,18 +166,16 @@ def _row(where: str, summary: Mapping[str, Any]) -> str:
 
 
 def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
-    if collected is None:
-        return "None was collected by this run.\n"
     rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
     lines = [
         "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
         "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
         "which a test holds. No recording of a person or a place is in it.",
         "",
-        *_facts(collected),
+        *(["None was collected by this run."] if collected is None else _facts(collected)),
     ]
     for number, result in enumerate(rounds, 1):
-        if result is not None:
+        if result is not None and ADOPTED not in result:
             lines += [
                 "",
                 f"Round {number} of DAgger, driven by the policy, relabelled by the expert:",
@@ -166,12 +185,13 @@ def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any]) -> str:
+def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None) -> str:
     versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
     packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
+    went_on = "" if after is None else f" --checkpoint WEIGHTS --after {after}"
     lines = [
         f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
-        f"made with `edge-train all --recipe recipe.toml`. Python {versions['python']}, {packages}.",
+        f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
     ]
     if timings := run_dir.timings():
         each = ", ".join(f"{step} {duration(seconds)}" for step, seconds in timings.items())

@@ -19,6 +19,8 @@ from tools.train.job import StageJob
 
 START: Final = "start"
 """Folder of weights that were there before the first stage."""
+START_CARD: Final = "card.md"
+"""Beside them: what the model card that lay beside the checkpoint says."""
 ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
 """Where weights come from, in the order in which they do."""
 FILE: Final = "model.safetensors"
@@ -46,6 +48,9 @@ def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], s
     path = stage_weights(out, START)
     loaded = load_checkpoint(checkpoints, config, fill_seed=seed)
     save_weights(loaded.model, path, WeightsInfo(trained=loaded.info.trained, origin=loaded.info.origin))
+    told = [card for each in checkpoints if (card := each.with_suffix(".md")).is_file()]
+    if len(told) == 1:
+        shutil.copyfile(told[0], path.with_name(START_CARD))
     return path
 
 
