@@ -83,10 +83,30 @@ def test_a_failed_check_is_exit_1_and_still_a_report(tmp_path: Path, capsys: pyt
 
 def test_good_artifacts_are_not_exported_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "artifacts").mkdir()
-    (tmp_path / "artifacts" / "manifest.json").write_text('{"model": {"trained": false}}')
+    (tmp_path / "artifacts" / "manifest.json").write_text('{"model": {"trained": true}}')
     run(tmp_path, hil="fails")
     assert "verified, not exported again" in capsys.readouterr().err
     assert not (tmp_path / "log" / "edge-export.log").exists()
+
+
+@pytest.mark.parametrize("shipped", [None, Path("nano.safetensors")])
+def test_untrained_artifacts_are_exported_again_once_trained_weights_ship(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shipped: Path | None
+) -> None:
+    (tmp_path / "artifacts").mkdir()
+    (tmp_path / "artifacts" / "manifest.json").write_text('{"model": {"trained": false}}')
+    monkeypatch.setattr(demo, "shipped_weights", lambda config: shipped)
+    run(tmp_path, hil="fails")
+    assert (tmp_path / "log" / "edge-export.log").exists() is (shipped is not None)
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"model": null}', '{"model": {"trained": false}}'])
+def test_only_trained_weights_may_walk_at_full_speed(tmp_path: Path, content: str) -> None:
+    assert not demo.trained(tmp_path)
+    (tmp_path / "manifest.json").write_text(content)
+    assert not demo.trained(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"model": {"trained": true}}')
+    assert demo.trained(tmp_path)
 
 
 def test_an_old_report_does_not_survive_a_failed_run(tmp_path: Path) -> None:

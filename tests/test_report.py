@@ -270,6 +270,25 @@ def test_a_longer_run_need_not_walk_farther_than_the_demo(tmp_path: Path) -> Non
     assert found["moved_under_command_m"].limit == 1.0 and found["control_ticks"].limit == 5900
 
 
+@pytest.mark.parametrize(("goal", "reached"), [([1.0, 0.0], False), (None, True)])
+def test_trained_weights_are_asked_to_reach_the_goal(tmp_path: Path, goal: list[float] | None, reached: bool) -> None:
+    lines = synthetic_run.trace_lines(12.0)
+    end = next(line for line in reversed(lines) if line["kind"] == "pose")
+    lines[0] = {**lines[0], "goal": goal or [end["x"] + 1.0, end["y"] - 1.0]}
+    synthetic_run.write_run(tmp_path, trace=lines, trained=True)
+    (tmp_path / "settings.json").write_text('{"duration_s": 60.0}')
+    found = {c.name: c for c in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
+    assert found["goal_distance_m"].passed is reached and found["goal_distance_m"].limit == 1.5
+
+
+@pytest.mark.parametrize(("trained", "duration_s"), [(False, 60.0), (True, 59.0)])
+def test_the_goal_is_not_asked_of_those_that_cannot_reach_it(tmp_path: Path, trained: bool, duration_s: float) -> None:
+    synthetic_run.write_run(tmp_path, trained=trained)
+    (tmp_path / "settings.json").write_text(json.dumps({"duration_s": duration_s}))
+    names = [check.name for check in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))]
+    assert "goal_distance_m" not in names
+
+
 @pytest.mark.parametrize("part", ["duration_ms", "late_ms"])
 def test_slow_and_late_ticks_fail(tmp_path: Path, part: str) -> None:
     ticks = synthetic_run.tick_records(12.0)

@@ -21,6 +21,10 @@ TICKS_PER_60_S = 590
 GENERATIONS_PER_60_S = 10
 TICK_P99_LIMIT_MS = 100.0
 MOVED_PER_60_S_M = 1.0
+REACHED_M = 1.5
+"""Of the goal, as in the benchmark's episodes indoors."""
+REACHABLE_S = 60.0
+"""In a shorter run the goal cannot be reached."""
 
 # A generation is stamped ready, then swapped in by another thread: a tick within this time may still see the old one.
 SWAP_RACE_NS = 10_000_000
@@ -202,4 +206,19 @@ def acceptance(data: RunData) -> list[Check]:
             is_zero and says_zero,
             f"last: {command}",
         ),
+        *_reached(data),
     ]
+
+
+def goal_distance_m(data: RunData) -> float:
+    """Distance to the goal at the last ground-truth pose."""
+    return float(np.linalg.norm(data.trace.pose[-1, :2] - np.asarray(data.trace.scene["goal"], float)))
+
+
+def _reached(data: RunData) -> list[Check]:
+    """Whether it stands at its goal: asked of trained weights that had the time."""
+    model = data.manifest.get("model", {})
+    if not isinstance(model, dict) or model.get("trained") is not True or data.duration_s < REACHABLE_S:
+        return []
+    gap_m = round(goal_distance_m(data), 3)
+    return [_at_most("goal_distance_m", "Distance to the goal at the end", gap_m, REACHED_M, "m")]

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sim_hil.report_style import percentile
-from tools.report.checks import moved_under_command_m
+from tools.report.checks import goal_distance_m, moved_under_command_m
 from tools.report.run_data import Record, RunData, odometry_in_world, truth_at
 
 RUNNER = "edge-run, its own clock"
@@ -40,11 +40,6 @@ def headline(data: RunData) -> list[tuple[str, str]]:
         (f"{moved_under_command_m(data.trace):.2f} m", "walked under command (ground truth)"),
         (f"{goal_distance_m(data):.2f} m", "from the goal at the end"),
     ]
-
-
-def goal_distance_m(data: RunData) -> float:
-    """Distance to the goal at the last ground-truth pose."""
-    return float(np.linalg.norm(data.trace.pose[-1, :2] - np.asarray(data.trace.scene["goal"], float)))
 
 
 def odometry_error_m(data: RunData) -> float | None:
