@@ -8,10 +8,11 @@ SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
 
-.PHONY: help demo nano faults test lint clean
+.PHONY: help demo demos nano faults test lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
+	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
 	@echo "make test   lint, type-check and run the tests"
@@ -34,6 +35,13 @@ help:
 
 demo: .venv/.demo-installed
 	@$(BIN)/python -m tools.demo --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
+
+# Ten worlds with one model, each with a report of its own; says how many passed every check.
+demos: .venv/.demo-installed
+	@passed=0; for seed in 0 1 2 3 4 5 6 7 8 9; do \
+		$(BIN)/python -m tools.demo --out out/demos/$$seed --artifacts out/demos/artifacts --duration $(DURATION) --seed $$seed --people $(PEOPLE) \
+			&& passed=$$((passed + 1)); \
+	done; echo "make: $$passed of 10 seeds passed"; test $$passed -ge 9
 
 # Every stage of tools/train/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
 nano: .venv/.demo-installed

@@ -187,6 +187,12 @@ def test_rows_that_compare_equal_weights_are_left_out(tmp_path: Path) -> None:
     assert not any(claim.row == "rl" for claim in plan.claims)
 
 
+def test_wordings_are_not_judged_on_a_suite_of_trainings_patterns(tmp_path: Path) -> None:
+    plan = plan_of(models(tmp_path, "rl"), ["score", "wordings"], TWO_S, held_out=False)
+    assert list(plan.conditions) == ["rl"] and "training's patterns" in plan.missing["row wordings"]
+    assert all(claim.row != "wordings" for claim in plan.claims)
+
+
 def test_artifacts_alone_are_the_shipped_model(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text("{}")
     plan = plan_of(tmp_path, ["score", "latency"], TWO_S)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from edge.latency_profile import LatencyProfile
 from export.model.config import PRESETS
 from export.model.config_file import with_overrides
 from export.model.network import build
@@ -295,6 +296,15 @@ def test_what_makes_no_sense_is_one_line(
     assert run(*arguments) == EXIT_BAD_INPUT
     told = capsys.readouterr().err
     assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_a_devices_delays_are_those_of_every_stage_that_injects_any(tmp_path: Path) -> None:
+    profile = tmp_path / "orin.json"
+    profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
+    out = tmp_path / "out"
+    recipe = cli._recipe(cli.parser().parse_args(["all", "--out", str(out), "--delay-profile", str(profile)]))
+    assert recipe.imitate is not None and recipe.rl is not None
+    assert recipe.imitate.delays.profile == recipe.rl.delay_profile == str(profile)
 
 
 def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[str, Any]]]:

@@ -179,6 +179,13 @@ def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
         run(_job(tmp_path, RlConfig()))
 
 
+def test_an_action_expert_that_has_imitated_nobody_is_not_improved(tmp_path: Path) -> None:
+    job = _job(tmp_path, RlConfig())
+    finish_network(job, "sft", _network())
+    with pytest.raises(RlError, match=r"sft/model.safetensors: its action expert has learned nothing yet"):
+        run(job)
+
+
 def test_kinds_of_scenes_take_turns() -> None:
     config = RlConfig(rotate_every=2, rotation=("office", "hospital"))
     assert [next(iter(config.kinds(i))) for i in range(5)] == ["office", "office", "hospital", "hospital", "office"]

@@ -26,6 +26,7 @@ from sim_hil.benchmark.bench_run import choose
 from sim_hil.benchmark.cli import stop_flag
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.episode import Episode, SuiteError, load_suite
+from sim_hil.benchmark.instructions import is_held_out
 from sim_hil.benchmark.jobs import RefusedRunError
 from sim_hil.benchmark.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.progress import BenchProgress
@@ -34,7 +35,7 @@ from sim_hil.benchmark.store import StoreError, read_results
 from sim_hil.scene import SceneError
 from tools.benchmark_runs import RESULT, RunsError, read_result, run_episodes
 from tools.findings_report import write_findings
-from tools.findings_rows import ROWS, RUNS, Finding, Level, claims_of, runs_of
+from tools.findings_rows import ROWS, RUNS, WORDINGS_ROW, Finding, Level, claims_of, runs_of
 from tools.findings_verdict import judge_all
 
 COMMAND: Final = "findings"
@@ -107,7 +108,8 @@ def _main(args: argparse.Namespace) -> int:
     base = parse_latency(args.latency)
     rows = rows_of(args.rows)
     episodes = choose(load_suite(args.suite), args.episodes)
-    plan = plan_of(args.artifacts, rows, base)
+    held_out = any(is_held_out(text) for episode in episodes for text in episode.instructions)
+    plan = plan_of(args.artifacts, rows, base, held_out=held_out)
     if args.rows is not None and not plan.conditions:
         raise ConditionsError(next(iter(plan.missing.values()), "--rows: nothing to run"))
     if args.dry_run:
@@ -152,11 +154,14 @@ def rows_of(text: str | None) -> list[str]:
     return rows
 
 
-def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile) -> Plan:
-    """What can be run of some rows."""
+def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile, *, held_out: bool = True) -> Plan:
+    """What can be run of some rows; `held_out`: whether the suite has wordings that training has not."""
     conditions: dict[str, Conditions] = {}
     folders: dict[str, str] = {}
     claims, left_out = claims_of(root)
+    if not held_out:
+        left_out[f"row {WORDINGS_ROW}"] = "this suite's own wordings are of training's patterns"
+        claims = [claim for claim in claims if claim.row != WORDINGS_ROW]
     missing = {row: why for row, why in left_out.items() if row.removeprefix("row ") in rows}
     by_conditions: dict[str, str] = {}
     for name in runs_of(rows, claims):

@@ -26,6 +26,9 @@ DRIFT_LEAST: Final = -10.0
 WORDING_LEAST: Final = -10.0
 SWAP_LEAST: Final = 30.0
 
+WORDINGS_ROW: Final = "wordings"
+"""Of the claim that needs a suite with wordings of its own."""
+
 Pair = tuple[str, str]
 """Names of two runs; a difference is the second's less the first's."""
 
@@ -153,7 +156,7 @@ CLAIMS: Final[Sequence[Finding | Level]] = (
         least=SWAP_LEAST,
     ),
     Finding(
-        "wordings", "held-out wordings cost less than 10 points of SR against training's", "own",
+        WORDINGS_ROW, "held-out wordings cost less than 10 points of SR against training's", "own",
         (("rl-training-words", "rl"),), least=WORDING_LEAST,
     ),
 )  # fmt: skip

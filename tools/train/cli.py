@@ -99,7 +99,7 @@ def parser() -> argparse.ArgumentParser:
         "--after", metavar="STEP", help="the weights of --checkpoint are what this step has left: go on after it"
     )
     p.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where networks are trained (default: cpu)")
-    p.add_argument("--delay-profile", type=Path, metavar="FILE", help="imitate under these delays (edge-calib latency)")
+    p.add_argument("--delay-profile", type=Path, metavar="FILE", help="learn under these delays (edge-calib latency)")
     p.add_argument(
         "--scores", type=Path, metavar="FILE", action="append", default=[], help="card: edge-bench's result.json"
     )
@@ -175,7 +175,8 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         from edge.latency_profile import load_profile
 
         load_profile(args.delay_profile)
-        settings.append(f"imitate.delays.profile={args.delay_profile.absolute()}")
+        path = args.delay_profile.absolute()
+        settings += [f"imitate.delays.profile={path}", f"rl.delay_profile={path}"]
     there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
     found = next((path for path in there if path.is_file()), None)
     if args.preset is not None and args.preset not in recipe_names():
