@@ -1,6 +1,7 @@
 """A trained point-goal network as one ONNX file: `python -m tools.train.point_goal_export FILE --out bc.onnx`.
 
-FILE is a run's `imitate/` or `rl/point_goal.safetensors`. What `edge-bench --policy point-goal-net:` drives: frame, velocity and goal in, plan out; the encoder is inside.
+FILE is a run's `imitate/point_goal.safetensors`, or `rl/`'s. What `edge-bench --policy point-goal-net:` drives: frame,
+velocity and goal in, plan out; the encoder is inside.
 """
 
 from __future__ import annotations
