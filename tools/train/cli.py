@@ -34,6 +34,7 @@ from tools.train.job import StageJob, StopFlag
 from tools.train.model_card import ship, write_card
 from tools.train.network_file import START, import_start
 from tools.train.optim import computes_bf16
+from tools.train.own_drives import take_drives
 from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.run_dir import RunDir
 from tools.train.show import progress_for
@@ -90,6 +91,9 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder of the run")
     p.add_argument("--resume", action="store_true", help="go on with a stage that was begun; skip what is done")
+    p.add_argument(
+        "--drives", type=Path, metavar="DIR", help="learn from this data set (tools.train.importers), collect nothing"
+    )
     p.add_argument("--from", dest="base", type=Path, metavar="DIR", help=f"use {', '.join(BORROWED)} of another run")
     p.add_argument(
         "--checkpoint", type=Path, metavar="PATH", action="append", default=[],
@@ -158,6 +162,8 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
         raise UsageError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
         raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
+    if args.base is not None and args.drives is not None:
+        raise UsageError("--from and --drives: expected one of them, both say where drives come from")
     if args.after is not None and not args.checkpoint:
         raise UsageError("--after: expected --checkpoint with it, the weights that the step has left")
     before = chain.steps_until(args.after, recipe) if args.after is not None else []
@@ -225,6 +231,8 @@ def _train(
         run_dir = RunDir.open(args.out, recipe)
         if args.base is not None:
             run_dir.borrow(RunDir(args.base), BORROWED, recipe)
+        if args.drives is not None:
+            take_drives(run_dir, args.drives)
         if args.checkpoint and not run_dir.begun(START):
             import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
             if before:

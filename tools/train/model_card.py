@@ -19,11 +19,20 @@ from export.progress import duration
 from tools.train.chain import ADOPTED, GO_ON, retired
 from tools.train.drive import file_sha256
 from tools.train.network_file import START, START_CARD, read_network, stage_weights
+from tools.train.own_drives import IMPORTED
 from tools.train.recipe import STAGES, Recipe
 from tools.train.run_dir import VERSIONS, RunDir
 
 NAME: Final = "MODEL_CARD.md"
 _BEFORE: Final = "## What it went on from"
+_OUR_DRIVES: Final = (
+    "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
+    "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
+    "which a test holds. No recording of a person or a place is in it.",
+)
+_OTHERS_DRIVES: Final = (
+    "Drives that were recorded elsewhere and imported (`--drives`); whose they are, this run cannot know.",
+)
 LIMITS: Final = """\
 * It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
   does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
@@ -168,9 +177,7 @@ def _row(where: str, summary: Mapping[str, Any]) -> str:
 def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
     rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
     lines = [
-        "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
-        "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
-        "which a test holds. No recording of a person or a place is in it.",
+        *(_OTHERS_DRIVES if collected is not None and collected.get(IMPORTED) is True else _OUR_DRIVES),
         "",
         *(["None was collected by this run."] if collected is None else _facts(collected)),
     ]

@@ -1,0 +1,81 @@
+"""A run that learns from drives recorded elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.training_drives import dataset, drive
+from tools.train import cli
+from tools.train.drive import Dataset, DriveError
+from tools.train.model_card import card
+from tools.train.network_file import START, import_start
+from tools.train.own_drives import take_drives
+from tools.train.recipe import load_recipe
+from tools.train.run_dir import RunDir, RunDirError
+
+TINY = load_recipe("tiny")
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Dataset:
+    return dataset(tmp_path / "theirs", drive("a"), drive("b"))
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> RunDir:
+    return RunDir.open(tmp_path / "run", TINY)
+
+
+def test_their_drives_are_the_runs_and_nothing_is_collected(run_dir: RunDir, theirs: Dataset) -> None:
+    take_drives(run_dir, theirs.folder)
+    assert Dataset.open(run_dir.out / "collect", verify=True).sha256 == theirs.sha256
+    assert run_dir.result("collect") is not None
+
+
+def test_their_folder_stays_as_it_is(run_dir: RunDir, theirs: Dataset) -> None:
+    before = {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()}
+    take_drives(run_dir, theirs.folder)
+    (run_dir.out / "collect" / "dataset.json").write_text("{}")
+    assert {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_second_call_changes_nothing(run_dir: RunDir, theirs: Dataset) -> None:
+    assert take_drives(run_dir, theirs.folder) == take_drives(run_dir, theirs.folder)
+
+
+def test_a_run_that_has_collected_takes_no_others(run_dir: RunDir, theirs: Dataset) -> None:
+    (run_dir.stage("collect") / "index.jsonl").write_text("")
+    with pytest.raises(RunDirError, match="has begun to collect"):
+        take_drives(run_dir, theirs.folder)
+
+
+def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
+    theirs.path("b").write_bytes(b"half")
+    with pytest.raises(DriveError, match="not the file that the index lists"):
+        take_drives(run_dir, theirs.folder)
+    assert not run_dir.begun("collect")
+
+
+def test_the_card_does_not_call_them_ours(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
+    from export.model.network import build
+    from export.model.weights import WeightsInfo, save_weights
+
+    save_weights(build(TINY.model, 1), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
+    take_drives(run_dir, theirs.folder)
+    text = card(run_dir, TINY, run_dir.out / START / "model.safetensors")
+    assert "recorded elsewhere" in text and "privileged expert" not in text
+
+
+def test_the_command_takes_them(tmp_path: Path, theirs: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    arguments = ["collect", "--preset", "tiny", "--drives", str(theirs.folder), "--out", str(out)]
+    assert cli.main(arguments) == 0 and "collect: done before" in capsys.readouterr().err
+    assert len(Dataset.open(out / "collect")) == 2
+
+
+def test_drives_come_from_one_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sft", "--preset", "tiny", "--drives", "a", "--from", "b", "--out", str(tmp_path / "c")]) == 2
+    assert "both say where drives come from" in capsys.readouterr().err

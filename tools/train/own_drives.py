@@ -1,0 +1,42 @@
+"""Drives that were recorded elsewhere, which a run learns from instead of collecting some."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any, Final
+
+from tools.train.dataset import DatasetWriter
+from tools.train.drive import Dataset
+from tools.train.run_dir import RunDir, RunDirError
+
+IMPORTED: Final = "imported"
+"""In the result of `collect`: the drives are not this repository's expert's."""
+
+
+def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
+    """Make the data set in `folder` the run's own, and its stage `collect` done; files are linked where they can be.
+
+    Raises DriveError for a data set that is not whole, RunDirError where the run has begun to collect.
+    """
+    done = run_dir.result("collect")
+    if done is not None and done.get(IMPORTED) is True:
+        return done
+    if run_dir.begun("collect"):
+        raise RunDirError(f"--drives {folder}: {run_dir.out} has begun to collect its own; name another --out")
+    dataset = Dataset.open(folder, verify=True)
+    with DatasetWriter(run_dir.stage("collect")) as writer:
+        for entry in dataset.entries:
+            _link_or_copy(dataset.path(entry.id), writer.path(entry.id))
+            writer.add(entry)
+        result = {IMPORTED: True, **writer.summary(""), "sha256": writer.finish().sha256}
+    run_dir.finish("collect", result)
+    return result
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or one without links
+        shutil.copyfile(source, target)
