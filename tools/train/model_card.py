@@ -196,6 +196,8 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
     versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
     packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
     went_on = "" if after is None else f" --checkpoint WEIGHTS --after {after}"
+    if results.get("collect", {}).get(IMPORTED) is True:
+        went_on += " --drives DATASET"
     lines = [
         f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
         f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
