@@ -212,7 +212,7 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[
     data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
-        raise SftError(f"{dataset.folder}: no anchors with reasoning to learn from; collect drives, or import them with words")
+        raise SftError(f"{dataset.folder}: no anchors with reasoning; collect drives, or import them with words")
     per_epoch = -(-len(data) // config.batch)
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
