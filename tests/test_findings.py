@@ -293,7 +293,8 @@ def test_the_suite_that_training_writes_is_taken(tmp_path: Path, capsys: Any) ->
     suite = write_suite(tmp_path / "evaluate", EvaluateConfig(episodes=2, kinds={"corridor": 1.0}))
     root = models(tmp_path / "models", "rl")
     assert run(root, tmp_path / "out", suite, "--dry-run") == EXIT_DONE
-    assert "runs of 2 episodes" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "runs of 2 episodes" in told and "not run: row wordings: the episodes' own wordings are of training" in told
     episodes = load_suite(suite)
     assert {load_scene(each.scene).name for each in episodes} == {Path(each.scene).stem for each in episodes}
     for name in ("rl-swapped", "rl-training-words"):

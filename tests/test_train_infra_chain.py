@@ -426,6 +426,28 @@ def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: P
     assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
 
 
-def test_weights_without_a_card_are_those_of_others(run_dir: RunDir, tmp_path: Path) -> None:
+def test_a_runs_own_card_is_found_beside_its_weights(trained: RunDir, tmp_path: Path) -> None:
+    write_card(trained, TINY)
+    more = RunDir.open(tmp_path / "more", TINY)
+    import_start(more.out, TINY.model, [trained.model_path], 1)
+    text = card(more, TINY, more.out / "start" / "model.safetensors")
+    assert "## What it went on from" in text and "ab12" in text and "recipe.toml --checkpoint WEIGHTS`" in text
+
+
+@pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
+def test_weights_without_a_card_of_their_own_are_those_of_others(
+    run_dir: RunDir, tmp_path: Path, text: bytes | None
+) -> None:
+    if text is not None:
+        (tmp_path / "w.md").write_bytes(text)
     adopted(run_dir, tmp_path, "imitate")
     assert "weights of others" in card(run_dir, NEWEST, run_dir.model_path)
+
+
+def test_weights_of_others_stay_those_of_others(run_dir: RunDir, tmp_path: Path) -> None:
+    adopted(run_dir, tmp_path, "imitate")
+    run_dir.finish("imitate", {"loss": 0.5})
+    more = RunDir.open(tmp_path / "more", NEWEST)
+    import_start(more.out, TINY.model, [ship(run_dir, NEWEST, tmp_path / "weights")], 1)
+    text = card(more, NEWEST, more.out / "start" / "model.safetensors")
+    assert "weights of others" in text and "No weights of anybody else" not in text

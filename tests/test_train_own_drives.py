@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.training_drives import dataset, drive
-from tools.train import cli
+from tools.train import cli, own_drives
 from tools.train.drive import Dataset, DriveError
 from tools.train.model_card import card
 from tools.train.network_file import START, import_start
@@ -37,7 +37,7 @@ def test_their_drives_are_the_runs_and_nothing_is_collected(run_dir: RunDir, the
 def test_their_folder_stays_as_it_is(run_dir: RunDir, theirs: Dataset) -> None:
     before = {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()}
     take_drives(run_dir, theirs.folder)
-    (run_dir.out / "collect" / "dataset.json").write_text("{}")
+    drive("a", 80).save(Dataset.open(run_dir.out / "collect").path("a"))
     assert {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()} == before
 
 
@@ -47,8 +47,39 @@ def test_a_second_call_changes_nothing(run_dir: RunDir, theirs: Dataset) -> None
 
 def test_a_run_that_has_collected_takes_no_others(run_dir: RunDir, theirs: Dataset) -> None:
     (run_dir.stage("collect") / "index.jsonl").write_text("")
-    with pytest.raises(RunDirError, match="has begun to collect"):
+    with pytest.raises(RunDirError, match="has drives that are others"):
         take_drives(run_dir, theirs.folder)
+
+
+def test_a_run_takes_one_data_set_only(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
+    take_drives(run_dir, theirs.folder)
+    with pytest.raises(RunDirError, match="has drives that are others"):
+        take_drives(run_dir, dataset(tmp_path / "more", drive("c")).folder)
+
+
+def test_an_interrupted_call_leaves_no_drives_and_can_be_repeated(
+    run_dir: RunDir, theirs: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(source: Path, target: Path) -> None:
+        if source.stem == "b":
+            raise KeyboardInterrupt
+        own_drives.shutil.copyfile(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(own_drives, "_link_or_copy", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            take_drives(run_dir, theirs.folder)
+    assert not run_dir.begun("collect")
+    take_drives(run_dir, theirs.folder)
+    assert Dataset.open(run_dir.out / "collect", verify=True).ids == ("a", "b")
+
+
+def test_links_among_their_files_are_followed(run_dir: RunDir, theirs: Dataset) -> None:
+    path = theirs.path("a")
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("elsewhere")
+    take_drives(run_dir, theirs.folder)
+    assert len(Dataset.open(run_dir.out / "collect", verify=True)) == 2
 
 
 def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
@@ -76,6 +107,26 @@ def test_the_command_takes_them(tmp_path: Path, theirs: Dataset, capsys: pytest.
     assert len(Dataset.open(out / "collect")) == 2
 
 
-def test_drives_come_from_one_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sft", "--preset", "tiny", "--drives", "a", "--from", "b", "--out", str(tmp_path / "c")]) == 2
-    assert "both say where drives come from" in capsys.readouterr().err
+def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["all", "--preset", "tiny", "--drives", str(theirs.folder), "--dry-run"]) == 0
+    told = capsys.readouterr().err
+    assert "sft" in told and "collect" not in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("sft", "--from", "b"), "both say where drives come from"),
+        (("all", "--checkpoint", "w", "--after", "imitate"), "goes on without drives"),
+        (("card",), "belongs to stages"),
+        (("sft",), "not the index of a data set"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str
+) -> None:
+    out = tmp_path / "c"
+    RunDir.open(out, TINY)
+    assert cli.main([*arguments, "--drives", str(tmp_path / "a"), "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert says in told and told.count("\n") == 1

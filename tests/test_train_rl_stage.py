@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from export.model.network import TicVla
+from export.model.weights import WeightsInfo, save_weights
 from tests.test_train_rl_tail import LIMITS, _config, _episode, _network
 from tools.train import rollout
 from tools.train.job import StageJob, StopFlag
@@ -183,6 +184,15 @@ def test_an_action_expert_that_has_imitated_nobody_is_not_improved(tmp_path: Pat
     job = _job(tmp_path, RlConfig())
     finish_network(job, "sft", _network())
     with pytest.raises(RlError, match=r"sft/model.safetensors: its action expert has learned nothing yet"):
+        run(job)
+
+
+def test_weights_with_an_action_expert_of_chance_are_not_improved(tmp_path: Path) -> None:
+    job = _job(tmp_path, RlConfig())
+    save_weights(
+        _network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone")
+    )
+    with pytest.raises(RlError, match="has learned nothing yet"):
         run(job)
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from edge.artifact_files import MANIFEST_NAME
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
+from export.checkpoint.coverage import CheckpointError
 from export.model.config import PRESETS
 from export.shipped import shipped_weights
 from sim_hil.realtime.children import Child, Children, StepError
@@ -263,7 +264,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except KeyboardInterrupt:
         _say("interrupted, all processes ended")
         return EXIT_INTERRUPTED
-    except (StepError, ReportError, OSError) as error:
+    except (StepError, ReportError, CheckpointError, OSError) as error:
         _say(str(error))
         return EXIT_CHECK_FAILED
     finally:

@@ -160,7 +160,7 @@ def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile, *, held_out: 
     folders: dict[str, str] = {}
     claims, left_out = claims_of(root)
     if not held_out:
-        left_out[f"row {WORDINGS_ROW}"] = "this suite's own wordings are of training's patterns"
+        left_out[f"row {WORDINGS_ROW}"] = "the episodes' own wordings are of training's patterns; judge it on dynanav"
         claims = [claim for claim in claims if claim.row != WORDINGS_ROW]
     missing = {row: why for row, why in left_out.items() if row.removeprefix("row ") in rows}
     by_conditions: dict[str, str] = {}

@@ -148,6 +148,10 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     check_result_target(args.json)
     recipe = _recipe(args)
     steps = steps_of(args.command, recipe) if args.command != "card" else []
+    if args.drives is not None:
+        if args.command == "card":
+            raise UsageError("--drives belongs to stages, not to card")
+        steps = [step for step in steps if step.stage != "collect" or not args.dry_run]
     if args.dry_run:
         plan = budget.budget_of(recipe, steps, args.device)
         sys.stderr.write("\n".join(budget.lines_of(recipe, steps, plan, args.device)) + "\n")
@@ -164,6 +168,8 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
         raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
     if args.base is not None and args.drives is not None:
         raise UsageError("--from and --drives: expected one of them, both say where drives come from")
+    if args.after is not None and args.drives is not None:
+        raise UsageError("--after and --drives: expected one of them, --after goes on without drives")
     if args.after is not None and not args.checkpoint:
         raise UsageError("--after: expected --checkpoint with it, the weights that the step has left")
     before = chain.steps_until(args.after, recipe) if args.after is not None else []
@@ -182,7 +188,9 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
         load_profile(args.delay_profile)
         path = args.delay_profile.absolute()
-        settings += [f"imitate.delays.profile={path}", f"rl.delay_profile={path}"]
+        # What imitation was begun with stays where only reinforcement learning is asked for, and the other way round.
+        settings += [f"imitate.delays.profile={path}"] if args.command != "rl" else []
+        settings += [f"rl.delay_profile={path}"] if args.command != "imitate" else []
     there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
     found = next((path for path in there if path.is_file()), None)
     if args.preset is not None and args.preset not in recipe_names():

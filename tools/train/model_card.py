@@ -18,12 +18,13 @@ from export.model.weights import WeightsInfo, save_weights
 from export.progress import duration
 from tools.train.chain import ADOPTED, GO_ON, retired
 from tools.train.drive import file_sha256
-from tools.train.network_file import START, START_CARD, read_network, stage_weights
+from tools.train.network_file import CARD, START, START_CARD, read_network, stage_weights
 from tools.train.own_drives import IMPORTED
 from tools.train.recipe import STAGES, Recipe
 from tools.train.run_dir import VERSIONS, RunDir
 
-NAME: Final = "MODEL_CARD.md"
+_HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # there are six levels
+_THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
 _BEFORE: Final = "## What it went on from"
 _OUR_DRIVES: Final = (
     "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
@@ -33,9 +34,15 @@ _OUR_DRIVES: Final = (
 _OTHERS_DRIVES: Final = (
     "Drives that were recorded elsewhere and imported (`--drives`); whose they are, this run cannot know.",
 )
-LIMITS: Final = """\
+_LIMITS_HERE: Final = """\
 * It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
   does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
+"""
+_LIMITS_ELSEWHERE: Final = """\
+* It was measured in simulated scenes with simulated people, if at all. Nothing here says how it does where its drives
+  were recorded.
+"""
+LIMITS: Final = """\
 * It knows the words of its instruction grammar and of its landmarks, in English. Others it may ignore.
 * It is no safety function. Fences, the emergency stop and a person who watches are; so are the supervisor's limits and
   the bridge's deadman, which hold whatever it does.
@@ -51,7 +58,7 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
     """Write the card beside the run's weights. `scores` are results of edge-bench. Raises CardError, OSError."""
     if not run_dir.model_path.is_file():
         raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
-    path = run_dir.out / NAME
+    path = run_dir.out / CARD
     write_whole(path, card(run_dir, recipe, run_dir.model_path, [score(each) for each in scores]))
     return path
 
@@ -78,34 +85,37 @@ def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mappin
     """The card's text; the same run gives the same text."""
     found = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
     results = {name: result for name, result in found.items() if ADOPTED not in result}
-    after = next((str(result["after"]) for result in found.values() if ADOPTED in result), None)
-    before = _before(run_dir)
+    after = next((str(result.get("after")) for result in found.values() if ADOPTED in result), None)
+    before, imported = _card_before(run_dir), results.get("collect", {}).get(IMPORTED) is True
     blocks = [
         f"# {recipe.name}: weights for tic-vla-edge\n",
-        _network(weights, recipe, _licence(run_dir.begun(START), before is not None)),
+        _network(weights, recipe, _licence(run_dir.begun(START), before)),
         "## Scores\n\n" + _scores(results.get("evaluate"), scores),
         "## Data\n\n" + _data(run_dir, results.get("collect")),
         "## Training\n\n" + _training(run_dir, recipe, results, after),
-        "## Limits\n\n" + LIMITS,
-        *([] if before is None else [f"{_BEFORE}\n\n{before}"]),
+        "## Limits\n\n" + (_LIMITS_ELSEWHERE if imported else _LIMITS_HERE) + LIMITS,
+        *([] if before is None else [f"{_BEFORE}\n\n{_history(before)}"]),
     ]
     return "\n".join(blocks)
 
 
-def _before(run_dir: RunDir) -> str | None:
-    """Data and training of the card of the weights that the run began with; None where they had none."""
+def _card_before(run_dir: RunDir) -> str | None:
+    """The card of the weights that the run began with; None where they had none."""
     path = stage_weights(run_dir.out, START).with_name(START_CARD)
-    if not path.is_file():
-        return None
-    text = path.read_text(encoding="utf-8")
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def _history(text: str) -> str:
+    """Data and training of a card, and of what it went on from itself, one level of headings further down."""
     sections = [f"## {section.rstrip()}\n" for section in text.split("\n## ")[1:]]
     kept = [each for each in sections if each.startswith(("## Data\n", "## Training\n", f"{_BEFORE}\n"))]
-    return "\n".join(line.replace("## ", "### ", 1) for each in kept for line in each.split("\n"))
+    lines = (line for each in kept for line in each.split("\n"))
+    return "\n".join(line.replace("## ", "### ", 1) if line.startswith(_HEADINGS) else line for line in lines)
 
 
-def _licence(begun_with_weights: bool, ours: bool) -> str:
-    if begun_with_weights and not ours:
-        return "It began with weights of others (`--checkpoint`), whose licence holds for it."
+def _licence(begun_with_weights: bool, before: str | None) -> str:
+    if begun_with_weights and (before is None or _THEIRS in before):
+        return _THEIRS
     return "Licence: Apache-2.0, as the repository. No weights of anybody else are in it."
 
 
@@ -176,11 +186,12 @@ def _row(where: str, summary: Mapping[str, Any]) -> str:
 
 def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
     rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
-    lines = [
-        *(_OTHERS_DRIVES if collected is not None and collected.get(IMPORTED) is True else _OUR_DRIVES),
-        "",
-        *(["None was collected by this run."] if collected is None else _facts(collected)),
-    ]
+    own = [result for result in rounds if result is not None and ADOPTED not in result]
+    lines: list[str] = []
+    if collected is not None:
+        lines += [*(_OTHERS_DRIVES if collected.get(IMPORTED) is True else _OUR_DRIVES), "", *_facts(collected)]
+    else:
+        lines += [*(_OUR_DRIVES if own else ()), "The expert's drives were not collected by this run."]
     for number, result in enumerate(rounds, 1):
         if result is not None and ADOPTED not in result:
             lines += [
@@ -195,7 +206,8 @@ def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
 def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None) -> str:
     versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
     packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
-    went_on = "" if after is None else f" --checkpoint WEIGHTS --after {after}"
+    went_on = " --checkpoint WEIGHTS" if run_dir.begun(START) else ""
+    went_on += "" if after is None else f" --after {after}"
     if results.get("collect", {}).get(IMPORTED) is True:
         went_on += " --drives DATASET"
     lines = [

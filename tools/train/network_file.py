@@ -15,12 +15,15 @@ from export.model.config import ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
+from tools.train.drive import file_sha256
 from tools.train.job import StageJob
 
 START: Final = "start"
 """Folder of weights that were there before the first stage."""
 START_CARD: Final = "card.md"
-"""Beside them: what the model card that lay beside the checkpoint says."""
+"""Beside them: the model card that they had."""
+CARD: Final = "MODEL_CARD.md"
+"""Of a run, beside its weights."""
 ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
 """Where weights come from, in the order in which they do."""
 FILE: Final = "model.safetensors"
@@ -48,10 +51,33 @@ def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], s
     path = stage_weights(out, START)
     loaded = load_checkpoint(checkpoints, config, fill_seed=seed)
     save_weights(loaded.model, path, WeightsInfo(trained=loaded.info.trained, origin=loaded.info.origin))
-    told = [card for each in checkpoints if (card := each.with_suffix(".md")).is_file()]
-    if len(told) == 1:
-        shutil.copyfile(told[0], path.with_name(START_CARD))
+    if len(checkpoints) == 1 and (card := card_of(checkpoints[0])) is not None:
+        path.with_name(START_CARD).write_text(card, encoding="utf-8")
     return path
+
+
+def card_of(weights: Path) -> str | None:
+    """The model card beside weights of ours: the one that states this very file's hash; None where there is none."""
+    if not weights.is_file():
+        return None
+    digest = file_sha256(weights)
+    for path in (weights.with_suffix(".md"), weights.with_name(CARD)):
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            continue
+        if f"SHA-256 `{digest}`" in text:
+            return text
+    return None
+
+
+def is_trained(weights: Path) -> bool:
+    """Whether all of the network in a file of ours has been trained. Raises NetworkFileError."""
+    try:
+        with safe_open(str(weights), framework="pt") as file:
+            return (file.metadata() or {}).get("trained") == "true"
+    except (OSError, SafetensorError) as error:
+        raise NetworkFileError(f"{weights}: not weights of ours ({error})") from error
 
 
 def start_network(job: StageJob, stage: str) -> TicVla:

@@ -11,6 +11,7 @@ from tools.train.dataset import DatasetWriter
 from tools.train.drive import Dataset
 from tools.train.run_dir import RunDir, RunDirError
 
+_PARTIAL: Final = "collect.partial"
 IMPORTED: Final = "imported"
 """In the result of `collect`: the drives are not this repository's expert's."""
 
@@ -18,20 +19,25 @@ IMPORTED: Final = "imported"
 def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
     """Make the data set in `folder` the run's own, and its stage `collect` done; files are linked where they can be.
 
-    Raises DriveError for a data set that is not whole, RunDirError where the run has begun to collect.
+    All or nothing: an interrupted call leaves no drives. Raises DriveError for a data set that is not whole,
+    RunDirError where the run has other drives.
     """
+    dataset = Dataset.open(folder)
     done = run_dir.result("collect")
-    if done is not None and done.get(IMPORTED) is True:
+    if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
         return done
     if run_dir.begun("collect"):
-        raise RunDirError(f"--drives {folder}: {run_dir.out} has begun to collect its own; name another --out")
-    dataset = Dataset.open(folder, verify=True)
-    with DatasetWriter(run_dir.stage("collect")) as writer:
+        raise RunDirError(f"--drives {folder}: {run_dir.out} has drives that are others; name another --out")
+    Dataset.open(folder, verify=True)
+    partial = run_dir.out / _PARTIAL
+    shutil.rmtree(partial, ignore_errors=True)
+    with DatasetWriter(partial) as writer:
         for entry in dataset.entries:
-            _link_or_copy(dataset.path(entry.id), writer.path(entry.id))
+            _link_or_copy(dataset.path(entry.id).resolve(), writer.path(entry.id))
             writer.add(entry)
         result = {IMPORTED: True, **writer.summary(""), "sha256": writer.finish().sha256}
-    run_dir.finish("collect", result)
+    run_dir.finish(_PARTIAL, result)
+    partial.replace(run_dir.out / "collect")
     return result
 
 

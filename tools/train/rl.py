@@ -23,7 +23,7 @@ from tools.train.action_tail import check_tail
 from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
 from tools.train.exported import export_artifacts
 from tools.train.job import StageJob
-from tools.train.network_file import START, finish_network, read_network, weights_before
+from tools.train.network_file import START, finish_network, is_trained, read_network, weights_before
 from tools.train.point_goal_net import build_point_goal, save_point_goal
 from tools.train.ppo import PpoConfig
 from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
@@ -147,7 +147,8 @@ def run(job: StageJob) -> dict[str, Any]:
     before = weights_before(job.run_dir.out, STAGE)
     if before is None:
         raise RlError(f"{job.run_dir.out}: no policy to improve; run imitate first")
-    if config.policy == "action" and before.parent.name not in (START, "imitate"):
+    imitated = before.parent.name == "imitate" or (before.parent.name == START and is_trained(before))
+    if config.policy == "action" and not imitated:
         raise RlError(f"{before}: its action expert has learned nothing yet; run imitate first")
     network = read_network(before, job.recipe.model, job.recipe.seed).to(job.device)
     bounds = robot_config().limits
