@@ -189,9 +189,7 @@ def test_an_action_expert_that_has_imitated_nobody_is_not_improved(tmp_path: Pat
 
 def test_weights_with_an_action_expert_of_chance_are_not_improved(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
-    save_weights(
-        _network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone")
-    )
+    save_weights(_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
     with pytest.raises(RlError, match="has learned nothing yet"):
         run(job)
 
