@@ -270,15 +270,19 @@ def test_a_longer_run_need_not_walk_farther_than_the_demo(tmp_path: Path) -> Non
     assert found["moved_under_command_m"].limit == 1.0 and found["control_ticks"].limit == 5900
 
 
-@pytest.mark.parametrize(("goal", "reached"), [([1.0, 0.0], False), (None, True)])
-def test_trained_weights_are_asked_to_reach_the_goal(tmp_path: Path, goal: list[float] | None, reached: bool) -> None:
+@pytest.mark.parametrize(("beside_m", "reached"), [(1.4, True), (1.6, False)])
+@pytest.mark.parametrize("share", [0.5, 1.0], ids=["passed on the way", "at the end"])
+def test_trained_weights_are_asked_to_reach_the_goal(
+    tmp_path: Path, share: float, beside_m: float, reached: bool
+) -> None:
     lines = synthetic_run.trace_lines(12.0)
-    end = next(line for line in reversed(lines) if line["kind"] == "pose")
-    lines[0] = {**lines[0], "goal": goal or [end["x"] + 1.0, end["y"] - 1.0]}
+    poses = [line for line in lines if line["kind"] == "pose"]
+    where = poses[round(share * (len(poses) - 1))]
+    lines[0] = {**lines[0], "goal": [where["x"], where["y"] + (1 if where["y"] > 0 else -1) * beside_m]}
     synthetic_run.write_run(tmp_path, trace=lines, trained=True)
     (tmp_path / "settings.json").write_text('{"duration_s": 60.0}')
     found = {c.name: c for c in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
-    assert found["goal_distance_m"].passed is reached and found["goal_distance_m"].limit == 1.5
+    assert found["goal_nearest_m"].passed is reached and found["goal_nearest_m"].limit == 1.5
 
 
 @pytest.mark.parametrize(("trained", "duration_s"), [(False, 60.0), (True, 59.0)])
@@ -286,7 +290,7 @@ def test_the_goal_is_not_asked_of_those_that_cannot_reach_it(tmp_path: Path, tra
     synthetic_run.write_run(tmp_path, trained=trained)
     (tmp_path / "settings.json").write_text(json.dumps({"duration_s": duration_s}))
     names = [check.name for check in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))]
-    assert "goal_distance_m" not in names
+    assert "goal_nearest_m" not in names
 
 
 @pytest.mark.parametrize("part", ["duration_ms", "late_ms"])

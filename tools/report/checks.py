@@ -215,10 +215,16 @@ def goal_distance_m(data: RunData) -> float:
     return float(np.linalg.norm(data.trace.pose[-1, :2] - np.asarray(data.trace.scene["goal"], float)))
 
 
+def nearest_to_goal_m(data: RunData) -> float:
+    """Least distance to the goal of all ground-truth poses: what the paper calls reaching it."""
+    gaps = np.linalg.norm(data.trace.pose[:, :2] - np.asarray(data.trace.scene["goal"], float), axis=1)
+    return float(gaps.min())
+
+
 def _reached(data: RunData) -> list[Check]:
-    """Whether it stands at its goal: asked of trained weights that had the time."""
+    """Whether it came to its goal: asked of trained weights that had the time."""
     model = data.manifest.get("model", {})
     if not isinstance(model, dict) or model.get("trained") is not True or data.duration_s < REACHABLE_S:
         return []
-    gap_m = round(goal_distance_m(data), 3)
-    return [_at_most("goal_distance_m", "Distance to the goal at the end", gap_m, REACHED_M, "m")]
+    nearest_m, note = round(nearest_to_goal_m(data), 3), f"{goal_distance_m(data):.2f} m from it at the end"
+    return [_at_most("goal_nearest_m", "Nearest that it came to the goal", nearest_m, REACHED_M, "m", note)]
