@@ -29,6 +29,8 @@ from export.task_error import TaskError, prompt_parts
 from tests.export_job import NANO, TARGET, job, manifest, progress
 
 GRAPHS = graph_names(pair=False)
+RANDOM = ("--random-weights", "0")
+"""What `artifacts_dir` was exported with."""
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +226,7 @@ def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys
 def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
     artifacts_dir: Path, tmp_path: Path
 ) -> None:
-    assert main(["--out", str(tmp_path / "cold"), "--no-cache"]) == 0
+    assert main([*RANDOM, "--out", str(tmp_path / "cold"), "--no-cache"]) == 0
     subprocess.run(["diff", "-r", str(artifacts_dir), str(tmp_path / "cold")], check=True, timeout=60)
     assert [path.name for path in tmp_path.iterdir()] == ["cold"]
 
@@ -233,11 +235,11 @@ def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened
     artifacts_dir: Path, tmp_path: Path
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    assert main(["--out", str(first)]) == 0
+    assert main([*RANDOM, "--out", str(first)]) == 0
     data = bytearray((first / "action_expert.onnx").read_bytes())
     data[1000] ^= 1
     (first / "action_expert.onnx").write_bytes(data)
-    assert main(["--out", str(second)]) == 0
+    assert main([*RANDOM, "--out", str(second)]) == 0
     subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
 
 
@@ -246,7 +248,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     artifacts_dir: Path, tmp_path: Path, told: signal.Signals
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
-    command = [sys.executable, "-m", "export.cli", "--out", str(out), "--cache", str(cache)]
+    command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
     # A background job of a shell ignores SIGINT and so would its children; what is handled here is default there.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from edge.artifact_files import seal
+from export import verify
 from export.cli import main
 from export.stages import file_sha256
 from export.target import TARGETS_DIR
@@ -90,13 +92,18 @@ def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: 
     assert "other weights" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("shipped", "code", "says"), [(False, 2, "give that with"), (True, 1, "other weights than")])
 def test_verify_of_a_checkpoint_takes_the_checkpoint(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, says: str
 ) -> None:
-    saved, out = tmp_path / "nano.safetensors", tmp_path / "nano"
-    assert main(["--out", str(tmp_path / "first"), "--random-weights", "0", "--save-weights", str(saved)]) == 0
+    saved, others, out = tmp_path / "nano.safetensors", tmp_path / "others.safetensors", tmp_path / "nano"
+    for seed, weights in ((0, saved), (1, others)):
+        where = str(tmp_path / f"first{seed}")
+        assert main(["--out", where, "--random-weights", str(seed), "--save-weights", str(weights)]) == 0
     assert main(["--out", str(out), "--checkpoint", str(saved)]) == 0
     capsys.readouterr()
-    assert main(["verify", str(out)]) == 2
-    assert "nano.safetensors" in capsys.readouterr().err
+    monkeypatch.setattr(verify, "shipped_weights", lambda config: others if shipped else None)
+    assert main(["verify", str(out)]) == code
+    told = capsys.readouterr().err
+    assert says in told and "checkpoint" in told
     assert main(["verify", str(out), "--checkpoint", str(saved)]) == 0

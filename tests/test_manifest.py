@@ -261,7 +261,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("mapped") / "nano"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.graphs.build.SINGLE_FILE_BYTES", 5_000_000)
-        assert main(["--target", "cpu", "--model", "nano", "--no-cache", "--out", str(out)]) == 0
+        assert main(["--target", "cpu", "--random-weights", "0", "--no-cache", "--out", str(out)]) == 0
     return out
 
 
