@@ -251,6 +251,20 @@ def test_tokens_and_states_are_dropped_as_often_as_the_network_says(dataset: Dat
         assert group.keep_guidance.all() and group.keep_state.all()
 
 
+def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset) -> None:
+    config = dataclasses.replace(PLAIN, blind=0.3)
+    plain, some = of(dataset), of(dataset, config)
+    hidden = []
+    for chosen, group in drawn(some, 300):
+        whole = TOKENS.frames(some.drives[chosen.drive].id)
+        for k, seen in zip(chosen.ks, group.visual_tokens, strict=True):
+            hidden.append(not seen.any())
+            assert hidden[-1] or np.array_equal(seen, whole[k])
+    assert np.mean(hidden) == pytest.approx(0.3, abs=0.05)
+    assert all(group.visual_tokens.any(axis=(1, 2)).all() for _, group in drawn(plain, 50))
+    assert config.undisturbed() == PLAIN
+
+
 def test_texts_are_cut_anywhere_and_a_model_that_says_nothing_leaves_its_prompt(dataset: Dataset) -> None:
     states = SideStates(dataset)
 

@@ -53,6 +53,9 @@ class SampleConfig:
     offset_noise_m_per_m: float = 0.02
     """Of the motion offset, in m for each metre driven since the state, one standard deviation (paper, Table 14)."""
     offset_noise_deg_per_m: float = 1.0
+    blind: float = 0.0
+    """Share of samples without the picture of now, so that what is said has to be heard: an expert's pictures alone
+    nearly tell its way."""
     weights: WeightConfig = field(default_factory=WeightConfig)
 
     def __post_init__(self) -> None:
@@ -60,8 +63,8 @@ class SampleConfig:
             raise ValueError(f"group: expected 1 to 64 frames, found {self.group}")
         if not (min(self.cut_text, self.prompt_only) >= 0 and self.cut_text + self.prompt_only <= 1):
             raise ValueError("expected cut_text and prompt_only from 0 on, together 1 at most")
-        if not 0 <= self.standing_start <= 1:
-            raise ValueError("expected standing_start from 0 to 1")
+        if not (0 <= self.standing_start <= 1 and 0 <= self.blind <= 1):
+            raise ValueError("expected standing_start and blind from 0 to 1")
         if not (0 <= self.offset_noise_m_per_m <= 1 and 0 <= self.offset_noise_deg_per_m <= 90):
             raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
 
@@ -69,7 +72,7 @@ class SampleConfig:
         """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
         even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
         return replace(
-            self, cut_text=0.0, prompt_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
+            self, blind=0.0, cut_text=0.0, prompt_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
             offset_noise_deg_per_m=0.0, weights=even,
         )  # fmt: skip
 
@@ -209,8 +212,11 @@ class Samples:
             guidance = np.array(rows)[None]
             keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
         frames = self._tokens.frames(drive.id)
+        visual = np.stack([frames[k] for k in ks])
+        if self.config.blind:
+            visual[rng.uniform(size=count) < self.config.blind] = 0
         return Group(
-            visual_tokens=np.stack([frames[k] for k in ks]),
+            visual_tokens=visual,
             state=drive.state[ks],
             latency=np.array(latency, np.float32),
             guidance=guidance,
