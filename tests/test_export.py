@@ -174,7 +174,7 @@ def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("export.pipeline.TaskCheck", Blind)
-    assert main(["--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
+    assert main([*RANDOM, "--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "language_model: not the same model: deviation as a share of the plans' spread" in said
     assert "cosine of the semantic state" in said
@@ -202,7 +202,7 @@ def test_a_failed_gate_leaves_no_directory(cache: StageCache, tmp_path: Path, mo
 def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--out", str(tmp_path / "out"), "--set", "gates.task.waypoint_cm=1e-9"]
+    arguments = [*RANDOM, "--out", str(tmp_path / "out"), "--set", "gates.task.waypoint_cm=1e-9"]
     assert main([*arguments, "--set", "gates.task.warn_waypoint_cm=1e-10"]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "vision_encoder: not the same model: waypoint error in cm" in said
@@ -212,7 +212,7 @@ def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
 
 def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["--out", str(out), "--set", "gates.task.warn_waypoint_cm=1e-9"]) == 0
+    assert main([*RANDOM, "--out", str(out), "--set", "gates.task.warn_waypoint_cm=1e-9"]) == 0
     assert "vision_encoder: near a limit: waypoint error in cm" in capsys.readouterr().err
     parity = manifest(out)["graphs"]["vision_encoder"]["parity"]
     assert parity["verdict"] == "WARN"
