@@ -46,7 +46,7 @@ demos: .venv/.demo-installed
 
 # Every stage of tools/train/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
 nano: .venv/.demo-installed
-	@$(BIN)/edge-train all --preset nano --out out/nano-run --resume
+	@OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 )) $(BIN)/torchrun --nproc-per-node 2 -m tools.train.cli all --preset nano --out out/nano-run --resume
 	@$(BIN)/edge-train card --out out/nano-run --ship export/weights
 
 # The demo's artifacts, if they are there; otherwise its own.

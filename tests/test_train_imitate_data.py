@@ -265,6 +265,25 @@ def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset)
     assert config.undisturbed() == PLAIN
 
 
+def test_some_states_are_given_without_their_prompt_and_all_others_whole(dataset: Dataset) -> None:
+    config = dataclasses.replace(PLAIN, text_only=0.4)
+    states, alone = SideStates(dataset), []
+    samples = of(dataset, config)
+    for chosen, group in drawn(samples, 300):
+        state = states.at(samples.drives[chosen.drive].id, chosen.anchor)
+        kept = group.keep_guidance[0]
+        alone.append(not kept[: state.prompt_tokens].any())
+        assert kept[state.prompt_tokens :].all() and len(kept) == len(state.kv)
+        assert alone[-1] or kept.all()
+    assert np.mean(alone) == pytest.approx(0.4, abs=0.08)
+    assert config.undisturbed() == PLAIN
+
+
+def test_shares_of_states_that_are_not_whole_are_together_one_at_most() -> None:
+    with pytest.raises(ValueError, match="together 1 at most"):
+        SampleConfig(cut_text=0.4, prompt_only=0.2, text_only=0.5)
+
+
 def test_texts_are_cut_anywhere_and_a_model_that_says_nothing_leaves_its_prompt(dataset: Dataset) -> None:
     states = SideStates(dataset)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from edge.cli import EXIT_BAD_INPUT
 from export.model.config import PRESETS
 from tests import train_ranks
 from tools.train import checkpoint
@@ -276,8 +277,8 @@ def test_every_epoch_shows_every_sample_once_in_an_order_of_its_own() -> None:
     assert all(sorted(epoch) == list(range(23)) for epoch in epochs) and list(epochs[0]) != list(epochs[1])
 
 
-def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
-    alone = train_ranks.train(SINGLE)
+def two_ranks(module: str, *arguments: str) -> list[tuple[int, str]]:
+    """Exit codes and standard errors of a module that is run as torchrun runs it, in two processes."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -285,12 +286,36 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     for rank in range(2):
         env = {**os.environ, "RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1",
                "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": str(ROOT)}  # fmt: skip
-        ranks.append(subprocess.Popen([sys.executable, "-m", "tests.train_ranks", str(tmp_path)], env=env, cwd=ROOT))
+        command = [sys.executable, "-m", module, *arguments]
+        ranks.append(subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True))
     try:
-        assert [process.wait(120) for process in ranks] == [0, 0]
+        said = [process.communicate(timeout=120)[1] for process in ranks]
+        return [(process.returncode, text) for process, text in zip(ranks, said, strict=True)]
     finally:
         for process in ranks:
             process.kill()
+
+
+def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
+    alone = train_ranks.train(SINGLE)
+    assert [code for code, _ in two_ranks("tests.train_ranks", str(tmp_path))] == [0, 0]
     together = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
     assert together[0] == together[1]
     assert together[0] == pytest.approx(alone, rel=1e-4) and alone[-1] < alone[0]
+
+
+def test_two_processes_share_the_stages_that_learn_and_the_first_does_the_others_alone(tmp_path: Path) -> None:
+    assert [code for code, _ in two_ranks("tests.train_chain_rank", str(tmp_path))] == [0, 0]
+    steps = ["collect", "encoder", "sft", "imitate", "dagger", "sft", "imitate", "rl", "evaluate"]
+    shared = {"encoder", "sft", "imitate"}
+    done = [[*(tmp_path / f"{rank}.txt").read_text().splitlines()] for rank in range(2)]
+    assert done[0] == [f"{step} 0/{2 if step in shared else 1}" for step in steps]
+    assert done[1] == [f"{step} 1/2" for step in steps if step in shared]
+    assert (tmp_path / "run" / "imitate-0").is_dir() and (tmp_path / "run" / "evaluate" / "result.json").is_file()
+
+
+@pytest.mark.parametrize("failing", ["collect", "dagger"])
+def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tmp_path: Path, failing: str) -> None:
+    (code, said), (other, heard) = two_ranks("tests.train_chain_rank", str(tmp_path), failing)
+    assert (code, other) == (EXIT_BAD_INPUT, EXIT_BAD_INPUT)
+    assert f"edge-train: {failing} has failed" in said and "edge-train: the first process has ended early" in heard

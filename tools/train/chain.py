@@ -17,7 +17,7 @@ from tools.train.run_dir import RunDir, RunDirError
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
-"""Stages that torchrun may run in several processes."""
+"""Stages whose work torchrun shares out; those between them the first of its processes does alone."""
 
 GO_ON: Final = ("sft", "imitate")
 """Stages that go on, over more drives, after a round of DAgger."""
@@ -120,7 +120,10 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
         return result
     if step.stage in GO_ON and step.round > retired(job.run_dir, step.stage):
         # The drives have become more: the stage goes on over all of them, and what it was is kept.
-        job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
+        job.ranks.barrier()  # all ranks have looked
+        if job.ranks.first:
+            job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
+        job.ranks.barrier()
         job = replace(job, resume=False)
     result = (stage_run or module_run)(step.stage)(job)
     if job.ranks.first:

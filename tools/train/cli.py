@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
@@ -28,7 +29,7 @@ from tools.benchmark_runs import RunsError
 from tools.train import budget, chain
 from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.curves import draw_curves
-from tools.train.distributed import Ranks, leave, ranks_of_environment
+from tools.train.distributed import SINGLE, Ranks, leave, ranks_of_environment
 from tools.train.exported import ExportError
 from tools.train.job import StageJob, StopFlag
 from tools.train.model_card import ship, write_card
@@ -51,7 +52,7 @@ EXAMPLES: Final = """examples:
   edge-train all --preset nano --out out/nano-run                  everything; Ctrl-C ends it, --resume goes on
   edge-train collect --preset nano --out out/run                   one stage after the other
   edge-train sft --out out/run --set sft.epochs=12
-  torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run
+  torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run           also: encoder, imitate, dagger, all
   edge-train imitate --out out/run --delay-profile orin.latency.json
   edge-train imitate --from out/run --variant no-latency --out out/no-latency
   edge-train dagger --preset nano --checkpoint out/run/model.safetensors --after imitate --out out/more
@@ -232,7 +233,7 @@ def deterministic(device: str) -> Iterator[None]:
 def _train(
     args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], before: Sequence[Step], ranks: Ranks
 ) -> dict[str, Any]:
-    if ranks.world > 1 and args.command not in chain.DISTRIBUTED:
+    if ranks.world > 1 and not any(step.stage in chain.DISTRIBUTED for step in steps):
         raise UsageError(f"{args.command}: runs in one process; torchrun is for {', '.join(chain.DISTRIBUTED)}")
     run_dir = RunDir(args.out)
     if ranks.first:
@@ -245,17 +246,18 @@ def _train(
             import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
             if before:
                 chain.adopt(run_dir, before)
-    ranks.barrier()
     results: dict[str, Any] = {}
     with stop_flag() as stop:
         for step in steps:
+            # All ranks see what the first one has written, and agree on whether to go on.
+            if ranks.any(stop.asked):
+                raise KeyboardInterrupt
             if is_done(run_dir, step):
                 _say(ranks, f"{step.name}: done before")
                 results[step.name] = run_dir.result(step.name if step.stage == "dagger" else step.stage)
                 continue
-            if stop.asked:
-                raise KeyboardInterrupt
             may_begin(run_dir, step, args.resume)
+            ranks.barrier()  # all have looked before any begins
             results[step.name] = _step(args, recipe, run_dir, step, ranks, stop)
     if ranks.first and run_dir.model_path.is_file():
         write_card(run_dir, recipe)
@@ -280,7 +282,7 @@ def _step(
             )
             if asks_bf16(recipe, step) and not computes_bf16(args.device):
                 progress.say("computes in float32: this processor has no instructions for bfloat16")
-            result = run_step(job, step)
+            result = run_step(job, step) if step.stage in chain.DISTRIBUTED else _alone(job, step)
     finally:
         took_s = (time.monotonic_ns() - started_ns) / 1e9
         if ranks.first:
@@ -289,6 +291,21 @@ def _step(
         draw_curves(run_dir)
     _say(ranks, f"{step.name}: done in {duration(took_s)}")
     return result
+
+
+def _alone(job: StageJob, step: Step) -> dict[str, Any]:
+    """A step that the first rank does, with all the cores that torchrun leaves idle meanwhile; the others wait."""
+    import torch
+
+    threads = torch.get_num_threads()
+    with job.ranks.by_first() as here:
+        if here:
+            torch.set_num_threads(max(threads, len(os.sched_getaffinity(0)) if job.ranks.world > 1 else 1))
+            try:
+                return run_step(replace(job, ranks=SINGLE), step)
+            finally:
+                torch.set_num_threads(threads)
+    return job.run_dir.result(step.name if step.stage == "dagger" else step.stage) or {}
 
 
 def asks_bf16(recipe: Recipe, step: Step) -> bool:

@@ -11,11 +11,19 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from datetime import timedelta
+from typing import Any, Final, NoReturn
 
 import numpy as np
 import torch
 import torch.distributed as dist
+
+_PATIENCE: Final = timedelta(days=7)
+"""How long ranks wait for one another: one may record drives for hours. torchrun ends them all when one dies."""
+
+
+class EndedEarlyError(RuntimeError):
+    """The first rank has not finished what the others waited for; its own line says why."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,24 @@ class Ranks:
         if self.world > 1:
             dist.barrier()
 
+    @contextmanager
+    def by_first(self) -> Iterator[bool]:
+        """True where the work is to be done, on the first rank; the others wait at the end of the block.
+
+        Raises EndedEarlyError on those where the first one's work has raised.
+        """
+        if not self.first:
+            yield False
+            if self.any(False):
+                raise EndedEarlyError("the first process has ended early")
+            return
+        done = False
+        try:
+            yield True
+            done = True
+        finally:
+            self.any(not done)
+
     def copy_parameters(self, parameters: Iterable[torch.Tensor]) -> None:
         """Give every rank the first one's values."""
         if self.world > 1:
@@ -91,7 +117,7 @@ def ranks_of_environment(device: str = "cpu") -> Iterator[Ranks]:
     if world == 1:
         yield SINGLE
         return
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {"timeout": _PATIENCE}
     if device.startswith("cuda"):
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         options["backend"] = "nccl"

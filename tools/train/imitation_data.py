@@ -48,6 +48,8 @@ class SampleConfig:
     """Share of states whose text ends early: a power budget may cut it at any token."""
     prompt_only: float = 0.05
     """Share of states of a prompt without any text: what the mode without reasoning drives by."""
+    text_only: float = 0.0
+    """Share of states of a text without its prompt: the instruction tells the side of a turn, only the text when."""
     standing_start: float = 0.5
     """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
     offset_noise_m_per_m: float = 0.02
@@ -61,8 +63,9 @@ class SampleConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.group <= 64:
             raise ValueError(f"group: expected 1 to 64 frames, found {self.group}")
-        if not (min(self.cut_text, self.prompt_only) >= 0 and self.cut_text + self.prompt_only <= 1):
-            raise ValueError("expected cut_text and prompt_only from 0 on, together 1 at most")
+        of_text = self.cut_text, self.prompt_only, self.text_only
+        if not (min(of_text) >= 0 and sum(of_text) <= 1):
+            raise ValueError("expected cut_text, prompt_only and text_only from 0 on, together 1 at most")
         if not (0 <= self.standing_start <= 1 and 0 <= self.blind <= 1):
             raise ValueError("expected standing_start and blind from 0 to 1")
         if not (0 <= self.offset_noise_m_per_m <= 1 and 0 <= self.offset_noise_deg_per_m <= 90):
@@ -72,7 +75,7 @@ class SampleConfig:
         """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
         even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
         return replace(
-            self, blind=0.0, cut_text=0.0, prompt_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
+            self, blind=0.0, cut_text=0.0, prompt_only=0.0, text_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
             offset_noise_deg_per_m=0.0, weights=even,
         )  # fmt: skip
 
@@ -211,6 +214,8 @@ class Samples:
             rows = state.kv[: self._length(state, cut, end)]
             guidance = np.array(rows)[None]
             keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
+            if self.config.reasoning and self._text_alone(cut):
+                keep[:, : state.prompt_tokens] = False
         frames = self._tokens.frames(drive.id)
         visual = np.stack([frames[k] for k in ks])
         if self.config.blind:
@@ -241,6 +246,10 @@ class Samples:
         if not self.config.reasoning or cut >= 1 - self.config.prompt_only:
             return state.prompt_tokens
         return state.prompt_tokens + (int(end * (said + 1)) if cut < self.config.cut_text else said)
+
+    def _text_alone(self, cut: float) -> bool:
+        """Whether a state is given without its prompt; `cut` is what `_length` is given."""
+        return self.config.cut_text <= cut < self.config.cut_text + self.config.text_only
 
     def _offset(self, drive: DriveFrames, anchor: int, k: int, noise: Array) -> SE2:
         way_m = float(drive.way_m[k] - drive.way_m[anchor])

@@ -1,0 +1,46 @@
+"""One rank of a whole run whose stages only say who did them: `python -m tests.train_chain_rank OUT [STAGE]`.
+
+`STAGE` fails, on the first rank that comes to it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from tools.train import chain, cli
+from tools.train.chain import Step
+from tools.train.distributed import leave
+from tools.train.job import StageJob
+from tools.train.run_dir import RunDirError
+
+
+def main() -> int:
+    """Exit code of `edge-train all`; each rank's file has a line for every step: stage, rank and world it was given."""
+    out, failing = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else ""
+    here = os.environ["RANK"]
+
+    def note(name: str, job: StageJob) -> dict[str, Any]:
+        with (out / f"{here}.txt").open("a", encoding="utf-8") as file:
+            file.write(f"{name} {job.ranks.rank}/{job.ranks.world}\n")
+        if name == failing:
+            raise RunDirError(f"{name} has failed")
+        job.ranks.barrier()
+        return {"stage": name}
+
+    def stage(name: str) -> Callable[[StageJob], dict[str, Any]]:
+        return lambda job: note(name, job)
+
+    def round_of(job: StageJob, step: Step) -> dict[str, Any]:
+        return note(step.stage, job)
+
+    with patch.object(chain, "module_run", stage), patch.object(chain, "_round", round_of):
+        return cli.main(["all", "--preset", "tiny", "--set", "dagger.rounds=1", "--out", str(out / "run")])
+
+
+if __name__ == "__main__":
+    leave(main())
