@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
-_SHOWN_AGAIN: Final = 1.3  # samples of an epoch by planned anchors, as 328 drives of `nano` had it: some are shown twice
+_SHOWN_AGAIN: Final = 1.3  # samples of an epoch by planned anchors, in `nano`'s 328 drives: some are shown twice
 _DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
 
 
