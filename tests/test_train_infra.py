@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge.cli import EXIT_BAD_INPUT
+from edge.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tests import train_ranks
 from tools.train import checkpoint
@@ -284,38 +284,67 @@ def two_ranks(module: str, *arguments: str) -> list[tuple[int, str]]:
         port = probe.getsockname()[1]
     ranks = []
     for rank in range(2):
-        env = {**os.environ, "RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1",
-               "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": str(ROOT)}  # fmt: skip
+        env = {**os.environ, "RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank), "LOCAL_WORLD_SIZE": "2",
+               "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
+               "PYTHONPATH": str(ROOT)}  # fmt: skip
         command = [sys.executable, "-m", module, *arguments]
         ranks.append(subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True))
     try:
         said = [process.communicate(timeout=120)[1] for process in ranks]
-        return [(process.returncode, text) for process, text in zip(ranks, said, strict=True)]
     finally:
         for process in ranks:
             process.kill()
+    sys.stderr.writelines(said)  # shown where a test fails
+    return [(process.returncode, text) for process, text in zip(ranks, said, strict=True)]
+
+
+def codes(ended: list[tuple[int, str]]) -> list[int]:
+    return [code for code, _ in ended]
 
 
 def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     alone = train_ranks.train(SINGLE)
-    assert [code for code, _ in two_ranks("tests.train_ranks", str(tmp_path))] == [0, 0]
+    assert codes(two_ranks("tests.train_ranks", str(tmp_path))) == [0, 0]
     together = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
     assert together[0] == together[1]
     assert together[0] == pytest.approx(alone, rel=1e-4) and alone[-1] < alone[0]
 
 
-def test_two_processes_share_the_stages_that_learn_and_the_first_does_the_others_alone(tmp_path: Path) -> None:
-    assert [code for code, _ in two_ranks("tests.train_chain_rank", str(tmp_path))] == [0, 0]
+def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_the_others_alone(tmp_path: Path) -> None:
+    assert codes(two_ranks("tests.train_chain_rank", str(tmp_path), "done")) == [0, 0]
     steps = ["collect", "encoder", "sft", "imitate", "dagger", "sft", "imitate", "rl", "evaluate"]
     shared = {"encoder", "sft", "imitate"}
-    done = [[*(tmp_path / f"{rank}.txt").read_text().splitlines()] for rank in range(2)]
-    assert done[0] == [f"{step} 0/{2 if step in shared else 1}" for step in steps]
-    assert done[1] == [f"{step} 1/2" for step in steps if step in shared]
+    done = [(tmp_path / f"{rank}.txt").read_text().splitlines() for rank in range(2)]
+    # Whoever works alone has the threads of both.
+    assert done[0] == [f"{step} 0/2 1" if step in shared else f"{step} 0/1 2" for step in steps]
+    assert done[1] == [f"{step} 1/2 1" for step in steps if step in shared]
     assert (tmp_path / "run" / "imitate-0").is_dir() and (tmp_path / "run" / "evaluate" / "result.json").is_file()
 
 
-@pytest.mark.parametrize("failing", ["collect", "dagger"])
+def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_path: Path) -> None:
+    assert codes(two_ranks("tests.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
+    before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
+    assert before[0][-3] == before[1][-3] == "encoder"
+    ended = two_ranks("tests.train_chain_rank", str(tmp_path), "done")
+    assert codes(ended) == [0, 0] and "encoder: done before" in ended[0][1]
+    assert (tmp_path / "1.txt").read_text().split().count("encoder") == 1
+
+
+@pytest.mark.parametrize("failing", ["collect", "dagger", "set-up"])
 def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tmp_path: Path, failing: str) -> None:
-    (code, said), (other, heard) = two_ranks("tests.train_chain_rank", str(tmp_path), failing)
-    assert (code, other) == (EXIT_BAD_INPUT, EXIT_BAD_INPUT)
-    assert f"edge-train: {failing} has failed" in said and "edge-train: the first process has ended early" in heard
+    line = f"{failing} has failed"
+    if failing == "set-up":
+        other = RunDir.open(tmp_path / "run", load_recipe("tiny", ["seed=5"]))
+        (other.stage("collect") / "begun").touch()
+        line = "begun with other numbers (seed: 5 there, 1 asked for)"
+    (code, said), (others, heard) = two_ranks("tests.train_chain_rank", str(tmp_path), failing)
+    assert (code, others) == (EXIT_BAD_INPUT, EXIT_BAD_INPUT)
+    assert line in said and "edge-train: the first process has ended early" in heard
+    assert "Traceback" not in said + heard
+
+
+def test_run_as_a_module_it_says_what_is_wrong_in_one_line() -> None:
+    command = [sys.executable, "-m", "tools.train.cli", "all", "--preset", "nope", "--out", "never"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == EXIT_BAD_INPUT
+    assert "edge-train: --preset nope: expected one of" in ended.stderr and "Traceback" not in ended.stderr

@@ -1,6 +1,7 @@
-"""One rank of a whole run whose stages only say who did them: `python -m tests.train_chain_rank OUT [STAGE]`.
+"""One rank of a whole run whose stages only say who did them: `python -m tests.train_chain_rank OUT HOW`.
 
-`STAGE` fails, on the first rank that comes to it.
+HOW: the name of a stage that fails on the first rank that comes to it; `stop`, where the second rank alone is asked to
+stop during `encoder`; or `done`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import torch
+
 from tools.train import chain, cli
 from tools.train.chain import Step
 from tools.train.distributed import leave
@@ -20,15 +23,17 @@ from tools.train.run_dir import RunDirError
 
 
 def main() -> int:
-    """Exit code of `edge-train all`; each rank's file has a line for every step: stage, rank and world it was given."""
-    out, failing = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else ""
+    """Exit code of `edge-train all`; each rank's file has a line for every step: stage, rank/world, threads."""
+    out, how = Path(sys.argv[1]), sys.argv[2]
     here = os.environ["RANK"]
 
     def note(name: str, job: StageJob) -> dict[str, Any]:
         with (out / f"{here}.txt").open("a", encoding="utf-8") as file:
-            file.write(f"{name} {job.ranks.rank}/{job.ranks.world}\n")
-        if name == failing:
+            file.write(f"{name} {job.ranks.rank}/{job.ranks.world} {torch.get_num_threads()}\n")
+        if name == how:
             raise RunDirError(f"{name} has failed")
+        if how == "stop" and name == "encoder" and here == "1":
+            job.stop.ask()
         job.ranks.barrier()
         return {"stage": name}
 
@@ -39,7 +44,7 @@ def main() -> int:
         return note(step.stage, job)
 
     with patch.object(chain, "module_run", stage), patch.object(chain, "_round", round_of):
-        return cli.main(["all", "--preset", "tiny", "--set", "dagger.rounds=1", "--out", str(out / "run")])
+        return cli.main(["all", "--preset", "tiny", "--set", "dagger.rounds=1", "--out", str(out / "run"), "--resume"])
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from tools.train.run_dir import RunDir, RunDirError
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
-"""Stages whose work torchrun shares out; those between them the first of its processes does alone."""
+"""Stages whose work torchrun shares out; the others the first of its processes does alone."""
 
 GO_ON: Final = ("sft", "imitate")
 """Stages that go on, over more drives, after a round of DAgger."""

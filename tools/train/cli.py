@@ -234,18 +234,12 @@ def _train(
     args: argparse.Namespace, recipe: Recipe, steps: Sequence[Step], before: Sequence[Step], ranks: Ranks
 ) -> dict[str, Any]:
     if ranks.world > 1 and not any(step.stage in chain.DISTRIBUTED for step in steps):
-        raise UsageError(f"{args.command}: runs in one process; torchrun is for {', '.join(chain.DISTRIBUTED)}")
+        shared = ", ".join((*chain.DISTRIBUTED, "dagger", "all"))
+        raise UsageError(f"{args.command}: runs in one process; torchrun is for {shared}")
     run_dir = RunDir(args.out)
-    if ranks.first:
-        run_dir = RunDir.open(args.out, recipe)
-        if args.base is not None:
-            run_dir.borrow(RunDir(args.base), BORROWED, recipe)
-        if args.drives is not None:
-            take_drives(run_dir, args.drives)
-        if args.checkpoint and not run_dir.begun(START):
-            import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
-            if before:
-                chain.adopt(run_dir, before)
+    with ranks.by_first() as here:
+        if here:
+            _prepare(args, recipe, before)
     results: dict[str, Any] = {}
     with stop_flag() as stop:
         for step in steps:
@@ -262,6 +256,19 @@ def _train(
     if ranks.first and run_dir.model_path.is_file():
         write_card(run_dir, recipe)
     return {"command": args.command, "recipe": recipe.name, "out": str(args.out), "stages": results}
+
+
+def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
+    """What a run has before its first step: its recipe, and the drives and weights that it is given."""
+    run_dir = RunDir.open(args.out, recipe)
+    if args.base is not None:
+        run_dir.borrow(RunDir(args.base), BORROWED, recipe)
+    if args.drives is not None:
+        take_drives(run_dir, args.drives)
+    if args.checkpoint and not run_dir.begun(START):
+        import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
+        if before:
+            chain.adopt(run_dir, before)
 
 
 def _step(
@@ -294,13 +301,15 @@ def _step(
 
 
 def _alone(job: StageJob, step: Step) -> dict[str, Any]:
-    """A step that the first rank does, with all the cores that torchrun leaves idle meanwhile; the others wait."""
+    """A step that the first rank does, with the threads of all on this machine; the others wait."""
     import torch
 
+    if job.ranks.world == 1:
+        return run_step(job, step)
     threads = torch.get_num_threads()
     with job.ranks.by_first() as here:
         if here:
-            torch.set_num_threads(max(threads, len(os.sched_getaffinity(0)) if job.ranks.world > 1 else 1))
+            torch.set_num_threads(threads * int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
             try:
                 return run_step(replace(job, ranks=SINGLE), step)
             finally:
@@ -346,6 +355,9 @@ def _fail(code: int, line: str) -> int:
 
 
 if __name__ == "__main__":
+    # By its name: here, the errors of this module would be those of `__main__`, which are not known as ours.
+    from tools.train.cli import main as run
+
     if "WORLD_SIZE" in os.environ:
-        leave(main())
-    sys.exit(main())
+        leave(run())
+    sys.exit(run())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final, NoReturn
@@ -93,12 +93,13 @@ class Ranks:
             if self.any(False):
                 raise EndedEarlyError("the first process has ended early")
             return
-        done = False
         try:
             yield True
-            done = True
-        finally:
-            self.any(not done)
+        except BaseException:
+            with suppress(RuntimeError):  # the others may be gone; what has happened here is what counts
+                self.any(True)
+            raise
+        self.any(False)
 
     def copy_parameters(self, parameters: Iterable[torch.Tensor]) -> None:
         """Give every rank the first one's values."""
@@ -124,10 +125,9 @@ def ranks_of_environment(device: str = "cpu") -> Iterator[Ranks]:
     else:
         options["backend"] = "gloo"
     dist.init_process_group(**options)
-    try:
-        yield Ranks(dist.get_rank(), world)
-    finally:
-        dist.destroy_process_group()
+    yield Ranks(dist.get_rank(), world)
+    # Not after an error: NCCL would wait here for those who wait for this process, which is about to end.
+    dist.destroy_process_group()
 
 
 def leave(code: int) -> NoReturn:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -28,7 +27,7 @@ from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.augment import AugmentConfig, augmented
 from tools.train.distributed import BatchOrder
-from tools.train.encoder_data import FramesConfig, FrameSet, Shard, fill, frames_sha256, made, plan
+from tools.train.encoder_data import FramesConfig, FrameSet, Shard, fill, frames_sha256, plan
 from tools.train.encoder_heads import Balance, EncoderHeads, as_tensors, losses, total
 from tools.train.encoder_labels import COLUMNS, PIXELS, mirrored_label
 from tools.train.encoder_score import Fixed, Score, decide
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 
 STAGE: Final = "encoder"
 _HEADS, _AUGMENT, _LOOK = 0xE0C2, 0xE0C3, 0xE0C4
-_POLL_S: Final = 1.0
 
 
 class EncoderError(ValueError):
@@ -139,14 +137,10 @@ def token_side(network: TicVla) -> int:
 
 
 def _render(job: StageJob, config: EncoderConfig, folder: Path, shards: Sequence[Shard]) -> None:
-    """The first rank has the pictures made; the others wait for the files, however long: no barrier lasts so long."""
-    if job.ranks.first:
-        fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.asked)
-    while not all(made(folder, shard) for shard in shards):
-        if job.stop.asked:
-            raise KeyboardInterrupt
-        time.sleep(_POLL_S)
-    job.ranks.barrier()
+    """The first rank has the pictures made; the others wait."""
+    with job.ranks.by_first() as here:
+        if here:
+            fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.asked)
 
 
 class _Pupil:

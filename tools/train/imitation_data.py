@@ -49,7 +49,7 @@ class SampleConfig:
     prompt_only: float = 0.05
     """Share of states of a prompt without any text: what the mode without reasoning drives by."""
     text_only: float = 0.0
-    """Share of states of a text without its prompt: the instruction tells the side of a turn, only the text when."""
+    """Share of states whose prompt is hidden: of a turn it tells the side, and only the text tells when."""
     standing_start: float = 0.5
     """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
     offset_noise_m_per_m: float = 0.02

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
-_SHOWN_AGAIN: Final = 1.3  # samples of an epoch by planned anchors, in `nano`'s 328 drives: some are shown twice
+_DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
 _DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
 
 
@@ -162,7 +162,7 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """(what, how many, which measured rate) before there are drives: they are planned to be 30 s long."""
     config, collect = recipe.sft or SftConfig(), recipe.collect
     seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
-    anchors = round(seconds * _SHOWN_AGAIN) * config.epochs
+    anchors = round(seconds * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
     return [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
 
 
