@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from export.model.tokenizer import NANO_TOKENIZER
 from tests.train_drives import MadeUpTokens, made_up_drive, small_dataset, tiny_model, write_dataset
 from tests.train_sft_rank import CONFIG, sft_job, trained
 from tests.train_stage_contract import Run, StageContract
+from tests.training_scenarios import drive_along, scenarios
 from tools.train import optim
 from tools.train.anchors import Prompts, anchors_of
 from tools.train.chain import Step, run_step
@@ -27,6 +29,7 @@ from tools.train.job import StageJob
 from tools.train.mirror import Views
 from tools.train.network_file import stage_weights
 from tools.train.optim import OptimConfig
+from tools.train.retell import RetellConfig
 from tools.train.sft import Samples, SftConfig, SftError, run
 
 
@@ -131,6 +134,16 @@ def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> 
     before, after = (load_file(stage_weights(tmp_path, name)) for name in ("sft-0", "sft"))
     name = "language.layers.0.down.weight"
     assert 0 < (after[name] - before[name]).abs().max() < steps * CONFIG.optim.lr * 0.1
+
+
+def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "collect", [drive_along(scenarios("corridor")[0]), made_up_drive("b")])
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    config = dataclasses.replace(CONFIG, epochs=1, evaluate=silent)
+    plain = run(sft_job(tmp_path, config))
+    shutil.rmtree(tmp_path / "sft")
+    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RetellConfig(ways=2, tries=24))))
+    assert plain["retold_anchors"] == 0 < more["retold_anchors"] == more["anchors"] - plain["anchors"]
 
 
 def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> None:

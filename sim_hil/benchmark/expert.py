@@ -34,7 +34,7 @@ _SIGHT_M: Final = 7.0  # people further away do not matter yet
 _VIEW_M: Final = 12.0  # who stands about within this is led round
 _STANDING_MPS: Final = 0.25
 _OFF_ROUTE_M: Final = 0.6
-_NEAR: Final = 0.8  # of the threshold: so near has arrived for certain
+NEAR: Final = 0.8  # of the threshold: so near has arrived for certain
 _STUCK_S: Final = 6.0
 _STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
 
@@ -76,7 +76,7 @@ class ExpertPolicy:
             episode.goal_xy,
             world.robot.radius_m,
             max_step_m(episode.robot),
-            _NEAR * episode.threshold_m,
+            NEAR * episode.threshold_m,
             self._told,
         )
         pose = world.pose()
@@ -99,7 +99,7 @@ class ExpertPolicy:
         pose = world.pose()
         people, velocities = self._watch(world)
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
-        self._route = _from_here(self._route, pose)
+        self._route = from_here(self._route, pose)
         if self._ticks % _REPLAN_TICKS == 0:
             standing = people[(gaps < _VIEW_M) & (self._paces < _STANDING_MPS)]
             here = (pose.x_m, pose.y_m)
@@ -149,20 +149,8 @@ class ExpertPolicy:
 
         Along its way, at the comfortable speed as soon as it can be reached: where to go, not how to pass people.
         """
-        world, driving = self._running(), self._driving
-        pose = world.pose()
-        line = self._route
-        along = np.arange(len(line)) * SPACING_M
         speed = self._choice.vx_mps if self._choice is not None else 0.0
-        points = []
-        for time_s in times_s:
-            # Speeding up to the comfortable speed, then on at it.
-            rise_s = min(max(driving.speed_mps - speed, 0.0) / driving.accel_mps2, time_s)
-            gone = (speed + 0.5 * driving.accel_mps2 * rise_s) * rise_s + driving.speed_mps * (time_s - rise_s)
-            x, y = float(np.interp(gone, along, line[:, 0])), float(np.interp(gone, along, line[:, 1]))
-            there = pose.inverse() @ SE2(x, y, 0.0)
-            points.append((there.x_m, there.y_m))
-        return points
+        return along(self._route, self._running().pose(), speed, self._driving, times_s)
 
     @property
     def choice(self) -> Choice | None:
@@ -192,7 +180,29 @@ class ExpertPolicy:
         self._world = None
 
 
-def _from_here(route: Array, pose: SE2) -> Array:
+def driving_of(robot: str) -> Driving:
+    """How a robot drives; raises KeyError for an unknown one."""
+    return _DRIVINGS[robot]
+
+
+def along(route: Array, pose: SE2, speed_mps: float, driving: Driving, times_s: Sequence[float]) -> list[Vec2]:
+    """Where one is at these times on a route, m in the frame of `pose`.
+
+    `route` [n, 2] m in the world: points SPACING_M apart, from here on.
+    """
+    marks = np.arange(len(route)) * SPACING_M
+    points = []
+    for time_s in times_s:
+        # Speeding up to the comfortable speed, then on at it.
+        rise_s = min(max(driving.speed_mps - speed_mps, 0.0) / driving.accel_mps2, time_s)
+        gone = (speed_mps + 0.5 * driving.accel_mps2 * rise_s) * rise_s + driving.speed_mps * (time_s - rise_s)
+        x, y = float(np.interp(gone, marks, route[:, 0])), float(np.interp(gone, marks, route[:, 1]))
+        there = pose.inverse() @ SE2(x, y, 0.0)
+        points.append((there.x_m, there.y_m))
+    return points
+
+
+def from_here(route: Array, pose: SE2) -> Array:
     """The part of a route that is still ahead."""
     gaps = np.hypot(route[:15, 0] - pose.x_m, route[:15, 1] - pose.y_m)
     nearest = int(np.argmin(gaps))

@@ -164,9 +164,15 @@ def _facing(task: Task) -> Task:
         return replace(task, start=(start[0], start[1], round(away, 3)))
     if abs(_wrapped(away - start[2])) > pi / 2:  # look the other way along the corridor
         start = (start[0], start[1], _wrapped(start[2] + pi))
-    if abs(_wrapped(away - start[2])) > pi / 3:
+    task = replace(task, start=start)
+    if not begins_ahead(task):
         raise RouteError("the way begins to the robot's side")
-    return replace(task, start=start)
+    return task
+
+
+def begins_ahead(task: Task) -> bool:
+    """Whether the robot looks where its way begins: words that say "go on" are true only then."""
+    return abs(_wrapped(_first_direction(task.path) - task.start[2])) <= pi / 3
 
 
 def _first_direction(path: tuple[Vec2, ...]) -> float:

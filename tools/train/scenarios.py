@@ -188,29 +188,27 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
             why = "it was not wanted"
             continue
         try:
-            texts = wordings(task.told, WORDINGS, int(rng.integers(2**31)), held_out=False)
-        except WordingError as error:
+            return scenario_of(site, task, int(rng.integers(2**31)), robot, people, seed, number)
+        except RouteError as error:
             why = str(error)
-            continue
-        if any(untrue(text, task.told) for text in texts):
-            why = "a wording is not true of it"
-            continue
-        if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.told)):
-            why = "something that is named is nowhere seen well"
-            continue
-        shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
-        if not isfinite(shortest_m):
-            why = f"the {robot} cannot get there"
-            continue
-        return Scenario(_episode(site, task, tuple(texts), robot, people, seed, number, shortest_m), task, site)
     raise RouteError(f"{site.scene.name}: no task found in {_DRAWS} draws; the last: {why}")
 
 
-def _episode(
-    site: Site, task: Task, texts: tuple[str, ...], robot: str, people: int, seed: int, number: int, shortest_m: float
-) -> Episode:  # fmt: skip
+def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: int, seed: int, number: int) -> Scenario:
+    """A task with wordings that are true of it; raises RouteError where there are none, or no way for the robot."""
+    try:
+        texts = wordings(task.told, WORDINGS, wording_seed, held_out=False)
+    except WordingError as error:
+        raise RouteError(str(error)) from error
+    if any(untrue(text, task.told) for text in texts):
+        raise RouteError("a wording is not true of it")
+    if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.told)):
+        raise RouteError("something that is named is nowhere seen well")
+    shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
+    if not isfinite(shortest_m):
+        raise RouteError(f"the {robot} cannot get there")
     name = f"{site.scene.name}-{number}"
-    return Episode(
+    episode = Episode(
         id=f"t{seed}-{name}-{people}-{robot}",
         task=name,
         scene=site.scene.name,
@@ -219,13 +217,14 @@ def _episode(
         seed=FIRST_SEED * (1 + seed) + number,
         start=task.start,
         goal_xy=task.goal,
-        instructions=texts,
+        instructions=tuple(texts),
         timeout_s=timeout_s(shortest_m, people, site.outdoors),
         threshold_m=site.threshold_m,
         shortest_m=round(shortest_m, 3),
         landmarks=named_landmarks(texts, task.told),
         goal_landmark=task.goal_label,
     )
+    return Scenario(episode, task, site)
 
 
 def _draw(site: Site, rng: np.random.Generator) -> Task:

@@ -34,6 +34,7 @@ from tools.train.mirror import FOLDER as MIRRORED
 from tools.train.mirror import MirroredDataset, Views, mirrored
 from tools.train.network_file import finish_network, read_network, stage_weights, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
+from tools.train.retell import RetellConfig, Retellings
 from tools.train.tokens import TokenCache
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class SftConfig:
     """Samples of all ranks together."""
     words: DrawConfig = field(default_factory=DrawConfig)
     shown: ShowConfig = field(default_factory=ShowConfig)
+    retold: RetellConfig = field(default_factory=RetellConfig)
+    """Other instructions under which every drive is shown too."""
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
     go_on_share: float = 0.4
@@ -181,7 +184,8 @@ def run(job: StageJob) -> dict[str, Any]:
         mirror = TokenCache(MirroredDataset.of(dataset), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
     job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
-    result = fit(job, network.to(job.device), dataset, Views(plain, mirror))
+    retold = _retold(job, dataset) if config.retold.ways else []
+    result = fit(job, network.to(job.device), dataset, Views(plain, mirror), retold)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
@@ -205,12 +209,17 @@ def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
     tokens.build(ids, device=job.device, ranks=job.ranks, progress=job.progress)
 
 
-def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[str, Any]:
-    """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is."""
+def fit(
+    job: StageJob, network: TicVla, dataset: Dataset, views: Views, retold: Sequence[Anchor] = ()
+) -> dict[str, Any]:  # fmt: skip
+    """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is.
+
+    `retold`: anchors of the same drives under other instructions.
+    """
     config, language = _config(job), network.language
     content = tokenizer_for(network.config, None)
     prompts = Prompts(Tokenizer.from_buffer(content), network.config)
-    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train)]
+    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train), *retold]
     data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
@@ -246,6 +255,7 @@ def fit(job: StageJob, network: TicVla, dataset: Dataset, views: Views) -> dict[
     result: dict[str, Any] = {
         "steps": total,
         "anchors": len(data.anchors),
+        "retold_anchors": len(retold),
         "held_anchors": len(held.anchors),
         **numbers,
     }
@@ -297,6 +307,15 @@ def _held(held: Samples, config: SftConfig, seed: int) -> list[Sample]:
 def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
     for drive in dataset.drives(ids, pictures=False):
         yield from anchors_of(drive)
+
+
+def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
+    """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
+    retellings = Retellings(dataset, _config(job).retold, job.recipe.seed)
+    job.progress.say("telling other ways")
+    retellings.build(dataset.train, ranks=job.ranks, progress=job.progress)
+    drives = dataset.drives(dataset.train, pictures=False)
+    return [anchor for drive in drives for other in retellings.of(drive) for anchor in anchors_of(other)]
 
 
 def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:

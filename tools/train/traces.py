@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan2, cos, hypot, radians, sin, tan
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from sim_hil.benchmark.route import Step
 from sim_hil.benchmark.sights import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
 from sim_hil.benchmark.visibility import EYE_M, HFOV_RAD
 from sim_hil.camera import MOUNTS
-from sim_hil.scene import SceneObject, Vec2
+from sim_hil.scene import SceneObject, Vec2, Vec3
 from tools.train import trace_words as words
 from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario
@@ -41,11 +41,23 @@ _ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go o
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
 
 
+class Sight(Protocol):
+    """Tells what is seen of a thing, as `Sightlines` does."""
+
+    def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
+        """px of a 128 x 128 picture."""
+        ...
+
+
 class Tracer:
     """Traces of one scenario's instants."""
 
-    def __init__(self, scenario: Scenario, progress: RouteProgress | None = None) -> None:
-        self._scene, self._lines, told = scenario.scene, scenario.site.lines, scenario.told
+    def __init__(
+        self, scenario: Scenario, progress: RouteProgress | None = None, lines: Sight | None = None
+    ) -> None:  # fmt: skip
+        """`lines`: who can be seen from where, in place of the site's own."""
+        self._scene, told = scenario.scene, scenario.told
+        self._lines: Sight = scenario.site.lines if lines is None else lines
         self.progress = RouteProgress(scenario) if progress is None else progress
         self._range_m = RANGE_OUTDOORS_M if scenario.site.outdoors else RANGE_INDOORS_M
         self._eye_ahead_m = MOUNTS[scenario.episode.robot].position_m[0]

@@ -1,0 +1,287 @@
+"""The same drive under other instructions: ways to other goals from where it began, and what is true of them along it.
+
+A drive shows one of many ways that its first pictures allow. A model that sees every corridor with one instruction
+learns corridors by heart, and where to go in them; with several it has to read what is asked. Past the place where the
+drive leaves the other way, it shows a turn that was missed. Only words are told anew: who is near, and whether to wait
+for them, is as it was, and how to pass people is known of the drive's own way alone.
+
+Retellings lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They
+are written by rename, so a build that was ended goes on with the next drive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import hypot
+from pathlib import Path
+from typing import Any, Final
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.cli import write_whole
+from sim_hil.benchmark.expert import NEAR, along, driving_of, from_here
+from sim_hil.benchmark.expert_route import RoutePlanner
+from sim_hil.benchmark.robots import footprint_m, max_step_m
+from sim_hil.benchmark.route import RouteError
+from sim_hil.benchmark.tasks import begins_ahead, make_task
+from sim_hil.scene import SceneObject, Vec3
+from tools.train import trace_words as words
+from tools.train.distributed import SINGLE, Ranks
+from tools.train.drive import PLAN_TIMES_S, TRACE_EVERY, Dataset, Drive, Entry
+from tools.train.job import QuietProgress, StageProgress
+from tools.train.progress_labels import RouteProgress
+from tools.train.scenarios import Scenario, ScenarioError, scenario_of
+from tools.train.sites import KINDS, Site
+from tools.train.trace_words import Trace
+from tools.train.traces import Sight, Tracer
+
+FOLDER: Final = "retold"
+FORMAT: Final = 1
+LEAST_FRAMES: Final = 50
+"""That a retelling has; a shorter one teaches nothing."""
+_OFF_M: Final = 6.0  # so far from the other way a retelling ends
+_APART_M: Final = 2.0  # between two goals
+_ARRIVE_SHARE: Final = 0.7  # of the distance that counts as arrived, as where drives end
+_REACH_M: Final = 10.0  # of a route: 9 s of it
+_TAG: Final = 0x2E7E11
+
+
+class RetellError(ValueError):
+    """Retellings that cannot be read; one line: what, expected, found, what to do."""
+
+
+@dataclass(frozen=True)
+class RetellConfig:
+    """How many other ways are told of each drive."""
+
+    ways: int = 0
+    """At most; 0: none."""
+    tries: int = 24
+    """Goals that are looked at for them, by chance."""
+    speed_mps: float = 0.8
+    """At which waypoints are; the expert's of `collect`."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ways <= 64 or not 0 <= self.tries <= 1000:
+            raise ValueError(f"expected 0 to 64 ways and 0 to 1000 tries, found {self.ways}, {self.tries}")
+        if not 0.2 <= self.speed_mps <= 1.5:
+            raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
+
+
+@dataclass(frozen=True)
+class Retelling:
+    """Another way, told of the first N frames of a drive.
+
+    `plan_xy` [N, 3, 2]: where one would be on it in 3, 6 and 9 s, m in the robot's frame; `traces`: one a second.
+    """
+
+    wordings: tuple[str, ...]
+    told: tuple[dict[str, Any], ...]
+    goal_xy: tuple[float, float]
+    plan_xy: NDArray[np.float32]
+    traces: tuple[dict[str, Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.plan_xy)
+
+    def of(self, drive: Drive) -> Drive:
+        """The drive as this tells it: nothing is known of what to do next, and its pictures are left out."""
+        count = len(self)
+        about = replace(
+            drive.about, wordings=self.wordings, told=self.told, goal_xy=self.goal_xy, traces=self.traces
+        )  # fmt: skip
+        return Drive(
+            about=about,
+            jpeg=np.zeros(0, np.uint8),
+            jpeg_end=drive.jpeg_end[:count],
+            pose=drive.pose[:count],
+            pose_odom=drive.pose_odom[:count],
+            state=drive.state[:count],
+            future=np.zeros_like(drive.future[:count]),
+            future_steps=np.zeros_like(drive.future_steps[:count]),
+            plan_xy=self.plan_xy,
+            by=drive.by[:count],
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        plan = [[[round(float(v), 3) for v in point] for point in frame] for frame in self.plan_xy]
+        return {**asdict(self), "plan_xy": plan}
+
+    @staticmethod
+    def of_json(content: dict[str, Any]) -> Retelling:
+        """What `as_json` has written; raises KeyError, TypeError, ValueError."""
+        x, y = content["goal_xy"]
+        lists = {name: tuple(content[name]) for name in ("wordings", "told", "traces")}
+        plan = np.array(content["plan_xy"], np.float32).reshape(-1, len(PLAN_TIMES_S), 2)
+        return Retelling(goal_xy=(float(x), float(y)), plan_xy=plan, **lists)
+
+
+class Retellings:
+    """Those of a data set's drives, by one set of numbers."""
+
+    def __init__(self, dataset: Dataset, config: RetellConfig, seed: int) -> None:
+        """Opens what is there; `build` makes what is missing."""
+        numbers = {"format": FORMAT, "seed": seed, **asdict(config)}
+        self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
+        self.folder = dataset.folder / FOLDER / self.key[:16]
+        self._dataset, self._config, self._seed = dataset, config, seed
+        self._entries = {entry.id: entry for entry in dataset.entries}
+
+    def build(self, ids: Sequence[str], *, ranks: Ranks = SINGLE, progress: StageProgress | None = None) -> None:
+        """Make what is missing of these drives. Ranks share the layouts; all must call. Raises DriveError, OSError."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        ranks.barrier()
+        missing = [self._entries[drive_id] for drive_id in ids if not self._path(drive_id).exists()]
+        ranks.barrier()  # everybody has looked before anybody adds
+        places: dict[tuple[str, int], list[Entry]] = {}
+        for entry in missing:
+            places.setdefault((entry.kind, entry.layout_seed), []).append(entry)
+        own = [places[place] for place in sorted(places)[ranks.rank :: ranks.world]]
+        done, count = 0, sum(map(len, own))
+        for entries in own:
+            kind, layout_seed = entries[0].kind, entries[0].layout_seed
+            site = Site(kind, layout_seed) if kind in KINDS else None
+            for entry in entries:
+                drive = self._dataset.load(entry.id, pictures=False)
+                found = [] if site is None else retell(drive, site, self._config, self._seed)
+                content = {"drive_sha256": entry.sha256, "ways": [each.as_json() for each in found]}
+                write_whole(self._path(entry.id), json.dumps(content, separators=(",", ":")) + "\n")
+                done += 1
+                (progress or QuietProgress()).update(done, count)
+        ranks.barrier()
+
+    def of(self, drive: Drive) -> Iterator[Drive]:
+        """A drive under each of its other instructions. Raises RetellError where they have not been made of it."""
+        path = self._path(drive.id)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            same = content["drive_sha256"] == self._entries[drive.id].sha256
+            found = [Retelling.of_json(each) for each in content["ways"]]
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise RetellError(f"{path}: not the retellings of a drive ({error!r}); delete it and run again") from error
+        if not same:
+            raise RetellError(f"{path}: of another drive {drive.id}; delete it and run again")
+        for each in found:
+            yield each.of(drive)
+
+    def _path(self, drive_id: str) -> Path:
+        return self.folder / f"{drive_id}.json"
+
+
+def retell(drive: Drive, site: Site, config: RetellConfig, seed: int) -> list[Retelling]:
+    """Ways to other goals of its site, in an order by chance; the same numbers give the same."""
+    rng = np.random.default_rng((seed, _TAG, crc32(drive.id.encode())))
+    things = [site.goals[int(index)] for index in rng.permutation(len(site.goals))[: config.tries]]
+    first = drive.T_world_base(0)
+    start = (round(first.x_m, 2), round(first.y_m, 2), round(first.theta_rad, 3))
+    lines = _Remembered(site.lines)
+    found: list[Retelling] = []
+    if not drive.traces or not site.grid.is_free(*start[:2]):
+        return found
+    for thing in things:
+        if len(found) >= config.ways:
+            break
+        scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
+        if scenario is not None and (one := told_along(drive, scenario, config.speed_mps, lines)) is not None:
+            found.append(one)
+    return found
+
+
+def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int) -> Scenario | None:
+    """The task to go to a thing from a drive's start; None where it cannot be told, or is the drive's own."""
+    about = drive.about
+    try:
+        task = make_task(site.scene, site.grid, start, thing)
+        gaps = [hypot(task.goal[0] - x, task.goal[1] - y) for x, y in (about.goal_xy, start[:2])]
+        if gaps[0] < _APART_M or gaps[1] < site.threshold_m + _APART_M or not begins_ahead(task):
+            return None
+        return scenario_of(site, task, wording_seed, about.robot, about.people, 0, 0)
+    except (RouteError, ScenarioError):
+        return None
+
+
+def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None) -> Retelling | None:
+    """What is true along a drive of the way of a scenario that begins where it began; None where it hardly shows any.
+
+    Told up to where the drive is 6 m from that way, or has arrived. `lines`: as of `Tracer`.
+    """
+    progress = RouteProgress(scenario)
+    count = _shown_frames(drive, scenario, progress)
+    plan = _plans(drive, scenario, speed_mps, count) if count >= LEAST_FRAMES else None
+    if plan is None:
+        return None
+    tracer = Tracer(scenario, progress, lines)
+    traces = []
+    for own in drive.traces:
+        k = int(own["k"])
+        if k >= count:
+            break
+        means = [tuple(float(v) for v in plan[k, 0])]
+        alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
+        traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
+    told = tuple(scenario.told_json())
+    return Retelling(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
+
+
+def _among(alone: Trace, own: Trace) -> Trace:
+    """A trace of an empty place, with the people of another one of the same instant."""
+    plan = alone.plan
+    if own.plan.startswith(words.WAIT) and plan != words.TURN_BACK:
+        plan = words.WAIT + plan
+    things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
+    people = [] if own.motion == words.NOBODY else own.motion.split(", ")
+    return Trace.of(own.situation, things, people, alone.progress, plan)
+
+
+def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:
+    """How many frames a drive has before it arrives at another goal, or is too far from the way there."""
+    x, y = scenario.episode.goal_xy
+    near = np.hypot(drive.pose[:, 0] - x, drive.pose[:, 1] - y) < _ARRIVE_SHARE * scenario.episode.threshold_m
+    for k in range(len(drive)):
+        if progress.strayed_m(drive.T_world_base(k)) > _OFF_M:
+            return k
+        if near[k]:
+            return k + 1
+    return len(drive)
+
+
+def _plans(drive: Drive, scenario: Scenario, speed_mps: float, count: int) -> NDArray[np.float32] | None:
+    """[count, 3, 2]: where one would be on the way, from every frame; None where the robot cannot get there."""
+    episode = scenario.episode
+    robot, goal_xy = episode.robot, episode.goal_xy
+    planner = RoutePlanner(
+        scenario.scene, goal_xy, footprint_m(robot), max_step_m(robot), NEAR * episode.threshold_m, scenario.task.path
+    )
+    driving = replace(driving_of(robot), speed_mps=speed_mps)
+    plan = np.zeros((count, len(PLAN_TIMES_S), 2), np.float32)
+    route = np.zeros((0, 2))
+    for k in range(count):
+        pose = drive.T_world_base(k)
+        if k % (TRACE_EVERY // 2) == 0:
+            if not planner.reachable(pose.x_m, pose.y_m):
+                return None
+            route = planner.route((pose.x_m, pose.y_m), np.zeros((0, 2)), _REACH_M)
+        route = from_here(route, pose)
+        plan[k] = along(route, pose, max(float(drive.state[k, 0]), 0.0), driving, PLAN_TIMES_S)
+    return plan
+
+
+class _Remembered:
+    """Sightlines that are asked the same for several ways along one drive."""
+
+    def __init__(self, lines: Sight) -> None:
+        self._lines = lines
+        self._known: dict[tuple[object, ...], float] = {}
+
+    def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
+        """As `Sightlines.pixels`."""
+        key = (eye, heading_rad, thing.label, thing.position_m, range_m)
+        if key not in self._known:
+            self._known[key] = self._lines.pixels(eye, heading_rad, thing, range_m)
+        return self._known[key]
