@@ -276,11 +276,10 @@ def test_a_late_move_is_answered_within_40_ms_and_motion_after_a_stop_by_another
         client.stop()
         wait_for(lambda: client.poll().state == "stopped", 20, "stopped")
         late.send(ids.MOVE, move_parameter(0.5, 0.0, 0.0), noreply=True)
-        wait_for(robot.is_driven, 5, "the late Move")
-        since_ns = robot.moves()[-1].received_ns
-        robot.heard.clear()
-        lasting_zero = wait_for_heard(robot, ids.MOVE)
-        check_stop_latency(lasting_zero - since_ns, 40_000_000, since_ns, host)
+        # Not whether it is driven: the answer may be there before anybody looks.
+        wait_for(lambda: any(heard.velocity != ZERO for heard in robot.moves()), 5, "the late Move")
+        since_ns = next(heard.received_ns for heard in robot.moves() if heard.velocity != ZERO)
+        lasting_zero_ns(robot, since_ns, 40_000_000, host)
     robot.heard.clear()
     robot.truth, robot.mode = {"velocity_world_mps": np.array((0.3, 0.0, 0.0))}, ids.MODE_LOCOMOTION
     wait_for_heard(robot, ids.STOP_MOVE)
