@@ -29,8 +29,9 @@ from tools.train.job import StageJob
 from tools.train.mirror import Views
 from tools.train.network_file import stage_weights
 from tools.train.optim import OptimConfig
+from tools.train.recipe import load_recipe
 from tools.train.retell import RetellConfig
-from tools.train.sft import Samples, SftConfig, SftError, run
+from tools.train.sft import Samples, SftConfig, SftError, budget, run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -153,6 +154,17 @@ def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> Non
     shown = Counter(sample.anchor for sample in samples.draw(np.random.default_rng(0)))
     assert {anchors[i].decides for i in shown} == {True, False}
     assert all(count == (3 if anchors[i].decides else 1) for i, count in shown.items()) and len(shown) == len(anchors)
+
+
+def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
+    recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.retold.ways=0"])
+
+    def anchors(**changed: Any) -> int:
+        sft = dataclasses.replace(recipe.sft or SftConfig(), **changed)
+        return next(count for _, count, key in budget(dataclasses.replace(recipe, sft=sft)) if key == "sft")
+
+    assert anchors() == 10 * 30 * 2
+    assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RetellConfig(ways=2))
 
 
 def test_the_recipes_numbers_are_checked() -> None:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
 _DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
+_RETOLD: Final = 0.5  # of a drive's frames that each other way is told of, in 14 drives
 _DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
 
 
@@ -165,7 +166,8 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """(what, how many, which measured rate) before there are drives: they are planned to be 30 s long."""
     config, collect = recipe.sft or SftConfig(), recipe.collect
     seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
-    anchors = round(seconds * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
+    each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
+    anchors = round(seconds * each) * config.epochs
     return [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
 
 
