@@ -14,7 +14,7 @@ from tools.train.drive import Drive
 from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario, scenario_group
 from tools.train.sites import KINDS
-from tools.train.trace_words import NOBODY, NOTHING, TURN_BACK, WAIT
+from tools.train.trace_words import NOBODY, NOTHING
 from tools.train.traces import Tracer
 
 SEED = 5
@@ -51,18 +51,17 @@ def _poses_along(scenario: Scenario) -> np.ndarray:
     return np.array(poses)
 
 
-def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NOBODY, waits: bool = False) -> Drive:
+def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NOBODY) -> Drive:
     """Along the told way with what a tracer says of it, for the next 3 s straight ahead."""
     poses = _poses_along(scenario)
     tracer, traces = Tracer(scenario, progress_of(scenario)), []
     for k in range(0, len(poses), 10):
         said = tracer.trace(SE2(*map(float, poses[k])), *_NO_PEOPLE, [(2.4, 0.0)]).to_json()
-        said["plan"] = WAIT + said["plan"] if waits and said["plan"] != TURN_BACK else said["plan"]
         things = said["objects"] if motion == NOBODY else NOTHING  # for both there is no room
         traces.append({"k": k, **said, "objects": things, "motion": motion})
     plain = made_up_drive(
-        drive_id, len(poses), layout_seed=scenario.layout_seed, kind=scenario.kind, robot=scenario.episode.robot,
-        people=0, goal_xy=scenario.episode.goal_xy, threshold_m=scenario.episode.threshold_m,
+        drive_id, len(poses), layout_seed=scenario.layout_seed, kind=scenario.kind, scene=scenario.scene.name,
+        robot=scenario.episode.robot, goal_xy=scenario.episode.goal_xy, threshold_m=scenario.episode.threshold_m,
         wordings=scenario.wordings, told=tuple(scenario.told_json()), traces=tuple(traces),
     )  # fmt: skip
     state = np.zeros((len(poses), 3), np.float32)

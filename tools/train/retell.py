@@ -2,8 +2,8 @@
 
 A drive shows one of many ways that its first pictures allow. A model that sees every corridor with one instruction
 learns corridors by heart, and where to go in them; with several it has to read what is asked. Past the place where the
-drive leaves the other way, it shows a turn that was missed. Only words are told anew: who is near, and whether to wait
-for them, is as it was, and how to pass people is known of the drive's own way alone.
+drive leaves the other way, it shows a turn that was missed. Only words are told anew, and only where nobody is near:
+where people stood is not recorded, so neither what they hid nor how to go round them is known of another way.
 
 Retellings lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They
 are written by rename, so a build that was ended goes on with the next drive.
@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import hypot
+from math import cos, hypot, sin
 from pathlib import Path
 from typing import Any, Final
 from zlib import crc32
@@ -29,14 +29,16 @@ from sim_hil.benchmark.expert_route import RoutePlanner
 from sim_hil.benchmark.robots import footprint_m, max_step_m
 from sim_hil.benchmark.route import RouteError
 from sim_hil.benchmark.tasks import begins_ahead, make_task
+from sim_hil.layouts import LayoutError
 from sim_hil.scene import SceneObject, Vec3
 from tools.train import trace_words as words
+from tools.train.anchors import Anchor, anchors_of
 from tools.train.distributed import SINGLE, Ranks
 from tools.train.drive import PLAN_TIMES_S, TRACE_EVERY, Dataset, Drive, Entry
 from tools.train.job import QuietProgress, StageProgress
 from tools.train.progress_labels import RouteProgress
-from tools.train.scenarios import Scenario, ScenarioError, scenario_of
-from tools.train.sites import KINDS, Site
+from tools.train.scenarios import Scenario, ScenarioError, is_sound, scenario_of
+from tools.train.sites import Site, SiteError
 from tools.train.trace_words import Trace
 from tools.train.traces import Sight, Tracer
 
@@ -44,8 +46,9 @@ FOLDER: Final = "retold"
 FORMAT: Final = 1
 LEAST_FRAMES: Final = 50
 """That a retelling has; a shorter one teaches nothing."""
-_OFF_M: Final = 6.0  # so far from the other way a retelling ends
+_OFF_M: Final = 3.0  # so far from the other way a retelling ends: most of it is not of turns that were missed
 _APART_M: Final = 2.0  # between two goals
+_FREE: Final = 0.9  # of a drive's poses are on the scene's free floor, if it is the scene; a policy brushes walls
 _ARRIVE_SHARE: Final = 0.7  # of the distance that counts as arrived, as where drives end
 _REACH_M: Final = 10.0  # of a route: 9 s of it
 _TAG: Final = 0x2E7E11
@@ -63,14 +66,10 @@ class RetellConfig:
     """At most; 0: none."""
     tries: int = 24
     """Goals that are looked at for them, by chance."""
-    speed_mps: float = 0.8
-    """At which waypoints are; the expert's of `collect`."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ways <= 64 or not 0 <= self.tries <= 1000:
             raise ValueError(f"expected 0 to 64 ways and 0 to 1000 tries, found {self.ways}, {self.tries}")
-        if not 0.2 <= self.speed_mps <= 1.5:
-            raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
 
 
 @dataclass(frozen=True)
@@ -125,19 +124,25 @@ class Retelling:
 class Retellings:
     """Those of a data set's drives, by one set of numbers."""
 
-    def __init__(self, dataset: Dataset, config: RetellConfig, seed: int) -> None:
-        """Opens what is there; `build` makes what is missing."""
-        numbers = {"format": FORMAT, "seed": seed, **asdict(config)}
+    def __init__(self, dataset: Dataset, config: RetellConfig, seed: int, speed_mps: float) -> None:
+        """Opens what is there; `build` makes what is missing. `speed_mps`: the expert's, at which waypoints are."""
+        numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **asdict(config)}
         self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
         self.folder = dataset.folder / FOLDER / self.key[:16]
-        self._dataset, self._config, self._seed = dataset, config, seed
+        self._dataset, self._config, self._seed, self._speed_mps = dataset, config, seed, speed_mps
         self._entries = {entry.id: entry for entry in dataset.entries}
 
-    def build(self, ids: Sequence[str], *, ranks: Ranks = SINGLE, progress: StageProgress | None = None) -> None:
-        """Make what is missing of these drives. Ranks share the layouts; all must call. Raises DriveError, OSError."""
+    def build(
+        self, ids: Sequence[str], *, ranks: Ranks = SINGLE, progress: StageProgress | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:  # fmt: skip
+        """Make what is missing of these drives. Ranks share the layouts; all must call.
+
+        Raises DriveError, OSError, and KeyboardInterrupt when `stopped` on any rank.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()
-        missing = [self._entries[drive_id] for drive_id in ids if not self._path(drive_id).exists()]
+        missing = [self._entries[drive_id] for drive_id in ids if self._read(drive_id) is None]
         ranks.barrier()  # everybody has looked before anybody adds
         places: dict[tuple[str, int], list[Entry]] = {}
         for entry in missing:
@@ -146,35 +151,49 @@ class Retellings:
         done, count = 0, sum(map(len, own))
         for entries in own:
             kind, layout_seed = entries[0].kind, entries[0].layout_seed
-            site = Site(kind, layout_seed) if kind in KINDS else None
+            site = _site(kind, layout_seed)
             for entry in entries:
+                if stopped():
+                    break
                 drive = self._dataset.load(entry.id, pictures=False)
-                found = [] if site is None else retell(drive, site, self._config, self._seed)
+                found = [] if site is None else retell(drive, site, self._config, self._seed, self._speed_mps)
                 content = {"drive_sha256": entry.sha256, "ways": [each.as_json() for each in found]}
                 write_whole(self._path(entry.id), json.dumps(content, separators=(",", ":")) + "\n")
                 done += 1
                 (progress or QuietProgress()).update(done, count)
-        ranks.barrier()
+        if ranks.any(stopped()):
+            raise KeyboardInterrupt
 
-    def of(self, drive: Drive) -> Iterator[Drive]:
-        """A drive under each of its other instructions. Raises RetellError where they have not been made of it."""
-        path = self._path(drive.id)
+    def anchors(self, drive: Drive) -> list[Anchor]:
+        """Those of a drive under its other instructions at which nobody is near; raises RetellError before `build`."""
+        found = self._read(drive.id)
+        if found is None:
+            raise RetellError(f"{self._path(drive.id)}: not the retellings of this drive; build them first")
+        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == words.NOBODY}
+        return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
+
+    def _read(self, drive_id: str) -> list[Retelling] | None:
+        """What was written of a drive as it is now; None where nothing was, or where it cannot be read."""
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            same = content["drive_sha256"] == self._entries[drive.id].sha256
+            content = json.loads(self._path(drive_id).read_text(encoding="utf-8"))
             found = [Retelling.of_json(each) for each in content["ways"]]
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise RetellError(f"{path}: not the retellings of a drive ({error!r}); delete it and run again") from error
-        if not same:
-            raise RetellError(f"{path}: of another drive {drive.id}; delete it and run again")
-        for each in found:
-            yield each.of(drive)
+        except (OSError, KeyError, TypeError, ValueError):
+            return None
+        return found if content["drive_sha256"] == self._entries[drive_id].sha256 else None
 
     def _path(self, drive_id: str) -> Path:
         return self.folder / f"{drive_id}.json"
 
 
-def retell(drive: Drive, site: Site, config: RetellConfig, seed: int) -> list[Retelling]:
+def _site(kind: str, layout_seed: int) -> Site | None:
+    """None for a scene that is not one of ours."""
+    try:
+        return Site(kind, layout_seed)
+    except (SiteError, LayoutError):
+        return None
+
+
+def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps: float) -> list[Retelling]:
     """Ways to other goals of its site, in an order by chance; the same numbers give the same."""
     rng = np.random.default_rng((seed, _TAG, crc32(drive.id.encode())))
     things = [site.goals[int(index)] for index in rng.permutation(len(site.goals))[: config.tries]]
@@ -182,15 +201,21 @@ def retell(drive: Drive, site: Site, config: RetellConfig, seed: int) -> list[Re
     start = (round(first.x_m, 2), round(first.y_m, 2), round(first.theta_rad, 3))
     lines = _Remembered(site.lines)
     found: list[Retelling] = []
-    if not drive.traces or not site.grid.is_free(*start[:2]):
+    if not drive.traces or not _was_here(drive, site) or not site.grid.is_free(*start[:2]):
         return found
     for thing in things:
         if len(found) >= config.ways:
             break
         scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
-        if scenario is not None and (one := told_along(drive, scenario, config.speed_mps, lines)) is not None:
+        if scenario is not None and (one := told_along(drive, scenario, speed_mps, lines)) is not None:
             found.append(one)
     return found
+
+
+def _was_here(drive: Drive, site: Site) -> bool:
+    """Whether a drive is of a scene as it is built now: of its name, and through no wall of it."""
+    free = [site.robot_grid(drive.about.robot).is_free(float(x), float(y)) for x, y, _ in drive.pose[::TRACE_EVERY]]
+    return drive.about.scene == site.scene.name and float(np.mean(free)) >= _FREE
 
 
 def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int) -> Scenario | None:
@@ -199,7 +224,9 @@ def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed:
     try:
         task = make_task(site.scene, site.grid, start, thing)
         gaps = [hypot(task.goal[0] - x, task.goal[1] - y) for x, y in (about.goal_xy, start[:2])]
-        if gaps[0] < _APART_M or gaps[1] < site.threshold_m + _APART_M or not begins_ahead(task):
+        if gaps[0] < _APART_M or gaps[1] < site.threshold_m + _APART_M:
+            return None
+        if not (begins_ahead(task) and is_sound(site, task)):
             return None
         return scenario_of(site, task, wording_seed, about.robot, about.people, 0, 0)
     except (RouteError, ScenarioError):
@@ -209,7 +236,7 @@ def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed:
 def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None) -> Retelling | None:
     """What is true along a drive of the way of a scenario that begins where it began; None where it hardly shows any.
 
-    Told up to where the drive is 6 m from that way, or has arrived. `lines`: as of `Tracer`.
+    Told up to where the drive is 3 m from that way, or has arrived. `lines`: as of `Tracer`.
     """
     progress = RouteProgress(scenario)
     count = _shown_frames(drive, scenario, progress)
@@ -217,12 +244,13 @@ def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight 
     if plan is None:
         return None
     tracer = Tracer(scenario, progress, lines)
+    driving = driving_of(scenario.episode.robot)
     traces = []
     for own in drive.traces:
         k = int(own["k"])
         if k >= count:
             break
-        means = [tuple(float(v) for v in plan[k, 0])]
+        means = [_turning_first(plan[k, 0], driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
         traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
     told = tuple(scenario.told_json())
@@ -231,12 +259,16 @@ def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight 
 
 def _among(alone: Trace, own: Trace) -> Trace:
     """A trace of an empty place, with the people of another one of the same instant."""
-    plan = alone.plan
-    if own.plan.startswith(words.WAIT) and plan != words.TURN_BACK:
-        plan = words.WAIT + plan
     things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
     people = [] if own.motion == words.NOBODY else own.motion.split(", ")
-    return Trace.of(own.situation, things, people, alone.progress, plan)
+    return Trace.of(own.situation, things, people, alone.progress, alone.plan)
+
+
+def _turning_first(point: NDArray[np.float32], turn_radps: float, speed_mps: float) -> tuple[float, float]:
+    """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does."""
+    bearing = float(np.arctan2(point[1], point[0]))
+    gone_m = max(PLAN_TIMES_S[0] - abs(bearing) / turn_radps, 0.0) * speed_mps
+    return gone_m * cos(bearing), gone_m * sin(bearing)
 
 
 def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:

@@ -238,16 +238,31 @@ def _draw(site: Site, rng: np.random.Generator) -> Task:
 
 
 def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
-    """Whether it is worth training on, and sound as the benchmark's validator means it."""
-    told, (x, y) = task.told, task.goal
-    if hypot(x - task.start[0], y - task.start[1]) < site.threshold_m + _LEAST_WAY_M:
-        return False
-    if any(step.before_m < _LEAST_LEG_M for step in told.steps if step.before_kind != "room"):
+    """Whether it is worth training on, and sound."""
+    told = task.told
+    if not _long_enough(site, task):
         return False
     worth = 0 if not told.steps else 2 if any(step.ordinal > 1 for step in told.steps) else 1
     if site.kind != CORRIDOR and rng.uniform() >= _KEEP[worth]:
         return False
-    return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(told, task.path)
+    return _unmistakable(site, task)
+
+
+def is_sound(site: Site, task: Task) -> bool:
+    """Whether a task can be learned from, as the benchmark's validator means it: words and way agree."""
+    return _long_enough(site, task) and _unmistakable(site, task)
+
+
+def _long_enough(site: Site, task: Task) -> bool:
+    (x, y), steps = task.goal, task.told.steps
+    if hypot(x - task.start[0], y - task.start[1]) < site.threshold_m + _LEAST_WAY_M:
+        return False
+    return not any(step.before_m < _LEAST_LEG_M for step in steps if step.before_kind != "room")
+
+
+def _unmistakable(site: Site, task: Task) -> bool:
+    """Nobody is at the goal beyond a wall from it, and the way bends where and as it is told."""
+    return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(task.told, task.path)
 
 
 def _at(place: float, choices: Sequence[tuple[_T, float]]) -> _T:

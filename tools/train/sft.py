@@ -23,6 +23,7 @@ from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw, waiting
 from tools.train.chain import retired
+from tools.train.collect_config import CollectConfig
 from tools.train.dagger import drives_after
 from tools.train.drive import RATE_HZ, Dataset
 from tools.train.job import StageJob
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
 _DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
-_RETOLD: Final = 0.5  # of a drive's frames that each other way is told of, in 14 drives
+_RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
 _DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
 
 
@@ -230,7 +231,7 @@ def fit(
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
     optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
-    state = _State(job, network, optimiser, _key(job, config, dataset, content, network))
+    state = _State(job, network, optimiser, _key(job, config, dataset, content, network, retold))
     numbers = state.load()
     questions = _held(held, config, job.seed)
     while optimiser.step_count < total:
@@ -313,11 +314,11 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 
 def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
-    retellings = Retellings(dataset, _config(job).retold, job.recipe.seed)
+    collected = job.recipe.collect or CollectConfig()
+    retellings = Retellings(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
     job.progress.say("telling other ways")
-    retellings.build(dataset.train, ranks=job.ranks, progress=job.progress)
-    drives = dataset.drives(dataset.train, pictures=False)
-    return [anchor for drive in drives for other in retellings.of(drive) for anchor in anchors_of(other)]
+    retellings.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
+    return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in retellings.anchors(drive)]
 
 
 def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
@@ -333,7 +334,9 @@ def _config(job: StageJob) -> SftConfig:
     return job.recipe.sft
 
 
-def _key(job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla) -> str:
+def _key(
+    job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, retold: Sequence[Anchor]
+) -> str:  # fmt: skip
     """What a checkpoint must have been made with to be gone on from."""
     made = {
         "seed": job.seed,
@@ -342,6 +345,7 @@ def _key(job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, n
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
         "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
+        "retold": hashlib.sha256("\n".join(each.reasoning for each in retold).encode()).hexdigest(),
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 
