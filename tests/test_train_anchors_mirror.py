@@ -17,7 +17,7 @@ from tests.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_da
 from tools.train import trace_words
 from tools.train.anchors import anchors_of
 from tools.train.drive import Drive
-from tools.train.mirror import MirroredDataset, Views, mirrored, mirrored_text
+from tools.train.mirror import SecondsDataset, Views, mirrored, mirrored_text
 from tools.train.tokens import TokenCache, encode
 
 
@@ -72,7 +72,7 @@ def half_white(drive_id: str, frames: int) -> Drive:
 def test_tokens_of_the_mirrored_drive_are_of_one_mirrored_picture_a_second(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [half_white("a", 32)])
     vision = build(tiny_model(), 1).vision
-    other = MirroredDataset.of(dataset)
+    other = SecondsDataset.of(dataset, mirrored=True)
     drive = other.load("a")
     assert len(drive) == 4
     shown = drive.frame(3)

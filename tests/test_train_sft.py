@@ -24,6 +24,7 @@ from tests.training_scenarios import drive_along, scenarios
 from tools.train import optim
 from tools.train.anchors import Prompts, anchors_of
 from tools.train.chain import Step, run_step
+from tools.train.collect_config import CollectConfig
 from tools.train.drive import Dataset
 from tools.train.job import StageJob
 from tools.train.mirror import Views
@@ -32,6 +33,7 @@ from tools.train.optim import OptimConfig
 from tools.train.recipe import load_recipe
 from tools.train.retell import RetellConfig
 from tools.train.sft import Samples, SftConfig, SftError, budget, run
+from tools.train.tour_config import TourConfig
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -144,7 +146,7 @@ def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
     plain = run(sft_job(tmp_path, config))
     shutil.rmtree(tmp_path / "sft")
     more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RetellConfig(ways=2, tries=24))))
-    assert plain["retold_anchors"] == 0 < more["retold_anchors"] == more["anchors"] - plain["anchors"]
+    assert plain["more_anchors"] == 0 < more["more_anchors"] == more["anchors"] - plain["anchors"]
 
 
 def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> None:
@@ -170,3 +172,16 @@ def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
 def test_the_recipes_numbers_are_checked() -> None:
     with pytest.raises(ValueError, match="from 1 on"):
         SftConfig(batch=0)
+
+
+def test_tours_are_made_and_learned_from_beside_the_drives(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    tours = TourConfig(count=2, per_layout=2, people_most=0)
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.5, tours=tours))
+    recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
+    result = run(dataclasses.replace(job, recipe=recipe))
+    made = Dataset.open(tmp_path / "collect" / "tours")
+    assert 0 < result["more_anchors"] <= sum(entry.frames // 10 + 1 for entry in made.entries)
+    assert {entry.driver for entry in made.entries} == {"tour"}
+    assert not set(made.ids) & set(Dataset.open(tmp_path / "collect").ids)

@@ -34,10 +34,11 @@ class Sightlines:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         rows = []
-        self._owners: list[str] = []
+        owners: list[str] = []
         for label, box in scene.obstacles():
             rows.append((*box.centre_m, *box.axis, *box.size_m))
-            self._owners.append(label)
+            owners.append(label)
+        self._owners = np.array(owners, dtype=object)
         self._boxes = np.array(rows, dtype=np.float64).reshape(-1, 8)
 
     def pixels(self, eye: tuple[float, float, float], heading_rad: float, thing: SceneObject, range_m: float) -> float:
@@ -59,9 +60,8 @@ class Sightlines:
         inside &= np.linalg.norm(away, axis=1) < range_m
         if not inside.any():
             return 0.0
-        others = np.array([owner != thing.label for owner in self._owners])
         seen = inside.copy()
-        seen[inside] = ~_blocked(origin, points[inside], self._boxes[others])
+        seen[inside] = ~_blocked(origin, points[inside], self._boxes[self._owners != thing.label])
         # A patch of area A whose normal meets the ray covers fx fy A |n . d| / depth^3 of the picture.
         scale = (PICTURE_PX / 2) ** 2 / (half_x * half_y)
         return float(np.sum(scale * areas[seen] / depth[seen] ** 3))
@@ -106,21 +106,37 @@ def _faces(thing: SceneObject, eye: tuple[float, float, float]) -> tuple[Array, 
 
 def _blocked(origin: Array, points: Array, boxes: Array) -> NDArray[np.bool_]:
     """For each point whether a box lies between it and the origin (slab test in each box's frame)."""
+    ray = points - origin  # [n, 3]
+    boxes = boxes[_between(origin, ray, boxes)]
     if not len(boxes):
         return np.zeros(len(points), bool)
     cx, cy, cz, ax, ay = (boxes[:, i] for i in range(5))
-    half = boxes[:, 5:8] / 2
     dx, dy, dz = origin[0] - cx, origin[1] - cy, origin[2] - cz
-    start = np.stack([dx * ax + dy * ay, -dx * ay + dy * ax, dz], axis=1)  # [m, 3]
-    ray = points - origin  # [n, 3]
-    run = np.stack(
-        [np.outer(ray[:, 0], ax) + np.outer(ray[:, 1], ay), np.outer(ray[:, 1], ax) - np.outer(ray[:, 0], ay),
-         np.repeat(ray[:, 2:3], len(boxes), axis=1)], axis=2,
-    )  # fmt: skip
-    run = np.where(np.abs(run) < 1e-9, 1e-9, run)
-    first = (-half - start) / run
-    second = (half - start) / run
-    enter = np.minimum(first, second).max(axis=2)
-    leave = np.maximum(first, second).min(axis=2)
+    starts = (dx * ax + dy * ay, -dx * ay + dy * ax, dz)  # [m] each
+    runs = (
+        np.outer(ray[:, 0], ax) + np.outer(ray[:, 1], ay),
+        np.outer(ray[:, 1], ax) - np.outer(ray[:, 0], ay),
+        np.repeat(ray[:, 2:3], len(boxes), axis=1),
+    )  # [n, m] each
+    enter, leave = np.full(runs[0].shape, -np.inf), np.full(runs[0].shape, np.inf)
+    for start, run, size in zip(starts, runs, boxes[:, 5:8].T, strict=True):
+        run = np.where(np.abs(run) < 1e-9, 1e-9, run)
+        first, second = (-size / 2 - start) / run, (size / 2 - start) / run
+        enter = np.maximum(enter, np.minimum(first, second))
+        leave = np.minimum(leave, np.maximum(first, second))
     hit = (enter < leave) & (leave > 0) & (enter < 0.995)
     return np.asarray(hit.any(axis=1))
+
+
+def _between(origin: Array, ray: Array, boxes: Array) -> NDArray[np.bool_]:
+    """Boxes that come near the bundle of rays, seen from above: the others cannot block any."""
+    middle = ray[:, :2].mean(axis=0)
+    ahead = middle / max(float(np.hypot(*middle)), 1e-9)
+    along, across = ray[:, :2] @ ahead, ray[:, 1] * ahead[0] - ray[:, 0] * ahead[1]
+    gap = boxes[:, :2] - origin[:2]
+    reach = np.hypot(boxes[:, 5], boxes[:, 6]) / 2 + 1e-6
+    deep, aside = gap @ ahead, gap[:, 1] * ahead[0] - gap[:, 0] * ahead[1]
+    near = (deep > min(float(along.min()), 0.0) - reach) & (deep < max(float(along.max()), 0.0) + reach)
+    return np.asarray(
+        near & (aside > min(float(across.min()), 0.0) - reach) & (aside < max(float(across.max()), 0.0) + reach)
+    )

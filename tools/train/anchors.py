@@ -93,6 +93,8 @@ class Anchor:
     """`points` of the frames from AROUND before it to AROUND after it; None where the drive has none."""
     waited: bool = False
     """The robot has stood here since the instruction, for a generation or more."""
+    by_seconds: bool = False
+    """Only whole seconds of its drive have pictures."""
 
     def before(self, ago_s: float) -> Progress | None:
         """What a generation with its newest frame `ago_s` ago rightly said; None before the drive began."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,12 +24,14 @@ from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import SceneError
+from tools.train.carried import Carriage, carried
 from tools.train.collect_config import CollectConfig
 from tools.train.dagger_driver import PolicyDriver, PolicyOptions
-from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TRACE_EVERY, About, Drive, Entry
+from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TOUR_DRIVER, TRACE_EVERY, About, Drive, Entry
 from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
 from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_episodes
 from tools.train.steering import SteeringNoise, Velocity
+from tools.train.tour_config import TourConfig
 from tools.train.traces import Tracer
 
 MODULE: Final = "tools.train.collect_worker"
@@ -40,7 +43,7 @@ _PLAN_STEP: Final = 3 * RATE_HZ - 1  # of a future: where the robot means to be 
 class Order:
     """What one process is told: drives `start` to `start + count - 1` into `folder`, but for those in `skip`.
 
-    `policy`: the artifacts that drive, and how; None where the expert does.
+    `policy`: the artifacts that drive, and how; None where the expert does. `tour`: nobody drives, the robot is carried.
     """
 
     folder: str
@@ -52,6 +55,7 @@ class Order:
     skip: tuple[str, ...]
     config: CollectConfig
     policy: PolicyOptions | None = None
+    tour: TourConfig | None = None
 
     def id(self, number: int) -> str:
         """Of a drive of this collection."""
@@ -96,7 +100,8 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
     """
     order = Order.of_json(job)
     numbers = range(order.start, order.start + order.count)
-    size, kinds = order.config.drives_per_layout, order.config.kinds or SHARES
+    size = order.tour.per_layout if order.tour is not None else order.config.drives_per_layout
+    kinds = order.config.kinds or SHARES
     if order.start // size != numbers[-1] // size:
         raise ValueError("an order is of one layout")
     try:
@@ -107,20 +112,31 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
         for number in numbers:
             yield {"dropped": order.id(number), "why": "no such layout"}
         return
-    for number, scenario in zip(numbers, scenarios, strict=True):
-        drive_id = order.id(number)
-        if drive_id in order.skip:
-            continue
-        yield {"begun": drive_id}
-        try:
-            yield {"drive": asdict(_drive(order, number, scenario))}
-        except (NothingToLearnError, SceneError) as error:
-            yield {"dropped": drive_id, "why": str(error)}
-        except InstructionError:
-            yield {"dropped": drive_id, "why": "its instruction is too long for the model"}
-        except ArtifactError as error:
-            yield {"refused": str(error)}
-            return
+    with ExitStack() as stack:
+        carriages = {}
+        if order.tour is not None:
+            for each in reversed(scenarios):  # the first of a layout says how many people there are
+                people = min(each.episode.people, order.tour.people_most)
+                carriages[each.layout_seed] = Carriage(each.site, people)
+                stack.callback(carriages[each.layout_seed].close)
+        for number, scenario in zip(numbers, scenarios, strict=True):
+            drive_id = order.id(number)
+            if drive_id in order.skip:
+                continue
+            yield {"begun": drive_id}
+            try:
+                if order.tour is None:
+                    entry = _drive(order, number, scenario)
+                else:
+                    entry = _tour(order, order.tour, number, scenario, carriages[scenario.layout_seed])
+                yield {"drive": asdict(entry)}
+            except (NothingToLearnError, SceneError) as error:
+                yield {"dropped": drive_id, "why": str(error)}
+            except InstructionError:
+                yield {"dropped": drive_id, "why": "its instruction is too long for the model"}
+            except ArtifactError as error:
+                yield {"refused": str(error)}
+                return
 
 
 def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
@@ -146,7 +162,18 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     else:
         steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _as_wanted
         recorded, driver = record(plan, expert, steer, _teller(scenario)), "expert-noise" if draw.noise else "expert"
-    drive = Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays)
+    return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
+
+
+def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, carriage: Carriage) -> Entry:
+    draw = Draw.of(order.config, order.seed, number)
+    rng = np.random.default_rng((order.seed, number, _TAG, 2))
+    recorded = carried(scenario, carriage, tour, draw.look, draw.drift, order.config, rng)
+    about = replace(_about(scenario, order.id(number), recorded, TOUR_DRIVER, draw), people=carriage.count)
+    return _saved(order, Drive(about, **recorded.arrays))
+
+
+def _saved(order: Order, drive: Drive) -> Entry:
     path = Path(order.folder) / DRIVES / f"{drive.id}.safetensors"
     drive.save(path)
     return Entry.of(drive, path)

@@ -19,6 +19,7 @@ from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Entry
 from tools.train.scenarios import MAX_SEED
+from tools.train.tour_config import TourConfig
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
@@ -40,6 +41,7 @@ class Collection:
     turn: int
     config: CollectConfig
     policy: PolicyOptions | None = None
+    tour: TourConfig | None = None
 
     def orders(self, folder: Path, has: Callable[[str], bool]) -> list[Order]:
         """One order a layout, of those that lack a drive."""
@@ -47,10 +49,12 @@ class Collection:
         scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
         # Jobs are no part of an order: it must not matter how many there are.
         config = replace(self.config, jobs=0)
-        orders, size = [], config.drives_per_layout
+        orders, size = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
         for start in range(0, self.count, size):
             # A whole layout always, so that the same tasks are found in it whatever the count.
-            order = Order(str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy)
+            order = Order(
+                str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy, self.tour
+            )
             ids = [order.id(number) for number in range(start, start + size)]
             wanted = [drive_id for drive_id in ids[: self.count - start] if not has(drive_id)]
             if wanted:

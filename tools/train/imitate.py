@@ -31,7 +31,7 @@ from tools.train.kv_build import SEEN_PARTS, KvConfig, build_kv_cache, parts_sha
 from tools.train.kv_cache import KvCache
 from tools.train.language_batch import FrameTokens
 from tools.train.mirror import FOLDER as MIRRORED
-from tools.train.mirror import MirroredDataset
+from tools.train.mirror import SecondsDataset
 from tools.train.mirror_drives import (
     MIRROR,
     BothStates,
@@ -119,7 +119,7 @@ def run(job: StageJob) -> dict[str, Any]:
     tokens = _encoded(job, TokenCache(dataset, network.vision), dataset.ids)
     seconds: TokenCache | None = None
     if config.mirrored:
-        seconds = TokenCache(MirroredDataset.of(dataset), network.vision, dataset.folder / MIRRORED)
+        seconds = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
         _encoded(job, seconds, dataset.train)
     network.to(job.device)
     if config.policy == POINT_GOAL:

@@ -47,46 +47,69 @@ def _across(points: Waypoints) -> Waypoints:
 
 
 @dataclass(frozen=True)
-class MirroredDrive:
-    """One picture a second of a drive, mirrored: what a cache of tokens asks a drive for."""
+class Seconds:
+    """One picture a second of a drive, as it is or mirrored: what a cache of tokens asks a drive for."""
 
     drive: Drive
+    mirrored: bool
 
     def __len__(self) -> int:
         return -(-len(self.drive) // TRACE_EVERY)
 
     def frame(self, k: int) -> NDArray[np.uint8]:
         """Picture of second k, uint8 RGB [128, 128, 3]. Raises DriveError, IndexError."""
-        return np.ascontiguousarray(self.drive.frame(k * TRACE_EVERY)[:, ::-1])
+        picture = self.drive.frame(k * TRACE_EVERY)
+        return np.ascontiguousarray(picture[:, ::-1]) if self.mirrored else picture
 
 
-class MirroredDataset(Dataset):
-    """A data set whose drives are mirrored, for a cache of visual tokens of its own."""
+@dataclass(frozen=True)
+class SecondsDataset(Dataset):
+    """A data set of whose drives one picture a second is looked at, for a cache of visual tokens of its own."""
+
+    mirrored: bool = False
 
     @staticmethod
-    def of(dataset: Dataset) -> MirroredDataset:
-        """The mirror of a data set."""
+    def of(dataset: Dataset, *, mirrored: bool = False) -> SecondsDataset:
+        """The seconds of a data set, or of its mirror image."""
         entries = tuple(replace(each, frames=-(-each.frames // TRACE_EVERY)) for each in dataset.entries)
-        return MirroredDataset(dataset.folder, entries)
+        return SecondsDataset(dataset.folder, entries, mirrored)
 
-    def load(self, drive_id: str, *, pictures: bool = True) -> MirroredDrive:  # type: ignore[override]
-        """One drive, mirrored. Raises DriveError."""
-        return MirroredDrive(super().load(drive_id, pictures=pictures))
+    def load(self, drive_id: str, *, pictures: bool = True) -> Seconds:  # type: ignore[override]
+        """One drive's. Raises DriveError."""
+        return Seconds(super().load(drive_id, pictures=pictures), self.mirrored)
 
 
 @dataclass(frozen=True)
 class Views:
-    """Visual tokens of frames as they are, and of one frame a second of the mirrored drives."""
+    """Visual tokens of drives: `plain` of every frame, `mirror` of one frame a second of the mirrored drives.
+
+    `seconds`, where there is one: one frame a second of what has no more (`Anchor.by_seconds`).
+    """
 
     plain: FrameTokens
     mirror: FrameTokens | None = None
+    seconds: FrameTokens | None = None
 
     def of(self, anchor: Anchor, *, in_mirror: bool = False) -> tuple[Halves, ...]:
         """Tokens [N, D] of an anchor's frames; in the mirror those of whole seconds, as anchors at seconds have."""
-        if not in_mirror:
+        if not in_mirror and not anchor.by_seconds:
             every = self.plain.frames(anchor.drive_id)
             return tuple(every[k] for k in anchor.frames)
-        if self.mirror is None or any(k % TRACE_EVERY for k in anchor.frames):
-            raise ValueError(f"drive {anchor.drive_id}, frame {anchor.k}: there are no tokens of its mirror image")
-        seconds = self.mirror.frames(anchor.drive_id)
+        source, what = (self.mirror, "of its mirror image") if in_mirror else (self.seconds, "of its seconds")
+        if source is None or any(k % TRACE_EVERY for k in anchor.frames):
+            raise ValueError(f"drive {anchor.drive_id}, frame {anchor.k}: there are no tokens {what}")
+        seconds = source.frames(anchor.drive_id)
         return tuple(seconds[k // TRACE_EVERY] for k in anchor.frames)
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Tokens of two data sets: `others`, and `tours` for drives of these ids."""
+
+    others: FrameTokens
+    tours: FrameTokens
+    ids: frozenset[str]
+
+    def frames(self, drive_id: str) -> Halves:
+        """As its part has them."""
+        return (self.tours if drive_id in self.ids else self.others).frames(drive_id)

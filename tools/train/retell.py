@@ -250,7 +250,7 @@ def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight 
         k = int(own["k"])
         if k >= count:
             break
-        means = [_turning_first(plan[k, 0], driving.turn_radps, speed_mps)]
+        means = [turning_first(plan[k, 0], driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
         traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
     told = tuple(scenario.told_json())
@@ -264,7 +264,7 @@ def _among(alone: Trace, own: Trace) -> Trace:
     return Trace.of(own.situation, things, people, alone.progress, alone.plan)
 
 
-def _turning_first(point: NDArray[np.float32], turn_radps: float, speed_mps: float) -> tuple[float, float]:
+def turning_first(point: NDArray[np.float32], turn_radps: float, speed_mps: float) -> tuple[float, float]:
     """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does."""
     bearing = float(np.arctan2(point[1], point[0]))
     gone_m = max(PLAN_TIMES_S[0] - abs(bearing) / turn_radps, 0.0) * speed_mps

@@ -32,11 +32,13 @@ from tools.train.language_augment import ShowConfig, disturbed, shifted
 from tools.train.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
 from tools.train.language_eval import EvalConfig, evaluate, glance
 from tools.train.mirror import FOLDER as MIRRORED
-from tools.train.mirror import MirroredDataset, Views, mirrored
+from tools.train.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.network_file import finish_network, read_network, stage_weights, start_network
 from tools.train.optim import OptimConfig, Optimiser, autocast
 from tools.train.retell import RetellConfig, Retellings
 from tools.train.tokens import TokenCache
+from tools.train.tour_config import TourConfig
+from tools.train.tours import build_tours, tour_anchors
 
 if TYPE_CHECKING:
     from tools.train.recipe import Recipe
@@ -63,6 +65,8 @@ class SftConfig:
     shown: ShowConfig = field(default_factory=ShowConfig)
     retold: RetellConfig = field(default_factory=RetellConfig)
     """Other instructions under which every drive is shown too."""
+    tours: TourConfig = field(default_factory=TourConfig)
+    """Robots that were carried along told ways, whose words are learned beside those of the drives."""
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
     go_on_share: float = 0.4
@@ -184,11 +188,16 @@ def run(job: StageJob) -> dict[str, Any]:
     mirror: TokenCache | None = None
     _encode(job, plain, dataset.ids)
     if config.mirrored > 0:
-        mirror = TokenCache(MirroredDataset.of(dataset), network.vision, dataset.folder / MIRRORED)
+        mirror = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
     job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
-    retold = _retold(job, dataset) if config.retold.ways else []
-    result = fit(job, network.to(job.device), dataset, Views(plain, mirror), retold)
+    more = _retold(job, dataset) if config.retold.ways else []
+    views = Views(plain, mirror)
+    if config.tours.count:
+        tours = _tours(job, dataset)
+        views = _with_tours(job, network, views, tours)
+        more += tour_anchors(tours, tours.train)
+    result = fit(job, network.to(job.device), dataset, views, more)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
@@ -213,16 +222,16 @@ def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
 
 
 def fit(
-    job: StageJob, network: TicVla, dataset: Dataset, views: Views, retold: Sequence[Anchor] = ()
+    job: StageJob, network: TicVla, dataset: Dataset, views: Views, more: Sequence[Anchor] = ()
 ) -> dict[str, Any]:  # fmt: skip
     """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is.
 
-    `retold`: anchors of the same drives under other instructions.
+    `more`: anchors to learn from beside those of the drives: of other instructions, of tours.
     """
     config, language = _config(job), network.language
     content = tokenizer_for(network.config, None)
     prompts = Prompts(Tokenizer.from_buffer(content), network.config)
-    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train), *retold]
+    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train), *more]
     data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
@@ -231,7 +240,7 @@ def fit(
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
     optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
-    state = _State(job, network, optimiser, _key(job, config, dataset, content, network, retold))
+    state = _State(job, network, optimiser, _key(job, config, dataset, content, network, more))
     numbers = state.load()
     questions = _held(held, config, job.seed)
     while optimiser.step_count < total:
@@ -258,7 +267,7 @@ def fit(
     result: dict[str, Any] = {
         "steps": total,
         "anchors": len(data.anchors),
-        "retold_anchors": len(retold),
+        "more_anchors": len(more),
         "held_anchors": len(held.anchors),
         **numbers,
     }
@@ -312,6 +321,28 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
         yield from anchors_of(drive)
 
 
+def _tours(job: StageJob, dataset: Dataset) -> Dataset:
+    """Made where they are not there yet."""
+    collected = job.recipe.collect or CollectConfig()
+    job.progress.say("carrying robots about")
+    return build_tours(
+        dataset, _config(job).tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
+        stopped=lambda: job.stop.asked,
+    )  # fmt: skip
+
+
+def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) -> Views:
+    """Tokens of tours beside those of the drives."""
+    seconds = TokenCache(SecondsDataset.of(tours), network.vision)
+    _encode(job, seconds, tours.train)
+    mirror = views.mirror
+    if mirror is not None:
+        other = TokenCache(SecondsDataset.of(tours, mirrored=True), network.vision, tours.folder / MIRRORED)
+        _encode(job, other, tours.train)
+        mirror = Joined(mirror, other, frozenset(tours.ids))
+    return Views(views.plain, mirror, seconds)
+
+
 def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
     collected = job.recipe.collect or CollectConfig()
@@ -335,7 +366,7 @@ def _config(job: StageJob) -> SftConfig:
 
 
 def _key(
-    job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, retold: Sequence[Anchor]
+    job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, more: Sequence[Anchor]
 ) -> str:  # fmt: skip
     """What a checkpoint must have been made with to be gone on from."""
     made = {
@@ -345,7 +376,7 @@ def _key(
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
         "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
-        "retold": hashlib.sha256("\n".join(each.reasoning for each in retold).encode()).hexdigest(),
+        "more": hashlib.sha256("\n".join(each.reasoning for each in more).encode()).hexdigest(),
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 

@@ -1,0 +1,346 @@
+"""A robot that is carried along a told way: what it would see and should say once a second, and not how it walks there.
+
+A recorded drive is physics, an expert that weighs futures ten times a second, and ten pictures a second. Words need
+one picture a second, and a body that glides as a walking one goes: swaying, at changing speeds, halting now and then,
+and at times off to some other place and back again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import atan2, cos, hypot, inf, pi, sin, sqrt
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.geometry import SE2
+from sim_hil.benchmark.expert import NEAR, along, driving_of, from_here
+from sim_hil.benchmark.expert_motion import Driving
+from sim_hil.benchmark.expert_route import RoutePlanner
+from sim_hil.benchmark.observation import Odometer
+from sim_hil.benchmark.robots import footprint_m, max_step_m
+from sim_hil.benchmark.route import RouteError
+from sim_hil.benchmark.tasks import draw_start
+from sim_hil.camera import CameraWorld
+from sim_hil.nav_grid import NavGrid
+from sim_hil.people import UPDATE_HZ, People
+from tools.train.augment import encoded
+from tools.train.collect_config import CollectConfig
+from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
+from tools.train.encoder_ids import ASPECT
+from tools.train.encoder_poses import body_state
+from tools.train.record import Look, NothingToLearnError, Recorded
+from tools.train.retell import turning_first
+from tools.train.scenarios import Scenario
+from tools.train.sites import Site
+from tools.train.tour_config import TourConfig
+from tools.train.traces import Tracer
+
+Array = NDArray[np.float64]
+Vec2 = tuple[float, float]
+
+_STEP_S: Final = 1.0 / RATE_HZ
+_REACH_M: Final = 10.0  # of a route: 9 s of it
+_VIEW_M: Final = 12.0  # who stands about within this is led round
+_STANDING_MPS: Final = 0.25
+_OFF_ROUTE_M: Final = 0.6
+_BLOCKED_M, _BLOCKED_RAD = 1.1, 1.0  # somebody so near ahead is waited for
+_SWAY_RADPS, _SWAY_S = 0.15, 1.5  # how much the steering sways (one standard deviation), and for how long one way
+_PACE_S: Final = (1.0, 6.0)  # for so long a pace is kept
+_HALT_SHARE: Final = 0.1  # of those times it halts, and for no longer than the next
+_HALT_S: Final = 2.5
+_SLOWEST: Final = 0.6  # of the expert's speed
+_STRAY_TO: Final = 0.8  # of the way is behind it at most where it leaves it
+_ALLOWED_MPS: Final = 0.35  # a tour that is slower is given up
+_SPARE_S: Final = 30.0
+_DECOYS: Final = 8
+
+
+class Carriage:
+    """The people of one layout and the cameras that see them, for one tour after the other.
+
+    Everybody looks the same in all of them; where they are, and walk, is each tour's own.
+    """
+
+    def __init__(self, site: Site, people: int) -> None:
+        """`people`: at most; a small layout has no room for many."""
+        self.site = site
+        while people and not _has_room(site, people):
+            people //= 2
+        self.count = people
+        self._people = People(site.scene, 0, 0)
+        self._cameras: dict[str, CameraWorld] = {}
+
+    def fill(self, seed: int) -> None:
+        """Let other people come. Raises NothingToLearnError where they find no room."""
+        try:
+            self._people = People(self.site.scene, self.count, seed)
+        except ValueError as error:
+            raise NothingToLearnError("no room for its people") from error
+
+    def people(self) -> Array:
+        """[n, 3]: x m, y m, heading rad."""
+        return self._people.poses()
+
+    def velocities(self) -> Array:
+        """[n, 2]: m/s in the world."""
+        return self._people.velocities()
+
+    def wait(self, pose: SE2) -> None:
+        """Let everybody walk for a tenth of a second, the robot being at a pose."""
+        for _ in range(UPDATE_HZ // RATE_HZ):
+            self._people.step(pose.x_m, pose.y_m, pose.theta_rad)
+
+    def picture(self, robot: str, pose: SE2, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """What a robot sees from a pose now, as a JPEG."""
+        if robot not in self._cameras:
+            self._cameras[robot] = CameraWorld(
+                self.site.scene, people=self.count, seed=self.site.layout_seed, robot=robot
+            )
+        camera = self._cameras[robot]
+        rows = self._people.render_rows().ravel()
+        state = np.zeros(camera.state_size)
+        state[:7] = body_state(self.site.scene, robot, pose.as_tuple(), rng)
+        state[len(state) - len(rows) :] = rows
+        picture = camera.render(state, look.render_px, look.render_px, ASPECT)
+        if look.render_px != PICTURE_PX:
+            small = cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
+            picture = np.asarray(small, np.uint8)
+        return encoded(picture, look.jpeg_quality)
+
+    def close(self) -> None:
+        """Release the renderers."""
+        for camera in self._cameras.values():
+            camera.close()
+        self._cameras.clear()
+
+
+@dataclass
+class Glider:
+    """A body that is steered along routes without being pushed by anything; never into a wall."""
+
+    pose: SE2
+    driving: Driving
+    grid: NavGrid
+    rng: np.random.Generator
+    speed_mps: float = 0.0
+    turn_radps: float = 0.0
+    _sway: float = 0.0
+    _pace: float = 1.0
+    _kept_s: float = 0.0
+
+    def step(self, route: Array, *, halted: bool = False) -> float:
+        """A tenth of a second along `route` [n, 2], points 0.1 m apart from here on; how far it came, m."""
+        self._change_pace()
+        at = min(round((0.45 + 0.45 * self.speed_mps) * 10), len(route) - 1)
+        aim = self.pose.inverse() @ SE2(float(route[at, 0]), float(route[at, 1]), 0.0)
+        error = atan2(aim.y_m, aim.x_m) if hypot(aim.x_m, aim.y_m) > 0.05 else 0.0
+        noise = float(self.rng.standard_normal())
+        self._sway += -self._sway * _STEP_S / _SWAY_S + _SWAY_RADPS * sqrt(2 * _STEP_S / _SWAY_S) * noise
+        stands = halted or self._pace == 0.0 or len(route) < 2
+        driving = self.driving
+        wanted_mps = 0.0 if stands else driving.speed_mps * self._pace * max(cos(error), 0.0) ** 2
+        top = driving.turn_radps
+        wanted_radps = 0.0 if stands else min(max(1.8 * error, -top), top) + self._sway
+        self.speed_mps = _slew(self.speed_mps, wanted_mps, driving.brake_mps2, driving.accel_mps2)
+        self.turn_radps = _slew(
+            self.turn_radps, wanted_radps, driving.turn_accel_radps2, driving.turn_accel_radps2
+        )  # fmt: skip
+        return self._glide()
+
+    def _change_pace(self) -> None:
+        self._kept_s -= _STEP_S
+        if self._kept_s > 0:
+            return
+        halts, pace, kept = (float(value) for value in self.rng.uniform(size=3))
+        longest = _HALT_S if halts < _HALT_SHARE else _PACE_S[1]
+        self._pace = 0.0 if halts < _HALT_SHARE else _SLOWEST + (1.0 - _SLOWEST) * pace
+        self._kept_s = _PACE_S[0] + kept * (longest - _PACE_S[0])
+
+    def _glide(self) -> float:
+        x, y, theta = self.pose.as_tuple()
+        middle = theta + 0.5 * self.turn_radps * _STEP_S
+        gone = self.speed_mps * _STEP_S
+        there = (x + gone * cos(middle), y + gone * sin(middle))
+        if not self.grid.is_free(*there) and self.grid.is_free(x, y):
+            self.speed_mps, gone, there = 0.0, 0.0, (x, y)
+        self.pose = SE2(*there, theta + self.turn_radps * _STEP_S)
+        return gone
+
+
+@dataclass
+class _Stray:
+    """A way off the told one: from where on, and for how long."""
+
+    after_m: float = inf
+    for_m: float = 0.0
+    planner: RoutePlanner | None = None
+    route: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+def carried(
+    scenario: Scenario, carriage: Carriage, config: TourConfig, look: Look, drift: str, collect: CollectConfig,
+    rng: np.random.Generator,
+) -> Recorded:  # fmt: skip
+    """Carry a robot along a scenario's way. `drift`: of its odometry, as of a drive's.
+
+    Raises NothingToLearnError where there is no way, or where it does not arrive.
+    """
+    carriage.fill(scenario.episode.seed)
+    tour = _Tour(scenario, carriage, config, collect, rng)
+    odometer = Odometer(drift, scenario.episode.seed, tour.body.pose)
+    jpegs: list[NDArray[np.uint8]] = []
+    ends: list[int] = []
+    rows: dict[str, list[Any]] = {"pose": [], "pose_odom": [], "state": [], "plan_xy": []}
+    traces: list[Mapping[str, Any]] = []
+    while not tour.over:
+        tour.look_ahead()
+        if len(ends) % TRACE_EVERY == 0:
+            jpegs.append(carriage.picture(scenario.episode.robot, tour.body.pose, look, rng))
+            traces.append(tour.trace())
+        ends.append((ends[-1] if ends else 0) + (len(jpegs[-1]) if len(ends) % TRACE_EVERY == 0 else 0))
+        rows["pose"].append(tour.body.pose.as_tuple())
+        rows["pose_odom"].append(odometer.pose.as_tuple())
+        rows["state"].append(odometer.velocity())
+        rows["plan_xy"].append(tour.plan)
+        tour.go_on()
+        odometer.step(tour.body.pose, _STEP_S)
+    count = len(ends)
+    arrays = {
+        "jpeg": np.concatenate(jpegs),
+        "jpeg_end": np.array(ends, np.int64),
+        "pose": np.array(rows["pose"]),
+        "pose_odom": np.array(rows["pose_odom"]),
+        "state": np.array(rows["state"], np.float32),
+        "future": np.zeros((count, FUTURE_STEPS, 3), np.float32),
+        "future_steps": np.zeros(count, np.int16),
+        "plan_xy": np.array(rows["plan_xy"], np.float32),
+        "by": np.zeros(count, np.uint8),
+    }
+    return Recorded("reached", False, arrays, tuple(traces))
+
+
+class _Tour:
+    """A tour under way."""
+
+    def __init__(
+        self, scenario: Scenario, carriage: Carriage, config: TourConfig, collect: CollectConfig,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        episode, site = scenario.episode, scenario.site
+        self._carriage, self._config, self._rng, self._site = carriage, config, rng, site
+        self._robot, self._goal = episode.robot, episode.goal_xy
+        self._near_m = collect.arrive_share * episode.threshold_m
+        self._driving = driving_of(episode.robot)
+        self._speed_mps = collect.speed_mps
+        self._planner = self._planner_to(self._goal, NEAR * episode.threshold_m, scenario.task.path)
+        if not self._planner.reachable(*episode.start[:2]):
+            raise NothingToLearnError("the expert sees no way")
+        self._tracer = Tracer(scenario)
+        self.body = Glider(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
+        self._route = np.array([episode.start[:2]])
+        self._stray = self._drawn_stray()
+        self._ticks, self._gone_m, self._off_m = 0, 0.0, 0.0
+        self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
+        self._linger_s: float | None = None
+        self.plan: list[Vec2] = []
+
+    def _paced(self) -> Driving:
+        return replace(self._driving, speed_mps=self._speed_mps)
+
+    def _planner_to(self, goal: Vec2, near_m: float, told: tuple[Vec2, ...] = ()) -> RoutePlanner:
+        robot = self._robot
+        return RoutePlanner(self._site.scene, goal, footprint_m(robot), max_step_m(robot), near_m, told)
+
+    def _drawn_stray(self) -> _Stray:
+        strays, where, far = (float(value) for value in self._rng.uniform(size=3))
+        if strays >= self._config.stray_share:
+            return _Stray()
+        for _ in range(_DECOYS):
+            try:
+                x, y, _ = draw_start(self._site.scene, self._site.robot_grid(self._robot), self._rng)
+            except RouteError:
+                break
+            planner = self._planner_to((x, y), 0.5)
+            if planner.reachable(self.body.pose.x_m, self.body.pose.y_m):
+                after_m = where * _STRAY_TO * self._tracer.progress.length_m
+                return _Stray(after_m, 1.0 + far * (self._config.stray_m - 1.0), planner)
+        return _Stray()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has arrived and stood there. Raises NothingToLearnError where it does not come on."""
+        if self._left_s <= 0:
+            raise NothingToLearnError("it did not arrive in time")
+        return self._linger_s is not None and self._linger_s <= 0
+
+    def look_ahead(self) -> None:
+        """Work out the way on from here."""
+        pose = self.body.pose
+        here = (pose.x_m, pose.y_m)
+        self._route = from_here(self._route, pose)
+        if self._ticks % TRACE_EVERY == 0:
+            standing = self._standing()
+            kept = self._route if hypot(*(self._route[0] - here)) < _OFF_ROUTE_M else None
+            self._route = self._planner.route(here, standing, _REACH_M, kept)
+            if self._strays and self._stray.planner is not None:
+                self._stray.route = self._stray.planner.route(here, standing, _REACH_M)
+        stays = self._linger_s is not None
+        way = np.array([here]) if stays else self._route
+        self.plan = along(way, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
+
+    @property
+    def _strays(self) -> bool:
+        return self._gone_m >= self._stray.after_m and self._off_m < self._stray.for_m
+
+    def _standing(self) -> Array:
+        people, velocities, pose = self._carriage.people()[:, :2], self._carriage.velocities(), self.body.pose
+        gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
+        return people[(gaps < _VIEW_M) & (np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDING_MPS)]
+
+    def trace(self) -> Mapping[str, Any]:
+        """What is to be said here."""
+        means = [turning_first(np.array(self.plan[0]), self._driving.turn_radps, self._speed_mps)]
+        people, velocities = self._carriage.people(), self._carriage.velocities()
+        return self._tracer.trace(self.body.pose, people, velocities, means).to_json()
+
+    def go_on(self) -> None:
+        """A tenth of a second on."""
+        arrived = hypot(self.body.pose.x_m - self._goal[0], self.body.pose.y_m - self._goal[1]) < self._near_m
+        if arrived and self._linger_s is None:
+            self._linger_s = float(self._rng.uniform(0.0, self._config.linger_s))
+        strays = self._strays and len(self._stray.route) > 1
+        if strays:
+            self._stray.route = from_here(self._stray.route, self.body.pose)
+        gone = self.body.step(self._stray.route if strays else self._route, halted=self._halted())
+        self._gone_m += gone
+        self._off_m += gone if strays else 0.0
+        self._carriage.wait(self.body.pose)
+        self._ticks += 1
+        self._left_s -= _STEP_S
+        if self._linger_s is not None:
+            self._linger_s -= _STEP_S
+
+    def _halted(self) -> bool:
+        """Whether it stands: it has arrived, or somebody is right before it."""
+        if self._linger_s is not None:
+            return True
+        people, pose = self._carriage.people(), self.body.pose
+        dx, dy = people[:, 0] - pose.x_m, people[:, 1] - pose.y_m
+        bearings = (np.arctan2(dy, dx) - pose.theta_rad + pi) % (2 * pi) - pi
+        return bool(np.any((np.hypot(dx, dy) < _BLOCKED_M) & (np.abs(bearings) < _BLOCKED_RAD)))
+
+
+def _has_room(site: Site, people: int) -> bool:
+    try:
+        People(site.scene, people, site.layout_seed)
+    except ValueError:
+        return False
+    return True
+
+
+def _slew(value: float, target: float, down: float, up: float) -> float:
+    return value + min(max(target - value, -down * _STEP_S), up * _STEP_S)

@@ -1,0 +1,35 @@
+"""The numbers of tours: robots that are carried along told ways, for words alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TourConfig:
+    """How many tours, and how varied. The same numbers and seed give the same tours.
+
+    What is called a share is the chance of each tour.
+    """
+
+    count: int = 0
+    """0: none."""
+    per_layout: int = 8
+    people_most: int = 20
+    """More people than these a scene never has: they hide what is spoken of, and take their time to be moved."""
+    stray_share: float = 0.35
+    """Tours that leave their way somewhere, for some other place, and come back to it."""
+    stray_m: float = 8.0
+    """So far they are carried there at most."""
+    linger_s: float = 5.0
+    """Up to so long a tour stands where it has arrived."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= 1_000_000 or not 1 <= self.per_layout <= 100:
+            raise ValueError(
+                f"expected a count of 0 to 1000000 and per_layout of 1 to 100, found {self.count}, {self.per_layout}"
+            )
+        if not 0 <= self.people_most <= 200 or not 0 <= self.stray_share <= 1:
+            raise ValueError("expected people_most from 0 to 200 and stray_share from 0 to 1")
+        if not (1 <= self.stray_m <= 50 and 0 <= self.linger_s <= 60):
+            raise ValueError("expected stray_m from 1 to 50 and linger_s from 0 to 60")

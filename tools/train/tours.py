@@ -1,0 +1,55 @@
+"""The tours beside a data set's drives, from which the language model learns and nobody else does.
+
+They lie in `tours/` of the data set's folder, a data set of their own of which one frame a second has a picture.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final
+
+from tools.train.anchors import Anchor, anchors_of
+from tools.train.collect_config import CollectConfig
+from tools.train.distributed import Ranks
+from tools.train.drive import Dataset
+from tools.train.job import StageProgress
+from tools.train.tour_config import TourConfig
+
+FOLDER: Final = "tours"
+PREFIX: Final = "w"
+_TURN: Final = 500  # of collections: rounds of DAgger take those from 0 on, their experts those from 1000 on
+# Whether one waits for somebody, and how one goes round, is the driver's choice: of who is carried it is not known.
+_IN_THE_WAY: Final = re.compile(r"\bperson ahead [0-2] m\b")
+
+
+def build_tours(
+    dataset: Dataset, config: TourConfig, collect: CollectConfig, seed: int, *, ranks: Ranks,
+    progress: StageProgress, stopped: Callable[[], bool] = lambda: False,
+) -> Dataset:  # fmt: skip
+    """The tours, those that are not there yet made by the first rank's processes; all must call.
+
+    Raises CollectError, DriveError, OSError, and KeyboardInterrupt when `stopped`.
+    """
+    # Here: who learns without tours needs no simulator.
+    from tools.train.collection import Collection, fill, job_count
+    from tools.train.dataset import DatasetWriter
+
+    folder = dataset.folder / FOLDER
+    with ranks.by_first() as here:
+        if here:
+            tours = Collection(PREFIX, config.count, seed, _TURN, collect, tour=config)
+            with DatasetWriter(folder) as writer:
+                fill(writer, tours, job_count(collect.jobs), update=progress.update, stopped=stopped)
+                writer.finish()
+    return Dataset.open(folder).of(PREFIX)
+
+
+def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:
+    """Those of tours at which nobody is in the way; their frames are whole seconds, and words hold for these alone."""
+    for drive in tours.drives(ids, pictures=False):
+        clear = {int(trace["k"]) for trace in drive.traces if not _IN_THE_WAY.search(str(trace["motion"]))}
+        for anchor in anchors_of(drive):
+            if anchor.k in clear:
+                yield replace(anchor, around=(), by_seconds=True)
