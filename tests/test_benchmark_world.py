@@ -63,6 +63,14 @@ def test_an_episode_that_is_over_takes_no_further_step(reached: EpisodeWorld) ->
         reached.step(FORWARD)
 
 
+def test_who_wants_to_see_the_robot_stay_may_linger() -> None:
+    with EpisodeWorld(corridor_episode(robot="carter"), WorldOptions(linger_s=1.0)) as world:
+        drive(world, FORWARD, 200)
+        gaps = np.hypot(*(world.trajectory()[:, :2] - (6.0, 0.0)).T)
+        assert world.end == "reached"
+        assert int(np.argmax(gaps < 1.5)) == len(gaps) - 1 - 30
+
+
 def test_path_and_time_are_those_driven(reached: EpisodeWorld) -> None:
     outcome = reached.outcome()
     assert 4.4 < outcome.path_m < 5.2

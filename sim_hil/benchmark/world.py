@@ -34,12 +34,14 @@ MAX_PIXELS: Final = 2048
 class WorldOptions:
     """`camera`: width and height of every observation's picture, px, None for none; `drift`: none, typical or severe.
 
-    `rate_hz`: physics steps a second, a whole multiple of 30.
+    `rate_hz`: physics steps a second, a whole multiple of 30. `linger_s`: the world goes on for so long after the goal
+    has been reached, for who wants to see the robot stay there; the benchmark does not.
     """
 
     camera: tuple[int, int] | None = None
     drift: str = "none"
     rate_hz: int = 480  # at 240 the Go2 fell once in half an hour of random commands, at 480 never in an hour
+    linger_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.camera is not None and not all(16 <= size <= MAX_PIXELS for size in self.camera):
@@ -48,6 +50,9 @@ class WorldOptions:
             raise ValueError(f"world: expected a drift of {', '.join(LEVELS)}, found {self.drift!r}")
         if self.rate_hz % FRAME_HZ or not 120 <= self.rate_hz <= 1200:
             raise ValueError(f"world: expected a whole multiple of {FRAME_HZ} steps a second, found {self.rate_hz}")
+
+        if not 0 <= self.linger_s <= 600:
+            raise ValueError(f"world: expected to linger for 0 to 600 s, found {self.linger_s}")
 
 
 class EpisodeWorld:
@@ -88,6 +93,7 @@ class EpisodeWorld:
         self._odometer = Odometer(self.options.drift, episode.seed, SE2(*self._trajectory[0]))
         self._first_collision_s: float | None = None
         self._end: str | None = None
+        self._reached_frame: int | None = None
         self._observed: tuple[int, Observation] | None = None
 
     def _pose(self) -> tuple[float, float, float]:
@@ -177,14 +183,19 @@ class EpisodeWorld:
         self._odometer.step(SE2(*pose), 1 / FRAME_HZ)
         if self._first_collision_s is None and self._simulation.collided_with():
             self._first_collision_s = self.time_s
-        if is_success(pose[:2], self.episode.goal_xy, self.episode.threshold_m):
-            self._end = "reached"
-        elif self._simulation.fell:
-            self._end = "fell"
-        elif self._frames >= round(self.episode.timeout_s * FRAME_HZ):
-            self._end = "timeout"
+        if self._reached_frame is None and is_success(pose[:2], self.episode.goal_xy, self.episode.threshold_m):
+            self._reached_frame = self._frames
+        self._end = self._ended()
         if self._on_frame is not None:
             self._on_frame(self)
+
+    def _ended(self) -> str | None:
+        if self._reached_frame is not None:
+            lingered = self._frames - self._reached_frame >= round(self.options.linger_s * FRAME_HZ)
+            return "reached" if lingered or self._simulation.fell else None
+        if self._simulation.fell:
+            return "fell"
+        return "timeout" if self._frames >= round(self.episode.timeout_s * FRAME_HZ) else None
 
     def stop(self) -> None:
         """End the episode here, as it is."""

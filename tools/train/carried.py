@@ -288,7 +288,7 @@ class _Tour:
             self._route = self._planner.route(here, standing, _REACH_M, kept)
             if self._strays and self._stray.planner is not None:
                 self._stray.route = self._stray.planner.route(here, standing, _REACH_M)
-        stays = self._linger_s is not None
+        stays = self._linger_s is not None  # as the teacher of a drive does
         way = np.array([here]) if stays else self._route
         self.plan = along(way, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
 

@@ -43,7 +43,7 @@ _PLAN_STEP: Final = 3 * RATE_HZ - 1  # of a future: where the robot means to be 
 class Order:
     """What one process is told: drives `start` to `start + count - 1` into `folder`, but for those in `skip`.
 
-    `policy`: the artifacts that drive, and how; None where the expert does. `tour`: nobody drives, the robot is carried.
+    `policy`: the artifacts that drive, and how; None where the expert does. `tour`: nobody drives, it is carried.
     """
 
     folder: str
@@ -78,6 +78,7 @@ class Draw:
     noise: bool
     look: Look
     drift: str
+    linger_s: float
 
     @staticmethod
     def of(config: CollectConfig, seed: int, number: int) -> Draw:
@@ -85,11 +86,13 @@ class Draw:
         rng = np.random.default_rng((seed, number, _TAG))
         noise, sharp, drift = (float(value) for value in rng.uniform(size=3))
         quality = int(rng.integers(config.jpeg_quality_min, config.jpeg_quality_max + 1))
+        linger = float(rng.uniform())
         severe, typical = config.severe_drift_share, config.typical_drift_share
         return Draw(
             noise=noise < config.noise_share,
             look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
             drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
+            linger_s=linger * config.linger_s,
         )
 
 
@@ -151,10 +154,11 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         look=draw.look,
         drift=draw.drift,
         pupil=order.policy is not None,
+        linger_s=draw.linger_s,
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
     expert = ExpertPolicy(
-        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil
+        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil, stays=True
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:

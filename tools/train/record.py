@@ -78,6 +78,7 @@ class DrivePlan:
     `path` [n, 2]: the told way, m. With `pupil` a policy drives: what goes wrong is kept, as there is something to
     learn from it, until it has gone 6 m from the way or has stayed where it is for 15 s. The expert's drives are kept
     up to their trouble, and none that goes further than `off_m` from the way: it would not be what the words say.
+    `linger_s`: for so long it is looked at after it has arrived.
     """
 
     episode: Episode
@@ -87,12 +88,13 @@ class DrivePlan:
     drift: str
     pupil: bool = False
     off_m: float = 4.0
+    linger_s: float = 0.0
 
 
 def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded:
     """Drive and record. Raises NothingToLearnError where less than 3 s can be learned from, SceneError, ValueError."""
     frames = _Frames()
-    options = WorldOptions(camera=(plan.look.render_px,) * 2, drift=plan.drift)
+    options = WorldOptions(camera=(plan.look.render_px,) * 2, drift=plan.drift, linger_s=plan.linger_s)
     first_collision: int | None = None
     with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
         try:

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 STAGE: Final = "sft"
 PLANNED_DRIVE_S: Final = 30.0
+PLANNED_TOUR_S: Final = 45.0
 _DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
 _RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
 _DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
@@ -172,8 +173,11 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     config, collect = recipe.sft or SftConfig(), recipe.collect
     seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
     each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
-    anchors = round(seconds * each) * config.epochs
-    return [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    toured = round(PLANNED_TOUR_S * config.tours.count)
+    anchors = round(seconds * each + toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
+    tours = [("tours", config.tours.count, "tour")] if config.tours.count else []
+    frames = seconds * RATE_HZ + toured * (2 if config.mirrored > 0 else 1)
+    return [*tours, ("frames encoded", frames, "encode"), ("anchors learned", anchors, "sft")]
 
 
 def run(job: StageJob) -> dict[str, Any]:

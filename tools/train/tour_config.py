@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class TourConfig:
     """How many tours, and how varied. The same numbers and seed give the same tours.
 
+    But for a pixel here and there in those of a layout that was ended in between: a renderer draws what it has drawn
+    before in the order in which it first did.
     What is called a share is the chance of each tour.
     """
 
