@@ -47,11 +47,15 @@ def _tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]
     return {"at": round(world.time_s, 1), "ahead_m": float(chosen[29, 0])}
 
 
-def _drive(steer: Steer, way: NDArray[np.float64] = WAY, look: Look | None = None, **changes: Any) -> Recorded:
+def _drive(
+    steer: Steer, way: NDArray[np.float64] = WAY, look: Look | None = None, linger_s: float = 0.0, **changes: Any
+) -> Recorded:
     """Along the corridor; a policy's drive where `steer` is not the expert."""
     episode = corridor_episode(robot="carter", **changes)
     pupil = steer is not _as_wanted
-    plan = DrivePlan(episode, load_scene("corridor"), way, look or Look(), "none", pupil=pupil)
+    plan = DrivePlan(
+        episode, load_scene("corridor"), way, look or Look(), "none", pupil=pupil, linger_s=linger_s
+    )  # fmt: skip
     return record(plan, ExpertPolicy(speed_mps=0.8), steer, _tell)
 
 
@@ -237,3 +241,12 @@ def test_numbers_that_make_no_sense_are_refused(changed: dict[str, Any], says: s
 def test_a_look_smaller_than_the_policys_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="128"):
         Look(64)
+
+
+def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_frame() -> None:
+    lingering = _drive(_as_wanted, linger_s=6.0)
+    pose = lingering.arrays["pose"]
+    assert lingering.outcome == "reached"
+    assert np.max(np.hypot(*(pose[-10:, :2] - pose[-1, :2]).T)) < 0.05
+    assert np.max(np.hypot(*lingering.arrays["plan_xy"][-1].T)) < 0.3
+    assert np.max(np.hypot(*lingering.arrays["future"][-10, :, :2].T)) < 0.3

@@ -8,7 +8,7 @@ import pytest
 from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.expert_motion import STEPS
 from sim_hil.benchmark.expert_route import RoutePlanner
-from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
+from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import Vec2
 from tests.benchmark_episodes import block, corridor_episode, hall
 
@@ -53,17 +53,3 @@ def test_it_drives_at_the_speed_it_is_given_and_tells_what_it_chose() -> None:
     # Where it drives is where it looks.
     ways = np.diff(choice.future, axis=0)
     assert np.allclose(np.arctan2(ways[:, 1], ways[:, 0]), choice.headings_rad[1:], atol=0.05)
-
-
-def test_it_stays_where_it_has_arrived_if_it_is_to() -> None:
-    episode = corridor_episode(robot="carter")
-    teacher = ExpertPolicy(speed_mps=0.8, stays=True)
-    with EpisodeWorld(episode, WorldOptions(linger_s=4.0)) as world:
-        teacher.reset(episode, "Go.", world, 0)
-        while not world.done:
-            world.step(teacher.act(world.observe()))
-        last = world.trajectory()[-60:]
-        plan = teacher.plan()
-    assert np.max(np.hypot(*(last[:, :2] - last[0, :2]).T)) < 0.1
-    assert np.hypot(*(last[-1, :2] - (6.0, 0.0))) > 1.0
-    assert np.max(np.hypot(*np.array(plan).T)) < 0.1

@@ -161,12 +161,17 @@ def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> Non
 def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
     recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.retold.ways=0"])
 
-    def anchors(**changed: Any) -> int:
+    def lines(**changed: Any) -> list[tuple[str, int, str]]:
         sft = dataclasses.replace(recipe.sft or SftConfig(), **changed)
-        return next(count for _, count, key in budget(dataclasses.replace(recipe, sft=sft)) if key == "sft")
+        return budget(dataclasses.replace(recipe, sft=sft))
+
+    def anchors(**changed: Any) -> int:
+        return sum(count for _, count, key in lines(**changed) if key == "sft")
 
     assert anchors() == 10 * 30 * 2
     assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RetellConfig(ways=2))
+    assert anchors(tours=TourConfig(count=4)) == anchors() + 4 * 45 * 2
+    assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
 
 
 def test_the_recipes_numbers_are_checked() -> None:
@@ -181,7 +186,7 @@ def test_tours_are_made_and_learned_from_beside_the_drives(tmp_path: Path) -> No
     job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.5, tours=tours))
     recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
     result = run(dataclasses.replace(job, recipe=recipe))
-    made = Dataset.open(tmp_path / "collect" / "tours")
+    made = Dataset.open(next((tmp_path / "collect" / "tours").iterdir()))
     assert 0 < result["more_anchors"] <= sum(entry.frames // 10 + 1 for entry in made.entries)
     assert {entry.driver for entry in made.entries} == {"tour"}
     assert not set(made.ids) & set(Dataset.open(tmp_path / "collect").ids)

@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 from math import hypot
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +22,15 @@ from tools.train.carried import Carriage, Glider, carried
 from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import messages
 from tools.train.collection import Collection
-from tools.train.drive import TOUR_DRIVER, Drive, DriveError
+from tools.train.distributed import SINGLE
+from tools.train.drive import TOUR_DRIVER, Dataset, Drive, DriveError
+from tools.train.job import QuietProgress
 from tools.train.mirror import Joined, Seconds, SecondsDataset, Views
 from tools.train.record import Look, Recorded
 from tools.train.scenarios import Scenario
 from tools.train.tour_config import TourConfig
-from tools.train.tours import tour_anchors
+from tools.train.tours import build_tours, tour_anchors
+from tools.train.trace_words import TURN_BACK, stop
 
 STRAIGHT = np.stack((np.arange(0, 8, 0.1), np.zeros(80)), axis=1)
 
@@ -44,19 +48,20 @@ def _tour(carriage: Carriage, scenario: Scenario, config: TourConfig) -> Recorde
 @pytest.fixture(scope="module")
 def straight_there() -> Iterator[Recorded]:
     with closing(Carriage(scenarios("office")[0].site, 10)) as carriage:
-        yield _tour(carriage, scenarios("office")[0], TourConfig(stray_share=0.0))
+        yield _tour(carriage, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
 
 
 @pytest.fixture(scope="module")
 def with_a_detour(carriage: Carriage) -> Recorded:
-    return _tour(carriage, scenarios("office")[0], TourConfig(stray_share=1.0, linger_s=0.0))
+    return _tour(carriage, scenarios("office")[0], TourConfig(stray_share=1.0))
 
 
 def test_it_begins_where_the_episode_does_and_stays_where_it_arrives(straight_there: Recorded) -> None:
     episode, pose = scenarios("office")[0].episode, straight_there.arrays["pose"]
     assert tuple(pose[0]) == pytest.approx(episode.start)
     assert hypot(*(pose[-1, :2] - np.array(episode.goal_xy))) < 0.7 * episode.threshold_m
-    assert np.allclose(straight_there.arrays["plan_xy"][-1], 0.0, atol=1e-6)
+    assert np.max(np.hypot(*np.diff(pose[-10:, :2], axis=0).T)) == 0.0
+    assert np.max(np.hypot(*straight_there.arrays["plan_xy"][-1].T)) < 0.3
 
 
 def test_it_moves_no_faster_than_a_policy_may_and_only_where_the_robot_fits(straight_there: Recorded) -> None:
@@ -91,9 +96,58 @@ def test_it_goes_off_the_way_and_comes_back_to_it(straight_there: Recorded, with
     assert hypot(*(with_a_detour.arrays["pose"][-1, :2] - np.array(goal))) < 1.05
 
 
+def test_it_says_turn_back_where_the_way_on_lies_behind_it(with_a_detour: Recorded) -> None:
+    plans = with_a_detour.arrays["plan_xy"][::10, 0]
+    behind = np.abs(np.arctan2(plans[:, 1], plans[:, 0])) > 2.0
+    says = np.array([trace["plan"] == TURN_BACK for trace in with_a_detour.traces])
+    assert behind.any() and says[behind].all() and not says.all()
+
+
+def test_where_it_has_arrived_it_says_to_stop(straight_there: Recorded) -> None:
+    assert straight_there.traces[-1]["plan"] == stop(0.0)
+
+
+def test_nobody_begins_where_it_does(carriage: Carriage) -> None:
+    for scenario in scenarios("office"):
+        carriage.fill(scenario.episode)
+        gaps = np.hypot(*(carriage.people()[:, :2] - scenario.episode.start[:2]).T)
+        assert gaps.min() > 2.0
+
+
+def test_other_numbers_make_other_tours_and_more_of_them_the_same(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path, [made_up_drive("a", 40)])
+    config = CollectConfig(kinds={"corridor": 1.0}, jobs=1)
+
+    def made(**changed: Any) -> Dataset:
+        numbers = TourConfig(**{"count": 1, "per_layout": 2, "people_most": 0, **changed})
+        return build_tours(dataset, numbers, config, 3, ranks=SINGLE, progress=QuietProgress())
+
+    two = made(count=2)
+    assert made().entries == two.entries[:1] and made().folder == two.folder
+    assert made(linger_s=1.0).folder != two.folder
+
+
+def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
+    config = CollectConfig(kinds={"warehouse": 1.0}, jobs=1)
+    numbers = TourConfig(count=1, per_layout=1, people_most=0)
+
+    def made(folder: Path, drive: Drive) -> Dataset:
+        dataset = write_dataset(folder, [drive])
+        return build_tours(dataset, numbers, config, 3, ranks=SINGLE, progress=QuietProgress())
+
+    shown = made(tmp_path / "a", made_up_drive("a", 40)).entries[0]
+    about = made_up_drive("a", 40).about
+    seed = next(seed for seed in range(100, 400) if replace(about, kind="warehouse", layout_seed=seed).is_val)
+    held = replace(made_up_drive("a", 40), about=replace(about, kind="warehouse", layout_seed=seed))
+    assert len(made(tmp_path / "b", held)) == 1
+    entry = Dataset.open(tmp_path / "b").entries[0]
+    same = Dataset(tmp_path / "b", (replace(entry, layout_seed=shown.layout_seed),))
+    assert not len(build_tours(same, numbers, config, 3, ranks=SINGLE, progress=QuietProgress()))
+
+
 def test_the_same_numbers_give_the_same_tour(straight_there: Recorded) -> None:
     with closing(Carriage(scenarios("office")[0].site, 10)) as fresh:
-        again = _tour(fresh, scenarios("office")[0], TourConfig(stray_share=0.0))
+        again = _tour(fresh, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
     assert all(np.array_equal(again.arrays[name], array) for name, array in straight_there.arrays.items())
 
 

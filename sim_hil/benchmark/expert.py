@@ -53,16 +53,13 @@ class ExpertPolicy:
     needs_image = False
 
     def __init__(
-        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (),
-        patient: bool = False, stays: bool = False,
+        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (), patient: bool = False
     ) -> None:  # fmt: skip
         """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
 
         `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
         `patient`: it keeps its distance to people even after standing long, for it is its pupil that stands.
-        `stays`: it stands where it has arrived, and does not go on to the goal itself.
         """
-        self._stays = stays
         self._patient = patient
         self._told = told
         self._margin_m = margin_m
@@ -87,7 +84,6 @@ class ExpertPolicy:
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
         driving = _DRIVINGS[episode.robot]
         self._world, self._planner = world, planner
-        self._goal, self._arrived_m = episode.goal_xy, episode.threshold_m if self._stays else 0.0
         speed_mps = driving.speed_mps if self._speed_mps is None else self._speed_mps
         self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m, speed_mps=speed_mps)
         self._motion = Motion(planner.grid, self._driving)
@@ -104,17 +100,13 @@ class ExpertPolicy:
         people, velocities = self._watch(world)
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
         self._route = from_here(self._route, pose)
-        here = (pose.x_m, pose.y_m)
-        self._ticks += 1
-        self._left.append(self._planner.left(pose.x_m, pose.y_m))
-        if hypot(self._goal[0] - pose.x_m, self._goal[1] - pose.y_m) < self._arrived_m:
-            self._route = np.array([here])
-            self._choice = self._motion.stand(pose.as_tuple(), observation.state[0])
-            return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
-        if self._ticks % _REPLAN_TICKS == 1 or len(self._route) == 1:
+        if self._ticks % _REPLAN_TICKS == 0:
             standing = people[(gaps < _VIEW_M) & (self._paces < _STANDING_MPS)]
+            here = (pose.x_m, pose.y_m)
             self._route = self._planner.route(here, standing, _REACH_M, self._route if self._on_route(pose) else None)
+        self._ticks += 1
         near = gaps < _SIGHT_M
+        self._left.append(self._planner.left(pose.x_m, pose.y_m))
         self._choice = self._motion.choose(
             pose.as_tuple(),
             observation.state[0],

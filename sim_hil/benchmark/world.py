@@ -191,8 +191,9 @@ class EpisodeWorld:
 
     def _ended(self) -> str | None:
         if self._reached_frame is not None:
-            lingered = self._frames - self._reached_frame >= round(self.options.linger_s * FRAME_HZ)
-            return "reached" if lingered or self._simulation.fell else None
+            if self._frames - self._reached_frame >= round(self.options.linger_s * FRAME_HZ):
+                return "reached"
+            return "fell" if self._simulation.fell else None
         if self._simulation.fell:
             return "fell"
         return "timeout" if self._frames >= round(self.episode.timeout_s * FRAME_HZ) else None

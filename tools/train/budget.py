@@ -16,6 +16,7 @@ from export.progress import duration
 from tools.train.chain import Step
 from tools.train.optim import computes_bf16
 from tools.train.recipe import STAGES, Recipe
+from tools.train.tour_config import OF_TOURS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -82,7 +83,11 @@ def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> 
     share = (config.go_on_share or 1.0) if config is not None else 1.0
     # An epoch is as long as its drives are many; imitation's samples are a number of their own.
     shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
-    return [(what, round(count * shares.get(key, share)), key) for what, count, key in work]
+    tours = {"tour": 0.0, "encode": 0.0, "sft": share}  # there are no more of them, and they are learned again
+    return [
+        (what, round(count * (tours if what.startswith(OF_TOURS) else shares).get(key, share)), key)
+        for what, count, key in work
+    ]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:

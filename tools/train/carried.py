@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2
+from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.expert import NEAR, along, driving_of, from_here
 from sim_hil.benchmark.expert_motion import Driving
 from sim_hil.benchmark.expert_route import RoutePlanner
@@ -33,11 +34,10 @@ from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, T
 from tools.train.encoder_ids import ASPECT
 from tools.train.encoder_poses import body_state
 from tools.train.record import Look, NothingToLearnError, Recorded
-from tools.train.retell import turning_first
 from tools.train.scenarios import Scenario
 from tools.train.sites import Site
 from tools.train.tour_config import TourConfig
-from tools.train.traces import Tracer
+from tools.train.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
@@ -48,6 +48,7 @@ _VIEW_M: Final = 12.0  # who stands about within this is led round
 _STANDING_MPS: Final = 0.25
 _OFF_ROUTE_M: Final = 0.6
 _BLOCKED_M, _BLOCKED_RAD = 1.1, 1.0  # somebody so near ahead is waited for
+_PATIENCE_S: Final = 4.0  # and then passed, however close: people give way
 _SWAY_RADPS, _SWAY_S = 0.15, 1.5  # how much the steering sways (one standard deviation), and for how long one way
 _PACE_S: Final = (1.0, 6.0)  # for so long a pace is kept
 _HALT_SHARE: Final = 0.1  # of those times it halts, and for no longer than the next
@@ -56,7 +57,8 @@ _SLOWEST: Final = 0.6  # of the expert's speed
 _STRAY_TO: Final = 0.8  # of the way is behind it at most where it leaves it
 _ALLOWED_MPS: Final = 0.35  # a tour that is slower is given up
 _SPARE_S: Final = 30.0
-_DECOYS: Final = 8
+_DECOYS, _DECOY_M = 8, 1.0  # tries to find some other place, and how near to it one turns back at the latest
+_THERE_M: Final = 0.25  # so near the end of a route it has been reached
 
 
 class Carriage:
@@ -74,10 +76,10 @@ class Carriage:
         self._people = People(site.scene, 0, 0)
         self._cameras: dict[str, CameraWorld] = {}
 
-    def fill(self, seed: int) -> None:
-        """Let other people come. Raises NothingToLearnError where they find no room."""
+    def fill(self, episode: Episode) -> None:
+        """Let other people come, nobody near the start. Raises NothingToLearnError where they find no room."""
         try:
-            self._people = People(self.site.scene, self.count, seed)
+            self._people = People(replace(self.site.scene, start=episode.start), self.count, episode.seed)
         except ValueError as error:
             raise NothingToLearnError("no room for its people") from error
 
@@ -135,14 +137,16 @@ class Glider:
     def step(self, route: Array, *, halted: bool = False) -> float:
         """A tenth of a second along `route` [n, 2], points 0.1 m apart from here on; how far it came, m."""
         self._change_pace()
+        left_m = 0.1 * (len(route) - 1)
         at = min(round((0.45 + 0.45 * self.speed_mps) * 10), len(route) - 1)
         aim = self.pose.inverse() @ SE2(float(route[at, 0]), float(route[at, 1]), 0.0)
-        error = atan2(aim.y_m, aim.x_m) if hypot(aim.x_m, aim.y_m) > 0.05 else 0.0
+        error = atan2(aim.y_m, aim.x_m)
         noise = float(self.rng.standard_normal())
         self._sway += -self._sway * _STEP_S / _SWAY_S + _SWAY_RADPS * sqrt(2 * _STEP_S / _SWAY_S) * noise
-        stands = halted or self._pace == 0.0 or len(route) < 2
+        stands = halted or self._pace == 0.0 or hypot(aim.x_m, aim.y_m) < _THERE_M
         driving = self.driving
-        wanted_mps = 0.0 if stands else driving.speed_mps * self._pace * max(cos(error), 0.0) ** 2
+        pace_mps = min(driving.speed_mps * self._pace, sqrt(driving.brake_mps2 * left_m))
+        wanted_mps = 0.0 if stands else pace_mps * max(cos(error), 0.0) ** 2
         top = driving.turn_radps
         wanted_radps = 0.0 if stands else min(max(1.8 * error, -top), top) + self._sway
         self.speed_mps = _slew(self.speed_mps, wanted_mps, driving.brake_mps2, driving.accel_mps2)
@@ -177,6 +181,7 @@ class _Stray:
 
     after_m: float = inf
     for_m: float = 0.0
+    to: Vec2 = (0.0, 0.0)
     planner: RoutePlanner | None = None
     route: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
@@ -189,7 +194,7 @@ def carried(
 
     Raises NothingToLearnError where there is no way, or where it does not arrive.
     """
-    carriage.fill(scenario.episode.seed)
+    carriage.fill(scenario.episode)
     tour = _Tour(scenario, carriage, config, collect, rng)
     odometer = Odometer(drift, scenario.episode.seed, tour.body.pose)
     jpegs: list[NDArray[np.uint8]] = []
@@ -243,8 +248,8 @@ class _Tour:
         self.body = Glider(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
         self._route = np.array([episode.start[:2]])
         self._stray = self._drawn_stray()
-        self._ticks, self._gone_m, self._off_m = 0, 0.0, 0.0
-        self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
+        self._ticks, self._gone_m, self._off_m, self._blocked_s = 0, 0.0, 0.0, 0.0
+        self._left_s = (self._tracer.progress.length_m + 2 * self._stray.for_m) / _ALLOWED_MPS + _SPARE_S
         self._linger_s: float | None = None
         self.plan: list[Vec2] = []
 
@@ -267,12 +272,12 @@ class _Tour:
             planner = self._planner_to((x, y), 0.5)
             if planner.reachable(self.body.pose.x_m, self.body.pose.y_m):
                 after_m = where * _STRAY_TO * self._tracer.progress.length_m
-                return _Stray(after_m, 1.0 + far * (self._config.stray_m - 1.0), planner)
+                return _Stray(after_m, 1.0 + far * (self._config.stray_m - 1.0), (x, y), planner)
         return _Stray()
 
     @property
     def over(self) -> bool:
-        """Whether it has arrived and stood there. Raises NothingToLearnError where it does not come on."""
+        """Whether it has arrived and stayed. Raises NothingToLearnError where it does not come on."""
         if self._left_s <= 0:
             raise NothingToLearnError("it did not arrive in time")
         return self._linger_s is not None and self._linger_s <= 0
@@ -288,9 +293,7 @@ class _Tour:
             self._route = self._planner.route(here, standing, _REACH_M, kept)
             if self._strays and self._stray.planner is not None:
                 self._stray.route = self._stray.planner.route(here, standing, _REACH_M)
-        stays = self._linger_s is not None  # as the teacher of a drive does
-        way = np.array([here]) if stays else self._route
-        self.plan = along(way, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
+        self.plan = along(self._route, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
 
     @property
     def _strays(self) -> bool:
@@ -303,7 +306,7 @@ class _Tour:
 
     def trace(self) -> Mapping[str, Any]:
         """What is to be said here."""
-        means = [turning_first(np.array(self.plan[0]), self._driving.turn_radps, self._speed_mps)]
+        means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
         people, velocities = self._carriage.people(), self._carriage.velocities()
         return self._tracer.trace(self.body.pose, people, velocities, means).to_json()
 
@@ -311,10 +314,12 @@ class _Tour:
         """A tenth of a second on."""
         arrived = hypot(self.body.pose.x_m - self._goal[0], self.body.pose.y_m - self._goal[1]) < self._near_m
         if arrived and self._linger_s is None:
-            self._linger_s = float(self._rng.uniform(0.0, self._config.linger_s))
+            self._linger_s = float(self._rng.uniform(0.5, 1.0)) * self._config.linger_s
         strays = self._strays and len(self._stray.route) > 1
         if strays:
             self._stray.route = from_here(self._stray.route, self.body.pose)
+            if hypot(self.body.pose.x_m - self._stray.to[0], self.body.pose.y_m - self._stray.to[1]) < _DECOY_M:
+                self._stray.for_m = 0.0
         gone = self.body.step(self._stray.route if strays else self._route, halted=self._halted())
         self._gone_m += gone
         self._off_m += gone if strays else 0.0
@@ -325,13 +330,13 @@ class _Tour:
             self._linger_s -= _STEP_S
 
     def _halted(self) -> bool:
-        """Whether it stands: it has arrived, or somebody is right before it."""
-        if self._linger_s is not None:
-            return True
+        """Whether it waits for somebody who is right before it, as it does for a while."""
         people, pose = self._carriage.people(), self.body.pose
         dx, dy = people[:, 0] - pose.x_m, people[:, 1] - pose.y_m
         bearings = (np.arctan2(dy, dx) - pose.theta_rad + pi) % (2 * pi) - pi
-        return bool(np.any((np.hypot(dx, dy) < _BLOCKED_M) & (np.abs(bearings) < _BLOCKED_RAD)))
+        blocked = bool(np.any((np.hypot(dx, dy) < _BLOCKED_M) & (np.abs(bearings) < _BLOCKED_RAD)))
+        self._blocked_s = self._blocked_s + _STEP_S if blocked else 0.0
+        return 0.0 < self._blocked_s < _PATIENCE_S
 
 
 def _has_room(site: Site, people: int) -> bool:

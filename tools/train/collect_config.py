@@ -34,8 +34,9 @@ class CollectConfig:
     """Kept to people beyond what the benchmark's expert keeps."""
     arrive_share: float = 0.7
     """Of the distance that counts as arrived: so near the goal a drive goes, that the last metres are learned too."""
-    linger_s: float = 6.0
-    """A drive goes on for up to so long after it has arrived: to stay there is to be learned as well."""
+    linger_s: float = 0.0
+    """A drive goes on for up to so long after it has arrived, and at least half of it: to stay there, where the expert
+    comes to rest, is to be learned as well."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:
@@ -49,7 +50,7 @@ class CollectConfig:
             raise ValueError(f"drives_per_layout: expected 1 to 100, found {self.drives_per_layout}")
         if not 0.2 <= self.speed_mps <= 1.5:
             raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
-        if not 0 <= self.linger_s <= 60:
-            raise ValueError(f"expected linger_s from 0 to 60, found {self.linger_s}")
+        if not 0 <= self.linger_s <= 10:
+            raise ValueError(f"expected linger_s from 0 to 10, found {self.linger_s}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:
             raise ValueError("expected margin_m from 0 to 0.5 and arrive_share from 0.3 to 1")

@@ -6,12 +6,12 @@ What is drawn for a drive depends on the collection's seed and the drive's numbe
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import SceneError
-from tools.train.carried import Carriage, carried
 from tools.train.collect_config import CollectConfig
 from tools.train.dagger_driver import PolicyDriver, PolicyOptions
 from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TOUR_DRIVER, TRACE_EVERY, About, Drive, Entry
@@ -33,6 +32,9 @@ from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_epis
 from tools.train.steering import SteeringNoise, Velocity
 from tools.train.tour_config import TourConfig
 from tools.train.traces import Tracer
+
+if TYPE_CHECKING:
+    from tools.train.carried import Carriage
 
 MODULE: Final = "tools.train.collect_worker"
 _TAG: Final = 0xC011
@@ -92,7 +94,7 @@ class Draw:
             noise=noise < config.noise_share,
             look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
             drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
-            linger_s=linger * config.linger_s,
+            linger_s=(1.0 + linger) / 2 * config.linger_s,
         )
 
 
@@ -116,12 +118,7 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
             yield {"dropped": order.id(number), "why": "no such layout"}
         return
     with ExitStack() as stack:
-        carriages = {}
-        if order.tour is not None:
-            for each in reversed(scenarios):  # the first of a layout says how many people there are
-                people = min(each.episode.people, order.tour.people_most)
-                carriages[each.layout_seed] = Carriage(each.site, people)
-                stack.callback(carriages[each.layout_seed].close)
+        carriages: dict[int, Carriage] = {}
         for number, scenario in zip(numbers, scenarios, strict=True):
             drive_id = order.id(number)
             if drive_id in order.skip:
@@ -131,7 +128,11 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
                 if order.tour is None:
                     entry = _drive(order, number, scenario)
                 else:
-                    entry = _tour(order, order.tour, number, scenario, carriages[scenario.layout_seed])
+                    seed = scenario.layout_seed
+                    if seed not in carriages:
+                        carriages[seed] = _carriage(order.tour, scenario, scenarios)
+                        stack.callback(carriages[seed].close)
+                    entry = _tour(order, order.tour, number, scenario, carriages[seed])
                 yield {"drive": asdict(entry)}
             except (NothingToLearnError, SceneError) as error:
                 yield {"dropped": drive_id, "why": str(error)}
@@ -158,7 +159,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
     expert = ExpertPolicy(
-        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil, stays=True
+        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
@@ -169,7 +170,18 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
 
 
+def _carriage(tour: TourConfig, scenario: Scenario, scenarios: Sequence[Scenario]) -> Carriage:
+    """Of a scenario's layout; the first one there says how many people there are, whoever is asked for first."""
+    from tools.train.carried import Carriage
+
+    first = next(each for each in scenarios if each.layout_seed == scenario.layout_seed)
+    return Carriage(scenario.site, min(first.episode.people, tour.people_most))
+
+
 def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, carriage: Carriage) -> Entry:
+    # Here: who records drives needs nothing of it.
+    from tools.train.carried import carried
+
     draw = Draw.of(order.config, order.seed, number)
     rng = np.random.default_rng((order.seed, number, _TAG, 2))
     recorded = carried(scenario, carriage, tour, draw.look, draw.drift, order.config, rng)

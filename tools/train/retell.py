@@ -15,7 +15,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import cos, hypot, sin
+from math import hypot
 from pathlib import Path
 from typing import Any, Final
 from zlib import crc32
@@ -40,7 +40,7 @@ from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario, ScenarioError, is_sound, scenario_of
 from tools.train.sites import Site, SiteError
 from tools.train.trace_words import Trace
-from tools.train.traces import Sight, Tracer
+from tools.train.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
 FORMAT: Final = 1
@@ -250,7 +250,7 @@ def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight 
         k = int(own["k"])
         if k >= count:
             break
-        means = [turning_first(plan[k, 0], driving.turn_radps, speed_mps)]
+        means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
         traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
     told = tuple(scenario.told_json())
@@ -262,13 +262,6 @@ def _among(alone: Trace, own: Trace) -> Trace:
     things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
     people = [] if own.motion == words.NOBODY else own.motion.split(", ")
     return Trace.of(own.situation, things, people, alone.progress, alone.plan)
-
-
-def turning_first(point: NDArray[np.float32], turn_radps: float, speed_mps: float) -> tuple[float, float]:
-    """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does."""
-    bearing = float(np.arctan2(point[1], point[0]))
-    gone_m = max(PLAN_TIMES_S[0] - abs(bearing) / turn_radps, 0.0) * speed_mps
-    return gone_m * cos(bearing), gone_m * sin(bearing)
 
 
 def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:

@@ -37,7 +37,7 @@ from tools.train.network_file import finish_network, read_network, stage_weights
 from tools.train.optim import OptimConfig, Optimiser, autocast
 from tools.train.retell import RetellConfig, Retellings
 from tools.train.tokens import TokenCache
-from tools.train.tour_config import TourConfig
+from tools.train.tour_config import OF_TOURS, TourConfig
 from tools.train.tours import build_tours, tour_anchors
 
 if TYPE_CHECKING:
@@ -173,17 +173,25 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     config, collect = recipe.sft or SftConfig(), recipe.collect
     seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
     each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
+    anchors = round(seconds * each) * config.epochs
+    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    if not config.tours.count:
+        return drives
     toured = round(PLANNED_TOUR_S * config.tours.count)
-    anchors = round(seconds * each + toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
-    tours = [("tours", config.tours.count, "tour")] if config.tours.count else []
-    frames = seconds * RATE_HZ + toured * (2 if config.mirrored > 0 else 1)
-    return [*tours, ("frames encoded", frames, "encode"), ("anchors learned", anchors, "sft")]
+    shown = round(toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
+    frames = toured * (2 if config.mirrored > 0 else 1)
+    tours = (
+        ("made", config.tours.count, "tour"),
+        ("frames encoded", frames, "encode"),
+        ("anchors learned", shown, "sft"),
+    )
+    return [*drives, *((f"{OF_TOURS}{what}", count, key) for what, count, key in tours)]
 
 
 def run(job: StageJob) -> dict[str, Any]:
     """Train on the run's data set; leaves the network with its new language model.
 
-    Raises SftError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
+    Raises SftError, CollectError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
     """
     config = _config(job)
     dataset = drives_after(job, STAGE)
@@ -200,7 +208,7 @@ def run(job: StageJob) -> dict[str, Any]:
     if config.tours.count:
         tours = _tours(job, dataset)
         views = _with_tours(job, network, views, tours)
-        more += tour_anchors(tours, tours.train)
+        more += tour_anchors(tours, tours.ids)
     result = fit(job, network.to(job.device), dataset, views, more)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
@@ -338,11 +346,11 @@ def _tours(job: StageJob, dataset: Dataset) -> Dataset:
 def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) -> Views:
     """Tokens of tours beside those of the drives."""
     seconds = TokenCache(SecondsDataset.of(tours), network.vision)
-    _encode(job, seconds, tours.train)
+    _encode(job, seconds, tours.ids)
     mirror = views.mirror
     if mirror is not None:
         other = TokenCache(SecondsDataset.of(tours, mirrored=True), network.vision, tours.folder / MIRRORED)
-        _encode(job, other, tours.train)
+        _encode(job, other, tours.ids)
         mirror = Joined(mirror, other, frozenset(tours.ids))
     return Views(views.plain, mirror, seconds)
 

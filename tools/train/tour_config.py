@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
+
+OF_TOURS: Final = "tours: "
+"""How the lines of a budget begin that are not of drives."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class TourConfig:
     stray_m: float = 8.0
     """So far they are carried there at most."""
     linger_s: float = 5.0
-    """Up to so long a tour stands where it has arrived."""
+    """A tour goes on for up to so long after it has arrived, half of it at least: on to the goal, where it stands."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.count <= 1_000_000 or not 1 <= self.per_layout <= 100:

@@ -1,13 +1,16 @@
 """The tours beside a data set's drives, from which the language model learns and nobody else does.
 
-They lie in `tours/` of the data set's folder, a data set of their own of which one frame a second has a picture.
+They lie in `tours/` of the data set's folder: data sets of their own with a picture of one frame a second, each in
+a folder whose name begins the hash of the numbers that it was made with.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Final
 
 from tools.train.anchors import Anchor, anchors_of
@@ -18,6 +21,7 @@ from tools.train.job import StageProgress
 from tools.train.tour_config import TourConfig
 
 FOLDER: Final = "tours"
+FORMAT: Final = 2
 PREFIX: Final = "w"
 _TURN: Final = 500  # of collections: rounds of DAgger take those from 0 on, their experts those from 1000 on
 # Whether one waits for somebody, and how one goes round, is the driver's choice: of who is carried it is not known.
@@ -30,20 +34,30 @@ def build_tours(
 ) -> Dataset:  # fmt: skip
     """The tours, those that are not there yet made by the first rank's processes; all must call.
 
-    Raises CollectError, DriveError, OSError, and KeyboardInterrupt when `stopped`.
+    They have layouts of their own; those of a layout that the data set holds out are left out. Raises CollectError,
+    DriveError, OSError, and KeyboardInterrupt when `stopped`.
     """
     # Here: who learns without tours needs no simulator.
     from tools.train.collection import Collection, fill, job_count
     from tools.train.dataset import DatasetWriter
 
-    folder = dataset.folder / FOLDER
+    folder = dataset.folder / FOLDER / _key(config, collect, seed)
     with ranks.by_first() as here:
         if here:
             tours = Collection(PREFIX, config.count, seed, _TURN, collect, tour=config)
             with DatasetWriter(folder) as writer:
                 fill(writer, tours, job_count(collect.jobs), update=progress.update, stopped=stopped)
                 writer.finish()
-    return Dataset.open(folder).of(PREFIX)
+    held = {(entry.kind, entry.layout_seed) for entry in dataset.entries if entry.val}
+    entries = (entry for entry in Dataset.open(folder).entries if (entry.kind, entry.layout_seed) not in held)
+    return Dataset(folder, tuple(entry for entry in entries if int(entry.id[len(PREFIX) :]) < config.count))
+
+
+def _key(config: TourConfig, collect: CollectConfig, seed: int) -> str:
+    """Of what a tour depends on: how many there are is no part of it, nor how many processes make them."""
+    alike = {"tours": asdict(replace(config, count=0)), "collect": asdict(replace(collect, episodes=1, jobs=0))}
+    numbers = {"format": FORMAT, "seed": seed, **alike}
+    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:

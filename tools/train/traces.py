@@ -21,7 +21,7 @@ from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario
 from tools.train.trace_words import Trace
 
-__all__ = ["PEOPLE_M", "Trace", "Tracer"]
+__all__ = ["PEOPLE_M", "Trace", "Tracer", "turning_first"]
 
 Array = NDArray[np.float64]
 
@@ -37,8 +37,24 @@ _WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
 _WAIT_FOR_M: Final = 2.5
 _INSIDE_M: Final = 0.2  # so far within an opening it is looked into
 _BACK_M: Final = -0.3  # who means to be so far behind itself in three seconds turns round
+_ROUND_RAD: Final = 2.0  # of its teacher's drives most turn round for what is so far to the side
+_HERE_M: Final = 0.05
 _ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go on
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
+
+
+def turning_first(point: Vec2, turn_radps: float, speed_mps: float) -> Vec2:
+    """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does.
+
+    What lies well behind it comes out behind it, however little time the turn leaves: it means to turn round.
+    """
+    bearing, gap_m = atan2(point[1], point[0]), hypot(*point)
+    if gap_m < _HERE_M:
+        return (_ON_M, 0.0)  # it means to be where it is, and waits for nobody
+    if abs(bearing) > _ROUND_RAD:
+        return (2.0 * _BACK_M, 0.0)
+    gone_m = max(3.0 - abs(bearing) / turn_radps, 0.0) * speed_mps
+    return gone_m * cos(bearing), gone_m * sin(bearing)
 
 
 class Sight(Protocol):
