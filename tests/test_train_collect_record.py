@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from edge.geometry import SE2
 from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.world import EpisodeWorld
@@ -17,7 +18,8 @@ from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
 from tools.train import record as recording
 from tools.train.collect_config import CollectConfig
-from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY
+from tools.train.detour import Detour
+from tools.train.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
 from tools.train.record import (
     DrivePlan,
     Look,
@@ -48,15 +50,17 @@ def _tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]
 
 
 def _drive(
-    steer: Steer, way: NDArray[np.float64] = WAY, look: Look | None = None, linger_s: float = 0.0, **changes: Any
-) -> Recorded:
+    steer: Steer, way: NDArray[np.float64] = WAY, look: Look | None = None, linger_s: float = 0.0,
+    detour: Detour | None = None, **changes: Any,
+) -> Recorded:  # fmt: skip
     """Along the corridor; a policy's drive where `steer` is not the expert."""
     episode = corridor_episode(robot="carter", **changes)
     pupil = steer is not _as_wanted
     plan = DrivePlan(
-        episode, load_scene("corridor"), way, look or Look(), "none", pupil=pupil, linger_s=linger_s
+        episode, load_scene("corridor"), way, look or Look(), "none", pupil=pupil, linger_s=linger_s,
+        detour=detour,
     )  # fmt: skip
-    return record(plan, ExpertPolicy(speed_mps=0.8), steer, _tell)
+    return record(plan, ExpertPolicy(speed_mps=0.8, rests=True), steer, _tell)
 
 
 @pytest.fixture(scope="module")
@@ -247,6 +251,20 @@ def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_fra
     lingering = _drive(_as_wanted, linger_s=6.0)
     pose = lingering.arrays["pose"]
     assert lingering.outcome == "reached"
-    assert np.max(np.hypot(*(pose[-10:, :2] - pose[-1, :2]).T)) < 0.05
-    assert np.max(np.hypot(*lingering.arrays["plan_xy"][-1].T)) < 0.3
+    assert np.max(np.abs(pose[-10:] - pose[-1])) < 0.05
+    assert np.max(np.hypot(*lingering.arrays["plan_xy"][-1].T)) < 0.4
     assert np.max(np.hypot(*lingering.arrays["future"][-10, :, :2].T)) < 0.3
+
+
+def test_on_a_detour_it_leaves_its_way_and_the_label_is_what_brings_it_back() -> None:
+    aside = _drive(_as_wanted, detour=Detour((1.3, 0.5), 3.5, 1.0), timeout_s=60.0)
+    by, pose = aside.arrays["by"], aside.arrays["pose"]
+    assert aside.outcome == "reached" and set(by) == {EXPERT, NOISE}
+    last = int(np.flatnonzero(by == NOISE)[-1])
+    assert np.all(pose[last:, 0] > 1.0) and abs(pose[last, 2]) > 2.0  # it looks back to where it came from
+    there = SE2(*map(float, pose[last])) @ SE2(*map(float, aside.arrays["future"][last, -1]))
+    assert there.x_m > pose[last, 0] + 0.3
+
+
+def test_where_there_is_no_way_to_it_there_is_no_detour() -> None:
+    assert set(_drive(_as_wanted, detour=Detour((500.0, 0.0), 1.0, 1.0)).arrays["by"]) == {EXPERT}

@@ -35,6 +35,7 @@ _VIEW_M: Final = 12.0  # who stands about within this is led round
 _STANDING_MPS: Final = 0.25
 _OFF_ROUTE_M: Final = 0.6
 NEAR: Final = 0.8  # of the threshold: so near has arrived for certain
+_END_M: Final = 0.4
 _STUCK_S: Final = 6.0
 _STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
 
@@ -53,13 +54,16 @@ class ExpertPolicy:
     needs_image = False
 
     def __init__(
-        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (), patient: bool = False
+        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (),
+        patient: bool = False, rests: bool = False,
     ) -> None:  # fmt: skip
         """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
 
         `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
         `patient`: it keeps its distance to people even after standing long, for it is its pupil that stands.
+        `rests`: it stands at its way's end, where the benchmark's, whose episode is over by then, turns about.
         """
+        self._rests = rests
         self._patient = patient
         self._told = told
         self._margin_m = margin_m
@@ -107,6 +111,9 @@ class ExpertPolicy:
         self._ticks += 1
         near = gaps < _SIGHT_M
         self._left.append(self._planner.left(pose.x_m, pose.y_m))
+        if self._rests and hypot(self._route[-1, 0] - pose.x_m, self._route[-1, 1] - pose.y_m) < _END_M:
+            self._choice = self._motion.stand(pose.as_tuple(), observation.state[0])
+            return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
         self._choice = self._motion.choose(
             pose.as_tuple(),
             observation.state[0],
@@ -151,6 +158,11 @@ class ExpertPolicy:
         """
         speed = self._choice.vx_mps if self._choice is not None else 0.0
         return along(self._route, self._running().pose(), speed, self._driving, times_s)
+
+    @property
+    def speed_mps(self) -> float | None:
+        """What it was given in place of the robot's own."""
+        return self._speed_mps
 
     @property
     def choice(self) -> Choice | None:

@@ -119,6 +119,18 @@ class Motion:
         future = np.stack((x[:, best], y[:, best]), axis=1)
         return Choice(self._speed, self._turn, future, turned[:, best].copy(), self._shift, float(cost[best]))
 
+    def stand(self, pose: tuple[float, float, float], speed_mps: float) -> Choice:
+        """Brake and then stand, whoever comes: for who has arrived. `speed_mps` measured."""
+        driving = self._driving
+        v = _stopping(speed_mps, driving.brake_mps2, self._times)
+        w = _stopping(self._turn, driving.turn_accel_radps2, self._times)
+        headings = pose[2] + np.cumsum(w) * STEP_S
+        ways = np.stack((np.cos(headings), np.sin(headings)), axis=1) * v[:, None] * STEP_S
+        self._speed = float(_stopping(speed_mps, driving.brake_mps2, np.array(CONTROL_S)))
+        self._turn = float(_stopping(self._turn, driving.turn_accel_radps2, np.array(CONTROL_S)))
+        self._shift = 0.0
+        return Choice(self._speed, self._turn, np.array(pose[:2]) + np.cumsum(ways, axis=0), headings, 0.0, 0.0)
+
     def _drive(self, pose: tuple[float, float, float], route: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
         """All futures at once: x, y, v, heading [STEPS, futures], and what each wants first, v and w."""
         driving, count = self._driving, len(self._pace)
@@ -223,6 +235,11 @@ def _line_and_left(route: Array) -> tuple[Array, Array]:
     ways = np.diff(route, axis=0, append=2 * route[-1:] - route[-2:-1])
     lengths = np.maximum(np.hypot(ways[:, 0], ways[:, 1]), 1e-9)
     return route, np.stack((-ways[:, 1] / lengths, ways[:, 0] / lengths), axis=1)
+
+
+def _stopping(value: float, rate: float, times_s: Array) -> Array:
+    """What is left at these times of a value that is brought to zero."""
+    return np.asarray(np.sign(value) * np.maximum(abs(value) - rate * times_s, 0.0))
 
 
 def _slew(value: float, target: float, down: float, up: float) -> float:

@@ -8,8 +8,8 @@ and at times off to some other place and back again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from math import atan2, cos, hypot, inf, pi, sin, sqrt
+from dataclasses import dataclass, replace
+from math import atan2, cos, hypot, pi, sin, sqrt
 from typing import Any, Final
 
 import cv2
@@ -23,13 +23,12 @@ from sim_hil.benchmark.expert_motion import Driving
 from sim_hil.benchmark.expert_route import RoutePlanner
 from sim_hil.benchmark.observation import Odometer
 from sim_hil.benchmark.robots import footprint_m, max_step_m
-from sim_hil.benchmark.route import RouteError
-from sim_hil.benchmark.tasks import draw_start
 from sim_hil.camera import CameraWorld
 from sim_hil.nav_grid import NavGrid
 from sim_hil.people import UPDATE_HZ, People
 from tools.train.augment import encoded
 from tools.train.collect_config import CollectConfig
+from tools.train.detour import Course, draw_detour
 from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
 from tools.train.encoder_ids import ASPECT
 from tools.train.encoder_poses import body_state
@@ -54,10 +53,9 @@ _PACE_S: Final = (1.0, 6.0)  # for so long a pace is kept
 _HALT_SHARE: Final = 0.1  # of those times it halts, and for no longer than the next
 _HALT_S: Final = 2.5
 _SLOWEST: Final = 0.6  # of the expert's speed
-_STRAY_TO: Final = 0.8  # of the way is behind it at most where it leaves it
 _ALLOWED_MPS: Final = 0.35  # a tour that is slower is given up
 _SPARE_S: Final = 30.0
-_DECOYS, _DECOY_M = 8, 1.0  # tries to find some other place, and how near to it one turns back at the latest
+_DECOYS: Final = 8  # tries to find some other place
 _THERE_M: Final = 0.25  # so near the end of a route it has been reached
 
 
@@ -175,17 +173,6 @@ class Glider:
         return gone
 
 
-@dataclass
-class _Stray:
-    """A way off the told one: from where on, and for how long."""
-
-    after_m: float = inf
-    for_m: float = 0.0
-    to: Vec2 = (0.0, 0.0)
-    planner: RoutePlanner | None = None
-    route: Array = field(default_factory=lambda: np.zeros((0, 2)))
-
-
 def carried(
     scenario: Scenario, carriage: Carriage, config: TourConfig, look: Look, drift: str, collect: CollectConfig,
     rng: np.random.Generator,
@@ -247,9 +234,9 @@ class _Tour:
         self._tracer = Tracer(scenario)
         self.body = Glider(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
         self._route = np.array([episode.start[:2]])
-        self._stray = self._drawn_stray()
-        self._ticks, self._gone_m, self._off_m, self._blocked_s = 0, 0.0, 0.0, 0.0
-        self._left_s = (self._tracer.progress.length_m + 2 * self._stray.for_m) / _ALLOWED_MPS + _SPARE_S
+        self._ticks, self._blocked_s = 0, 0.0
+        self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
+        self._aside, self._aside_route = self._drawn_aside(), self._route
         self._linger_s: float | None = None
         self.plan: list[Vec2] = []
 
@@ -260,20 +247,22 @@ class _Tour:
         robot = self._robot
         return RoutePlanner(self._site.scene, goal, footprint_m(robot), max_step_m(robot), near_m, told)
 
-    def _drawn_stray(self) -> _Stray:
-        strays, where, far = (float(value) for value in self._rng.uniform(size=3))
-        if strays >= self._config.stray_share:
-            return _Stray()
+    def _drawn_aside(self) -> tuple[Course, RoutePlanner] | None:
+        """A way off the told one, and what leads there; None where it stays on it."""
+        if float(self._rng.uniform()) >= self._config.stray_share:
+            return None
+        length_m = self._tracer.progress.length_m
         for _ in range(_DECOYS):
-            try:
-                x, y, _ = draw_start(self._site.scene, self._site.robot_grid(self._robot), self._rng)
-            except RouteError:
-                break
-            planner = self._planner_to((x, y), 0.5)
-            if planner.reachable(self.body.pose.x_m, self.body.pose.y_m):
-                after_m = where * _STRAY_TO * self._tracer.progress.length_m
-                return _Stray(after_m, 1.0 + far * (self._config.stray_m - 1.0), (x, y), planner)
-        return _Stray()
+            detour = draw_detour(self._site, self._robot, length_m, self._config.stray_m, self._rng)
+            planner = None if detour is None else self._planner_to(detour.to, 0.5)
+            if detour is not None and planner is not None and planner.reachable(*self._here):
+                self._left_s += 2 * detour.for_m / _ALLOWED_MPS
+                return Course(detour), planner
+        return None
+
+    @property
+    def _here(self) -> Vec2:
+        return (self.body.pose.x_m, self.body.pose.y_m)
 
     @property
     def over(self) -> bool:
@@ -285,19 +274,15 @@ class _Tour:
     def look_ahead(self) -> None:
         """Work out the way on from here."""
         pose = self.body.pose
-        here = (pose.x_m, pose.y_m)
         self._route = from_here(self._route, pose)
+        self._aside_route = from_here(self._aside_route, pose)
         if self._ticks % TRACE_EVERY == 0:
             standing = self._standing()
-            kept = self._route if hypot(*(self._route[0] - here)) < _OFF_ROUTE_M else None
-            self._route = self._planner.route(here, standing, _REACH_M, kept)
-            if self._strays and self._stray.planner is not None:
-                self._stray.route = self._stray.planner.route(here, standing, _REACH_M)
+            kept = self._route if hypot(*(self._route[0] - self._here)) < _OFF_ROUTE_M else None
+            self._route = self._planner.route(self._here, standing, _REACH_M, kept)
+            if self._aside is not None and self._aside[0].aside:
+                self._aside_route = self._aside[1].route(self._here, standing, _REACH_M)
         self.plan = along(self._route, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
-
-    @property
-    def _strays(self) -> bool:
-        return self._gone_m >= self._stray.after_m and self._off_m < self._stray.for_m
 
     def _standing(self) -> Array:
         people, velocities, pose = self._carriage.people()[:, :2], self._carriage.velocities(), self.body.pose
@@ -315,14 +300,11 @@ class _Tour:
         arrived = hypot(self.body.pose.x_m - self._goal[0], self.body.pose.y_m - self._goal[1]) < self._near_m
         if arrived and self._linger_s is None:
             self._linger_s = float(self._rng.uniform(0.5, 1.0)) * self._config.linger_s
-        strays = self._strays and len(self._stray.route) > 1
-        if strays:
-            self._stray.route = from_here(self._stray.route, self.body.pose)
-            if hypot(self.body.pose.x_m - self._stray.to[0], self.body.pose.y_m - self._stray.to[1]) < _DECOY_M:
-                self._stray.for_m = 0.0
-        gone = self.body.step(self._stray.route if strays else self._route, halted=self._halted())
-        self._gone_m += gone
-        self._off_m += gone if strays else 0.0
+        course = None if self._aside is None else self._aside[0]
+        aside = course is not None and course.aside and len(self._aside_route) > 1
+        gone = self.body.step(self._aside_route if aside else self._route, halted=self._halted())
+        if course is not None:
+            course.went(gone, self.body.pose)
         self._carriage.wait(self.body.pose)
         self._ticks += 1
         self._left_s -= _STEP_S

@@ -37,6 +37,9 @@ class CollectConfig:
     linger_s: float = 0.0
     """A drive goes on for up to so long after it has arrived, and at least half of it: to stay there, where the expert
     comes to rest, is to be learned as well."""
+    stray_share: float = 0.0
+    stray_m: float = 6.0
+    """Drives of the expert that leave their way for some other place, for up to so far, and come back."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:
@@ -50,6 +53,8 @@ class CollectConfig:
             raise ValueError(f"drives_per_layout: expected 1 to 100, found {self.drives_per_layout}")
         if not 0.2 <= self.speed_mps <= 1.5:
             raise ValueError(f"speed_mps: expected 0.2 to 1.5, found {self.speed_mps}")
+        if not (0 <= self.stray_share <= 1 and 1 <= self.stray_m <= 50):
+            raise ValueError("expected stray_share from 0 to 1 and stray_m from 1 to 50")
         if not 0 <= self.linger_s <= 10:
             raise ValueError(f"expected linger_s from 0 to 10, found {self.linger_s}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:

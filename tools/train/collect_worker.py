@@ -26,6 +26,7 @@ from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import SceneError
 from tools.train.collect_config import CollectConfig
 from tools.train.dagger_driver import PolicyDriver, PolicyOptions
+from tools.train.detour import draw_detour
 from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TOUR_DRIVER, TRACE_EVERY, About, Drive, Entry
 from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
 from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_episodes
@@ -81,6 +82,7 @@ class Draw:
     look: Look
     drift: str
     linger_s: float
+    strays: bool
 
     @staticmethod
     def of(config: CollectConfig, seed: int, number: int) -> Draw:
@@ -88,13 +90,14 @@ class Draw:
         rng = np.random.default_rng((seed, number, _TAG))
         noise, sharp, drift = (float(value) for value in rng.uniform(size=3))
         quality = int(rng.integers(config.jpeg_quality_min, config.jpeg_quality_max + 1))
-        linger = float(rng.uniform())
+        linger, strays = (float(value) for value in rng.uniform(size=2))
         severe, typical = config.severe_drift_share, config.typical_drift_share
         return Draw(
             noise=noise < config.noise_share,
             look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
             drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
             linger_s=(1.0 + linger) / 2 * config.linger_s,
+            strays=strays < config.stray_share,
         )
 
 
@@ -148,6 +151,10 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     draw = Draw.of(config, order.seed, number)
     threshold_m = scenario.episode.threshold_m
     episode = replace(scenario.episode, id=order.id(number), threshold_m=config.arrive_share * threshold_m)
+    detour = None
+    if draw.strays and order.policy is None:
+        way_rng = np.random.default_rng((order.seed, number, _TAG, 3))
+        detour = draw_detour(scenario.site, episode.robot, scenario.told.length_m, config.stray_m, way_rng)
     plan = DrivePlan(
         episode=episode,
         scene=scenario.scene,
@@ -156,10 +163,12 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         drift=draw.drift,
         pupil=order.policy is not None,
         linger_s=draw.linger_s,
+        detour=detour,
+        off_m=DrivePlan.off_m + (0.0 if detour is None else detour.for_m),
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
     expert = ExpertPolicy(
-        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil
+        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil, rests=True
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:

@@ -16,7 +16,8 @@ from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
 from sim_hil.scene import Scene
-from tools.train.drive import PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
+from tools.train.detour import Detour, DetourDriver
+from tools.train.drive import NOISE, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
 from tools.train.futures import chosen_future, label_futures
 from tools.train.steering import Velocity
 
@@ -78,7 +79,7 @@ class DrivePlan:
     `path` [n, 2]: the told way, m. With `pupil` a policy drives: what goes wrong is kept, as there is something to
     learn from it, until it has gone 6 m from the way or has stayed where it is for 15 s. The expert's drives are kept
     up to their trouble, and none that goes further than `off_m` from the way: it would not be what the words say.
-    `linger_s`: for so long it is looked at after it has arrived.
+    `linger_s`: for so long it is looked at after it has arrived. `detour`: it leaves its way for a while, if it can.
     """
 
     episode: Episode
@@ -89,6 +90,7 @@ class DrivePlan:
     pupil: bool = False
     off_m: float = 4.0
     linger_s: float = 0.0
+    detour: Detour | None = None
 
 
 def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded:
@@ -101,11 +103,14 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
             expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
         except ValueError as error:
             raise NothingToLearnError("the expert sees no way") from error
+        aside = _aside(plan, world, expert)
         try:
             while not world.done:
                 observation = _shrunk(world.observe())
                 wanted = expert.act(observation)
                 command, by = steer(observation, wanted)
+                if aside is not None and (elsewhere := aside.command(observation)) is not None:
+                    command, by = elsewhere, NOISE
                 _keep(frames, plan, world, observation, expert, by)
                 if len(frames.traces) * TRACE_EVERY < len(frames.pose):
                     frames.traces.append(tell(world, frames.chosen[-1]))
@@ -116,9 +121,20 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
                     world.stop()
         finally:
             expert.close()
+            if aside is not None:
+                aside.close()
         end, collided = world.end, world.collided
     outcome = "cut" if end == "stopped" else str(end)
     return _finish(frames, plan, outcome, collided, first_collision)
+
+
+def _aside(plan: DrivePlan, world: EpisodeWorld, expert: ExpertPolicy) -> DetourDriver | None:
+    if plan.detour is None:
+        return None
+    try:
+        return DetourDriver(plan.detour, plan.episode, world, expert.speed_mps)
+    except ValueError:  # there is no way to that place
+        return None
 
 
 def _shrunk(observation: Observation) -> Observation:
