@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from edge.back_off import BACKING_OFF, BackOff, BackOffConfig
 from edge.camera import Frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
 from edge.faults import FAULT_OF_CAUSE
@@ -96,6 +97,7 @@ class ControlLoop:
         """
         self._policy = policy
         self._controller = controller
+        self._back_off = BackOff(BackOffConfig(controller.config.limits.vx_min_mps))
         self._newest_frame = newest_frame
         self._history = history
         self._ring = ring
@@ -192,7 +194,14 @@ class ControlLoop:
             speed_scale=self.supervision.speed_scale,
             hold=self._hold(acted_ns),
         )
-        command = self._controller.step(inputs, acted_ns)
+        command = self._back_off.step(
+            self._controller.step(inputs, acted_ns),
+            None if pose is None else pose.T_odom_base,
+            acted_ns,
+            inputs.speed_scale,
+        )
+        if command.reason == BACKING_OFF:
+            self._controller.halt(BACKING_OFF)  # what comes after it speeds up from standing
         self._send(command)
         end_ns = self._clock()
         self._last_tick_ns = end_ns - deadline_ns

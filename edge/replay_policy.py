@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from edge.back_off import BACKING_OFF
 from edge.camera import decode_frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
 from edge.geometry import SE2
@@ -237,6 +238,7 @@ class Replayer:
         inputs = ControllerInputs(trajectory, 0.0, 0.0, speed_scale=tick.speed_scale, hold=hold)
         command = self._controller.step(inputs, tick.acted_ns)
         self._command_known = self._command_known or hold is not None
-        if self._command_known:
+        # A step back is of what odometry saw while it was driven, not of the plan.
+        if self._command_known and tick.reason != BACKING_OFF:
             apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
             self.comparison.command.append(float(np.abs(apart).max()))

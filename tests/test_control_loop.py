@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from edge.back_off import BACKING_OFF
 from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
 from edge.geometry import SE2
+from edge.pose_history import StampedPose
 from tests.control_bench import PERIOD_NS, Bench
 
 
@@ -181,3 +183,17 @@ def test_what_was_found_while_the_robot_was_stood_up_does_not_count(bench: Bench
     bench.stop.wait = lambda _seconds: bool(bench.on_time)  # type: ignore[method-assign,assignment]
     assert bench.loop.run(bench.now_ns, None) is None
     assert bench.loop.supervision.active == ()
+
+
+def test_a_robot_that_is_driven_and_does_not_come_on_steps_back_and_speeds_up_from_there(bench: Bench) -> None:
+    said = []
+    for tick in range(60):
+        bench.history.put(StampedPose(bench.now_ns, SE2(1.0 + 1e-4 * (tick % 3), 0.0, 0.0), 0.0, 0.0, 0.0))
+        bench.look()
+        bench.think(0)
+        said.append(bench.tick())
+    reasons = [reason for _, reason in said]
+    first = reasons.index(BACKING_OFF)
+    assert 20 <= first <= 23 and set(reasons[:first]) == {"ok"}
+    assert all(speed == -0.2 for speed, reason in said if reason == BACKING_OFF)
+    assert "ok" in reasons[first:] and bench.loop.statistics.reasons[BACKING_OFF] >= 20
