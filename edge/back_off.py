@@ -1,11 +1,13 @@
-"""Out of a wedge: a robot that is told to drive and does not come on steps back a little, and is driven on from there.
+"""Out of a wedge: a robot that is told to drive on and does not come on goes back the way that it has come.
 
-A plan made from pictures does not feel the doorpost that the robot's side rests against, and the arc to a point 1 s
-ahead never reverses. What lies just behind is where the robot has come from. Pure: no clock, no thread, no I/O.
+A plan made from pictures does not feel the doorpost that the robot's side rests against, and the arc to a point ahead
+never reverses. The poses that the robot has just been in are the only ones behind it that are known to be free: it goes
+back through these, heading by heading, and no further. Pure: no clock, no thread, no I/O.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from math import hypot
 from typing import Final
@@ -16,6 +18,12 @@ from edge.geometry import SE2, wrap_angle
 BACKING_OFF: Final = "backing-off"
 """What a command gives as its reason meanwhile."""
 OK: Final = "ok"
+MAX_STEP_S: Final = 0.2
+"""Of a tick that came late no more is counted."""
+_TRAIL_M, _TRAIL_RAD = 0.05, 0.1  # between two poses of the trail
+_TRAIL: Final = 60  # poses
+_AT_M, _AT_RAD = 0.03, 0.1  # so near to one of them, it has been reached
+_REACH_S: Final = 0.5  # in which the next one would be reached, but for the limits
 
 
 @dataclass(frozen=True)
@@ -24,64 +32,141 @@ class BackOffConfig:
 
     vx_min_mps: float
     after_s: float = 2.0
-    told_mps: float = 0.1
-    told_radps: float = 0.3
-    """A command from which on the robot ought to move."""
-    moved_m: float = 0.1
-    moved_rad: float = 0.2
-    """Odometry that has seen as much since then has seen it move."""
+    told_m: float = 0.3
+    """So long it must have been told to drive on, and so far, before its not having come on is a wedge."""
+    share: float = 0.25
+    """Of what it was told; who has come further is not held by anything."""
     speed_mps: float = 0.2
+    turn_radps: float = 0.5
     distance_m: float = 0.3
-    at_most_s: float = 2.5
+    at_most_s: float = 3.0
+    stands_s: float = 1.0
+    """A way back on which odometry sees nothing for so long is given up."""
+    attempts: int = 3
+    apart_m: float = 1.0
+    """Tries until it has come so far from where it first was held."""
 
     def __post_init__(self) -> None:
-        times = (self.after_s, self.at_most_s, self.speed_mps, self.distance_m, self.told_mps, self.told_radps)
-        if self.vx_min_mps > 0 or min(*times, self.moved_m, self.moved_rad) <= 0:
-            raise ValueError(f"back-off: expected vx_min_mps of 0 or below and all else above 0, found {self}")
+        numbers = (
+            self.after_s, self.told_m, self.share, self.speed_mps, self.turn_radps, self.distance_m, self.at_most_s,
+            self.stands_s, self.attempts, self.apart_m,
+        )  # fmt: skip
+        if self.vx_min_mps > 0 or min(numbers) <= 0 or self.share >= 1:
+            raise ValueError(f"back-off: expected vx_min_mps of 0 or below, share below 1, all above 0, found {self}")
+
+
+@dataclass
+class _Told:
+    """What it was told to drive since it was at a pose."""
+
+    start: SE2
+    for_s: float = 0.0
+    far_m: float = 0.0
+
+
+@dataclass
+class _Back:
+    """A way back under way."""
+
+    start: SE2
+    since_ns: int
+    last: SE2
+    moved_ns: int
 
 
 class BackOff:
-    """Watches whether the robot does what it is told."""
+    """Watches whether the robot comes on when it is told to."""
 
     def __init__(self, config: BackOffConfig) -> None:
         self._config = config
-        self._told: tuple[int, SE2] | None = None
-        """Since when, and from where on, it has been told to move without moving."""
-        self._back: tuple[int, SE2] | None = None
-        """Since when, and from where on, it steps back."""
+        self._trail: deque[SE2] = deque(maxlen=_TRAIL)
+        self._told: _Told | None = None
+        self._back: _Back | None = None
+        self._held_at: SE2 | None = None
+        self._attempts = 0
+        self._last_ns: int | None = None
 
     def step(
         self, wanted: VelocityCommand, T_odom_base: SE2 | None, now_ns: int, speed_scale: float = 1.0
     ) -> VelocityCommand:
-        """`wanted`, or the step back in its place. Whatever forces zero comes first and ends it."""
-        config = self._config
-        speed_mps = min(config.speed_mps * min(speed_scale, 1.0), -config.vx_min_mps)
-        if wanted.reason != OK or T_odom_base is None or not speed_mps > 0:
-            self._told = self._back = None
+        """`wanted`, or the way back in its place. Whatever forces zero, and a plan to stand, come first and end it."""
+        elapsed_s = 0.0 if self._last_ns is None else min(max((now_ns - self._last_ns) / 1e9, 0.0), MAX_STEP_S)
+        self._last_ns = now_ns
+        scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
+        speed_mps = min(self._config.speed_mps, -self._config.vx_min_mps) * scale
+        if T_odom_base is None or wanted.reason != OK or speed_mps <= 0:
+            self._back = None
             return wanted
-        if self._back is None and self._is_wedged(wanted, T_odom_base, now_ns):
-            self._back = (now_ns, T_odom_base)
         if self._back is None:
-            return wanted
-        since_ns, start = self._back
-        if now_ns - since_ns >= config.at_most_s * 1e9 or _gap_m(start, T_odom_base) >= config.distance_m:
+            self._remember(T_odom_base)
+            if not self._is_wedged(wanted, T_odom_base, elapsed_s):
+                return wanted
+            self._begin(T_odom_base, now_ns)
+        command = self._way_back(wanted, T_odom_base, now_ns, speed_mps, scale)
+        if command is None:
             self._told = self._back = None
             return wanted
-        return VelocityCommand(-speed_mps, 0.0, 0.0, wanted.target, BACKING_OFF)
+        return command
 
-    def _is_wedged(self, wanted: VelocityCommand, pose: SE2, now_ns: int) -> bool:
+    def _remember(self, pose: SE2) -> None:
+        if not self._trail or _gap(self._trail[-1], pose, _TRAIL_M, _TRAIL_RAD) >= 1.0:
+            self._trail.append(pose)
+
+    def _is_wedged(self, wanted: VelocityCommand, pose: SE2, elapsed_s: float) -> bool:
         config = self._config
-        if abs(wanted.vx_mps) < config.told_mps and abs(wanted.wz_radps) < config.told_radps:
-            self._told = None
+        if self._held_at is not None and _far_m(self._held_at, pose) > config.apart_m:
+            self._held_at, self._attempts = None, 0
+        if wanted.vx_mps <= 0.0:
             return False
-        if self._told is not None:
-            since_ns, start = self._told
-            turned_rad = abs(wrap_angle(pose.theta_rad - start.theta_rad))
-            if _gap_m(start, pose) < config.moved_m and turned_rad < config.moved_rad:
-                return now_ns - since_ns >= config.after_s * 1e9
-        self._told = (now_ns, pose)
-        return False
+        if self._told is None:
+            self._told = _Told(pose)
+        told = self._told
+        told.for_s += elapsed_s
+        told.far_m += wanted.vx_mps * elapsed_s
+        if told.for_s < config.after_s or told.far_m < config.told_m:
+            return False
+        if _far_m(told.start, pose) >= config.share * told.far_m:
+            self._told = _Told(pose)
+            return False
+        return self._attempts < config.attempts
+
+    def _begin(self, pose: SE2, now_ns: int) -> None:
+        self._back = _Back(pose, now_ns, pose, now_ns)
+        self._held_at = self._held_at or pose
+        self._attempts += 1
+
+    def _way_back(
+        self, wanted: VelocityCommand, pose: SE2, now_ns: int, speed_mps: float, scale: float
+    ) -> VelocityCommand | None:
+        """Towards the pose before, or None where the way back ends."""
+        config, back = self._config, self._back
+        if back is None or wanted.target is None or hypot(wanted.target.x_m, wanted.target.y_m) < _TRAIL_M:
+            return None
+        if _gap(back.last, pose, _AT_M, _AT_RAD) >= 1.0:
+            back.last, back.moved_ns = pose, now_ns
+        if now_ns - back.moved_ns >= config.stands_s * 1e9 or now_ns - back.since_ns >= config.at_most_s * 1e9:
+            return None
+        while self._trail and self._is_passed(pose, self._trail[-1]):
+            self._trail.pop()
+        if not self._trail or _far_m(back.start, pose) >= config.distance_m:
+            return None
+        before = pose.inverse() @ self._trail[-1]
+        vx_mps = -min(max(-before.x_m, 0.0) / _REACH_S, speed_mps)
+        most = config.turn_radps * scale
+        wz_radps = min(max(before.theta_rad / _REACH_S, -most), most)
+        return VelocityCommand(vx_mps, 0.0, wz_radps, wanted.target, BACKING_OFF)
+
+    @staticmethod
+    def _is_passed(pose: SE2, before: SE2) -> bool:
+        """Whether nothing of the way to a pose of the trail is left: neither to go back, nor to turn."""
+        there = pose.inverse() @ before
+        return there.x_m > -_AT_M and abs(there.theta_rad) < _AT_RAD
 
 
-def _gap_m(a: SE2, b: SE2) -> float:
+def _far_m(a: SE2, b: SE2) -> float:
     return hypot(b.x_m - a.x_m, b.y_m - a.y_m)
+
+
+def _gap(a: SE2, b: SE2, one_m: float, one_rad: float) -> float:
+    """How far apart two poses are, in the larger of two units."""
+    return max(_far_m(a, b) / one_m, abs(wrap_angle(b.theta_rad - a.theta_rad)) / one_rad)

@@ -63,7 +63,7 @@ class ControlStatistics:
     """|Δt measured for the action expert − (instant of its call − anchor)|."""
     unsent: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
-    """Ticks by what decided their velocity: "ok", or the reason for zero."""
+    """Ticks by what decided their velocity: "ok", the reason for zero, or BACKING_OFF."""
     faults: dict[str, int] = field(default_factory=dict)
     """How often each fault of the table was raised."""
 

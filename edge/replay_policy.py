@@ -238,7 +238,7 @@ class Replayer:
         inputs = ControllerInputs(trajectory, 0.0, 0.0, speed_scale=tick.speed_scale, hold=hold)
         command = self._controller.step(inputs, tick.acted_ns)
         self._command_known = self._command_known or hold is not None
-        # A step back is of what odometry saw while it was driven, not of the plan.
+        # A way back is of what odometry saw while it was driven, not of the plan.
         if self._command_known and tick.reason != BACKING_OFF:
             apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
             self.comparison.command.append(float(np.abs(apart).max()))

@@ -1,8 +1,10 @@
-"""A robot that is told to drive and does not come on steps back; nothing else ever reverses it."""
+"""A robot that is told to drive on and does not come on goes back through its own trail; nothing else reverses it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from math import hypot
 
 import pytest
 from hypothesis import given
@@ -13,84 +15,167 @@ from edge.controller import VelocityCommand
 from edge.geometry import SE2
 
 CONFIG = BackOffConfig(vx_min_mps=-0.4)
-HERE = SE2(1.0, 2.0, 0.5)
 TICK_NS = 100_000_000
 ON = VelocityCommand(0.4, 0.0, 0.2, SE2(0.4, 0.0, 0.0), "ok")
+Moves = Callable[[SE2, VelocityCommand], SE2]
 
 
-def wedged(back_off: BackOff, ticks: int, wanted: VelocityCommand = ON, pose: SE2 | None = HERE) -> VelocityCommand:
-    """What is commanded in the last of so many ticks at one place."""
-    for tick in range(ticks):
-        command = back_off.step(wanted, pose, tick * TICK_NS)
-    return command
+def glide(pose: SE2, command: VelocityCommand) -> SE2:
+    """Nothing holds it."""
+    return pose @ SE2(command.vx_mps * 0.1, 0.0, command.wz_radps * 0.1)
 
 
-def test_for_two_seconds_it_does_as_told() -> None:
-    assert wedged(BackOff(CONFIG), 20) is ON
+def wall_at(x_m: float) -> Moves:
+    """Nothing holds it but a wall across its way; turning it, too, is held there."""
+
+    def move(pose: SE2, command: VelocityCommand) -> SE2:
+        there = glide(pose, command)
+        return pose if there.x_m > x_m and command.vx_mps > 0 else there
+
+    return move
 
 
-def test_then_it_steps_straight_back_slowly() -> None:
-    command = wedged(BackOff(CONFIG), 21)
-    assert (command.vx_mps, command.vy_mps, command.wz_radps, command.reason) == (-0.2, 0.0, 0.0, BACKING_OFF)
+class Run:
+    """Ticks of a robot that does as it is told, as far as `moves` lets it."""
+
+    def __init__(self, moves: Moves = glide, config: BackOffConfig = CONFIG, pose: SE2 | None = None) -> None:
+        self.back_off, self.moves, self.pose, self.ticks = BackOff(config), moves, pose or SE2(0.0, 0.0, 0.0), 0
+        self.said: list[str] = []
+        self.poses = [self.pose]
+
+    def go(self, ticks: int, wanted: VelocityCommand = ON, speed_scale: float = 1.0) -> VelocityCommand:
+        for _ in range(ticks):
+            command = self.back_off.step(wanted, self.pose, self.ticks * TICK_NS, speed_scale)
+            self.pose = self.moves(self.pose, command)
+            self.ticks += 1
+            self.said.append(command.reason)
+            self.poses.append(self.pose)
+        return command
 
 
-def test_a_turn_that_does_not_come_about_is_a_wedge_too() -> None:
-    turning = VelocityCommand(0.0, 0.0, -0.5, None, "ok")
-    assert wedged(BackOff(CONFIG), 21, turning).reason == BACKING_OFF
+STRAIGHT = replace(ON, wz_radps=0.0)
 
 
-def test_who_is_told_to_stand_is_not_wedged() -> None:
-    assert wedged(BackOff(CONFIG), 100, VelocityCommand(0.05, 0.0, 0.1, None, "ok")).reason == "ok"
+def held(config: BackOffConfig = CONFIG, wanted: VelocityCommand = STRAIGHT) -> Run:
+    """Driven a metre and then held at a wall, up to the first tick of its way back."""
+    run = Run(wall_at(1.0), config)
+    while BACKING_OFF not in run.said and run.ticks < 200:
+        run.go(1, wanted)
+    return run
 
 
-@given(st.floats(0.15, 0.8), st.floats(-1.0, 1.0))
-def test_who_comes_on_is_never_sent_back(speed_mps: float, wz_radps: float) -> None:
-    back_off, pose = BackOff(CONFIG), HERE
-    for tick in range(100):
-        command = back_off.step(VelocityCommand(speed_mps, 0.0, wz_radps, None, "ok"), pose, tick * TICK_NS)
-        assert command.reason == "ok"
-        pose = pose @ SE2(speed_mps * 0.1, 0.0, wz_radps * 0.1)
+def test_for_two_seconds_at_the_wall_it_does_as_told() -> None:
+    run = held()
+    first = run.said.index(BACKING_OFF)
+    stood = sum(pose.x_m == run.poses[first].x_m for pose in run.poses[: first + 1])
+    assert 14 <= stood <= 50 and set(run.said[:first]) == {"ok"}
 
 
-def test_it_ends_where_it_has_gone_its_distance() -> None:
-    back_off = BackOff(CONFIG)
-    wedged(back_off, 21)
-    assert back_off.step(ON, HERE @ SE2(-0.29, 0.0, 0.0), 21 * TICK_NS).reason == BACKING_OFF
-    assert back_off.step(ON, HERE @ SE2(-0.31, 0.0, 0.0), 22 * TICK_NS) is ON
+def test_then_it_goes_back_slowly_about_as_far_as_it_was_told_to() -> None:
+    run = held()
+    at_the_wall = run.poses[-2].x_m
+    while run.said[-1] == BACKING_OFF:
+        assert run.go(1, STRAIGHT).vx_mps >= (-0.2 if run.said[-1] == BACKING_OFF else 0.0)
+    assert at_the_wall - min(pose.x_m for pose in run.poses[-40:]) == pytest.approx(0.3, abs=0.05)
 
 
-def test_it_ends_after_a_while_where_it_cannot_go_back_either_and_tries_again() -> None:
-    said = []
-    back_off = BackOff(CONFIG)
-    for tick in range(100):
-        said.append(back_off.step(ON, HERE, tick * TICK_NS).reason)
-    assert said[20:45] == [BACKING_OFF] * 25 and said[45] == "ok"
-    assert BACKING_OFF in said[46:]
+def test_it_goes_back_through_the_headings_that_it_came_by() -> None:
+    def corner(pose: SE2, command: VelocityCommand) -> SE2:
+        return pose if pose.y_m > 0.25 and command.vx_mps > 0 else glide(pose, command)
+
+    run, turning = Run(corner), VelocityCommand(0.3, 0.0, 0.6, SE2(0.3, 0.1, 0.6), "ok")
+    while BACKING_OFF not in run.said:
+        run.go(1, turning)
+    came, start = run.poses[:-1], run.poses[-2]
+    while run.said[-1] == BACKING_OFF:
+        run.go(1, turning)
+        gaps = [
+            (hypot(p.x_m - run.pose.x_m, p.y_m - run.pose.y_m), abs(p.theta_rad - run.pose.theta_rad)) for p in came
+        ]
+        assert any(gap_m < 0.08 and turned < 0.25 for gap_m, turned in gaps)
+    assert run.poses[-2].theta_rad < start.theta_rad - 0.2
+
+
+def test_where_it_has_not_come_from_anywhere_it_does_not_go() -> None:
+    run = Run(lambda pose, _: pose)
+    run.go(200, STRAIGHT)
+    assert run.pose == SE2(0.0, 0.0, 0.0) and set(run.said) <= {"ok", BACKING_OFF}
+    run = Run(lambda pose, command: pose if command.vx_mps > 0 else glide(pose, command))
+    run.go(200, STRAIGHT)
+    assert run.pose == SE2(0.0, 0.0, 0.0)
+
+
+@given(st.floats(0.05, 0.8), st.floats(-1.0, 1.0), st.floats(0.3, 1.0))
+def test_who_comes_on_is_never_sent_back(speed_mps: float, wz_radps: float, slip: float) -> None:
+    run = Run(lambda pose, command: pose @ SE2(slip * command.vx_mps * 0.1, 0.0, command.wz_radps * 0.1))
+    if abs(wz_radps) < 0.3 * speed_mps:  # who drives in circles is back where it was now and then
+        run.go(100, VelocityCommand(speed_mps, 0.0, wz_radps, SE2(speed_mps, 0.0, 0.0), "ok"))
+        assert set(run.said) == {"ok"}
+
+
+@given(st.integers(1, 6), st.floats(0.3, 1.0))
+def test_who_dithers_on_the_spot_is_not_held_by_anything(ticks: int, wz_radps: float) -> None:
+    run = Run()
+    for turn in range(60):
+        sign = 1 if turn % 2 else -1
+        run.go(ticks, VelocityCommand(0.0, 0.0, sign * wz_radps, SE2(0.0, 0.0, 0.3), "ok"))
+    assert set(run.said) == {"ok"}
 
 
 @pytest.mark.parametrize("reason", ["stale-frame", "no-semantic-state", "thinking"])
 def test_whatever_forces_zero_ends_it_at_once(reason: str) -> None:
-    back_off = BackOff(CONFIG)
-    wedged(back_off, 25)
+    run = held()
     zero = VelocityCommand(0.0, 0.0, 0.0, None, reason)
-    assert back_off.step(zero, HERE, 25 * TICK_NS) is zero
-    assert back_off.step(ON, HERE, 26 * TICK_NS) is ON
+    assert run.go(1, zero) is zero
+
+
+def test_a_plan_to_stand_ends_it_at_once() -> None:
+    run = held()
+    standing = VelocityCommand(0.01, 0.0, 0.0, SE2(0.01, 0.0, 0.0), "ok")
+    assert run.go(1, standing) is standing
+
+
+def test_halts_in_between_do_not_hide_a_wedge() -> None:
+    run = Run(wall_at(0.5))
+    for _ in range(20):  # as sync mode drives: half a second of each generation
+        run.go(5, STRAIGHT)
+        run.go(20, VelocityCommand(0.0, 0.0, 0.0, None, "thinking"))
+    assert BACKING_OFF in run.said
+
+
+def test_where_it_cannot_go_back_either_it_gives_up_in_a_second_and_tries_three_times_at_one_place() -> None:
+    run = Run(wall_at(1.0))
+    run.go(30, STRAIGHT)
+    run.moves = lambda pose, _: pose
+    run.go(600, STRAIGHT)
+    tries = sum(a != BACKING_OFF == b for a, b in zip(run.said, run.said[1:], strict=False))
+    assert tries == 3 and run.said.count(BACKING_OFF) <= 3 * 11
+
+
+def test_elsewhere_it_tries_again() -> None:
+    run = Run(wall_at(1.0))
+    run.go(600, STRAIGHT)
+    before = run.said.count(BACKING_OFF)
+    run.moves = wall_at(3.0)
+    run.go(300, STRAIGHT)
+    assert run.said.count(BACKING_OFF) > before
 
 
 def test_without_a_pose_nothing_is_known_of_a_wedge() -> None:
-    assert wedged(BackOff(CONFIG), 50, pose=None) is ON
+    back_off = BackOff(CONFIG)
+    assert all(back_off.step(ON, None, tick * TICK_NS) is ON for tick in range(100))
 
 
 def test_it_keeps_to_the_share_of_speed_that_the_supervisor_leaves() -> None:
-    back_off = BackOff(CONFIG)
-    wedged(back_off, 21)
-    assert back_off.step(ON, HERE, 21 * TICK_NS, speed_scale=0.5).vx_mps == pytest.approx(-0.1)
-    assert back_off.step(ON, HERE, 22 * TICK_NS, speed_scale=float("nan")) is ON
+    run = held()
+    assert -0.1 - 1e-9 <= run.go(1, STRAIGHT, speed_scale=0.5).vx_mps < 0.0
+    assert run.go(1, STRAIGHT, speed_scale=float("nan")) is STRAIGHT
 
 
 def test_a_robot_that_may_not_reverse_never_does() -> None:
-    assert wedged(BackOff(BackOffConfig(vx_min_mps=0.0)), 100) is ON
-    assert wedged(BackOff(BackOffConfig(vx_min_mps=-0.05)), 21).vx_mps == pytest.approx(-0.05)
+    assert set(held(BackOffConfig(vx_min_mps=0.0)).said) == {"ok"}
+    run = held(BackOffConfig(vx_min_mps=-0.05))
+    assert -0.05 <= run.go(1, STRAIGHT).vx_mps <= 0.0
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:

@@ -71,6 +71,10 @@ class ExpertPolicy:
         self._world: EpisodeWorld | None = None
         self._choice: Choice | None = None
 
+    def alike(self) -> ExpertPolicy:
+        """Another one that drives as this one does, told no way."""
+        return ExpertPolicy(margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient)
+
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
         """Plan the episode. Raises ValueError without a world, or where the goal cannot be reached."""
         if world is None:
@@ -88,6 +92,7 @@ class ExpertPolicy:
             raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
         driving = _DRIVINGS[episode.robot]
         self._world, self._planner = world, planner
+        self._goal, self._threshold_m = episode.goal_xy, episode.threshold_m
         speed_mps = driving.speed_mps if self._speed_mps is None else self._speed_mps
         self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m, speed_mps=speed_mps)
         self._motion = Motion(planner.grid, self._driving)
@@ -111,7 +116,7 @@ class ExpertPolicy:
         self._ticks += 1
         near = gaps < _SIGHT_M
         self._left.append(self._planner.left(pose.x_m, pose.y_m))
-        if self._rests and hypot(self._route[-1, 0] - pose.x_m, self._route[-1, 1] - pose.y_m) < _END_M:
+        if self._rests and self._is_there(pose):
             self._choice = self._motion.stand(pose.as_tuple(), observation.state[0])
             return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
         self._choice = self._motion.choose(
@@ -123,6 +128,12 @@ class ExpertPolicy:
             patience=self._patience(),
         )
         return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
+
+    def _is_there(self, pose: SE2) -> bool:
+        """Whether it has arrived, and its way ends here."""
+        (x, y), end = self._goal, self._route[-1]
+        arrived = hypot(x - pose.x_m, y - pose.y_m) < self._threshold_m
+        return arrived and hypot(end[0] - pose.x_m, end[1] - pose.y_m) < _END_M
 
     def _running(self) -> EpisodeWorld:
         if self._world is None:
@@ -158,11 +169,6 @@ class ExpertPolicy:
         """
         speed = self._choice.vx_mps if self._choice is not None else 0.0
         return along(self._route, self._running().pose(), speed, self._driving, times_s)
-
-    @property
-    def speed_mps(self) -> float | None:
-        """What it was given in place of the robot's own."""
-        return self._speed_mps
 
     @property
     def choice(self) -> Choice | None:

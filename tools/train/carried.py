@@ -228,7 +228,7 @@ class _Tour:
         self._near_m = collect.arrive_share * episode.threshold_m
         self._driving = driving_of(episode.robot)
         self._speed_mps = collect.speed_mps
-        self._planner = self._planner_to(self._goal, NEAR * episode.threshold_m, scenario.task.path)
+        self._planner = self._planner_to(self._goal, NEAR * self._near_m, scenario.task.path)
         if not self._planner.reachable(*episode.start[:2]):
             raise NothingToLearnError("the expert sees no way")
         self._tracer = Tracer(scenario)

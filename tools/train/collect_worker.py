@@ -167,8 +167,13 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         off_m=DrivePlan.off_m + (0.0 if detour is None else detour.for_m),
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
+    # Whoever drives away from the goal is not stuck before somebody, and no more is a pupil.
     expert = ExpertPolicy(
-        margin_m=config.margin_m, speed_mps=config.speed_mps, told=scenario.task.path, patient=plan.pupil, rests=True
+        margin_m=config.margin_m,
+        speed_mps=config.speed_mps,
+        told=scenario.task.path,
+        patient=plan.pupil or detour is not None,
+        rests=True,
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:

@@ -68,10 +68,10 @@ class Course:
 class DetourDriver:
     """Drives to the other place as an expert would, while the course is aside."""
 
-    def __init__(self, detour: Detour, episode: Episode, world: EpisodeWorld, speed_mps: float | None) -> None:
-        """Raises ValueError where there is no way to it."""
+    def __init__(self, detour: Detour, episode: Episode, world: EpisodeWorld, teacher: ExpertPolicy) -> None:
+        """Raises ValueError where there is no way to it, or it is where the episode begins."""
         elsewhere = replace(episode, goal_xy=detour.to, threshold_m=_NEAR_M)
-        self._expert = ExpertPolicy(speed_mps=speed_mps)
+        self._expert = teacher.alike()
         self._expert.reset(elsewhere, episode.instructions[0], world, episode.seed)
         self._course, self._world, self._last = Course(detour), world, world.pose()
 

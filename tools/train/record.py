@@ -132,7 +132,7 @@ def _aside(plan: DrivePlan, world: EpisodeWorld, expert: ExpertPolicy) -> Detour
     if plan.detour is None:
         return None
     try:
-        return DetourDriver(plan.detour, plan.episode, world, expert.speed_mps)
+        return DetourDriver(plan.detour, plan.episode, world, expert)
     except ValueError:  # there is no way to that place
         return None
 

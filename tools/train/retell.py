@@ -43,7 +43,7 @@ from tools.train.trace_words import Trace
 from tools.train.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
-FORMAT: Final = 1
+FORMAT: Final = 2
 LEAST_FRAMES: Final = 50
 """That a retelling has; a shorter one teaches nothing."""
 _OFF_M: Final = 3.0  # so far from the other way a retelling ends: most of it is not of turns that were missed

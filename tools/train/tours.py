@@ -24,6 +24,12 @@ FOLDER: Final = "tours"
 FORMAT: Final = 2
 PREFIX: Final = "w"
 _TURN: Final = 500  # of collections: rounds of DAgger take those from 0 on, their experts those from 1000 on
+_OF_DRIVES: Final = frozenset(  # what a tour has in common with the drives beside it
+    (
+        "kinds", "sharp_share", "jpeg_quality_min", "jpeg_quality_max", "typical_drift_share", "severe_drift_share",
+        "speed_mps", "arrive_share",
+    )
+)  # fmt: skip
 # Whether one waits for somebody, and how one goes round, is the driver's choice: of who is carried it is not known.
 _IN_THE_WAY: Final = re.compile(r"\bperson ahead [0-2] m\b")
 
@@ -55,8 +61,8 @@ def build_tours(
 
 def _key(config: TourConfig, collect: CollectConfig, seed: int) -> str:
     """Of what a tour depends on: how many there are is no part of it, nor how many processes make them."""
-    alike = {"tours": asdict(replace(config, count=0)), "collect": asdict(replace(collect, episodes=1, jobs=0))}
-    numbers = {"format": FORMAT, "seed": seed, **alike}
+    looks = {name: value for name, value in asdict(collect).items() if name in _OF_DRIVES}
+    numbers = {"format": FORMAT, "seed": seed, **asdict(replace(config, count=0)), "collect": looks}
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:16]
 
 
