@@ -23,6 +23,7 @@ from tests.train_stage_contract import Run, StageContract
 from tests.training_scenarios import drive_along, scenarios
 from tools.train import optim
 from tools.train.anchors import Prompts, anchors_of
+from tools.train.budget import budget_of
 from tools.train.chain import Step, run_step
 from tools.train.collect_config import CollectConfig
 from tools.train.drive import Dataset
@@ -159,7 +160,7 @@ def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> Non
 
 
 def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
-    recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.retold.ways=0"])
+    recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.tours.count=0"])
 
     def lines(**changed: Any) -> list[tuple[str, int, str]]:
         sft = dataclasses.replace(recipe.sft or SftConfig(), **changed)
@@ -172,6 +173,30 @@ def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
     assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RetellConfig(ways=2))
     assert anchors(tours=TourConfig(count=4)) == anchors() + 4 * 45 * 2
     assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
+
+
+def test_after_a_round_of_dagger_a_share_of_the_tours_is_learned_again_and_none_is_made(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    tours = TourConfig(count=2, per_layout=2, people_most=0)
+    numbers = dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.0, tours=tours, tours_again=0.5)
+    job = sft_job(tmp_path, numbers)
+    recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
+    job = dataclasses.replace(job, recipe=recipe)
+    first = run_step(job, Step("sft"))
+    made = sorted((tmp_path / "collect" / "tours").glob("*/drives/*"))
+    again = run_step(job, Step("sft", 1))
+    assert 0 < again["more_anchors"] < first["more_anchors"]
+    assert sorted((tmp_path / "collect" / "tours").glob("*/drives/*")) == made
+
+
+def test_the_budget_of_a_round_has_no_tours_to_make() -> None:
+    recipe = load_recipe("nano", ["sft.tours.count=100", "sft.tours_again=0.1", "dagger.rounds=1"])
+    lines = {line.what: line.samples for line in budget_of(recipe, [Step("sft")], "cpu")}
+    later = {line.what: line.samples for line in budget_of(recipe, [Step("sft", 1)], "cpu")}
+    assert lines["tours: made"] == 100 and not {"tours: made", "tours: frames encoded"} & set(later)
+    share = (recipe.sft or SftConfig()).go_on_share
+    assert later["tours: anchors learned"] == round(lines["tours: anchors learned"] * share * 0.1)
 
 
 def test_the_recipes_numbers_are_checked() -> None:

@@ -83,11 +83,13 @@ def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> 
     share = (config.go_on_share or 1.0) if config is not None else 1.0
     # An epoch is as long as its drives are many; imitation's samples are a number of their own.
     shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
-    tours = {"tour": 0.0, "encode": 0.0, "sft": share}  # there are no more of them, and they are learned again
-    return [
+    again = recipe.sft.tours_again if recipe.sft is not None else 1.0
+    tours = {"tour": 0.0, "encode": 0.0, "sft": share * again}  # there are no more of them, and some are learned again
+    counts = (
         (what, round(count * (tours if what.startswith(OF_TOURS) else shares).get(key, share)), key)
         for what, count, key in work
-    ]
+    )
+    return [line for line in counts if line[1] > 0]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:

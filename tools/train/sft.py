@@ -48,7 +48,7 @@ PLANNED_DRIVE_S: Final = 30.0
 PLANNED_TOUR_S: Final = 45.0
 _DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
 _RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
-_DRAWS, _ORDER, _HELD, _NOISE = 0x5F71, 0x5F72, 0x5F73, 0x5F74
+_DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
 
 
 class SftError(ValueError):
@@ -68,6 +68,8 @@ class SftConfig:
     """Other instructions under which every drive is shown too."""
     tours: TourConfig = field(default_factory=TourConfig)
     """Robots that were carried along told ways, whose words are learned beside those of the drives."""
+    tours_again: float = 0.25
+    """Share of them that is learned again, others each time, where it goes on after a round of DAgger."""
     mirrored: float = 0.5
     """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
     go_on_share: float = 0.4
@@ -92,8 +94,8 @@ class SftConfig:
             raise ValueError("expected go_on_share from 0 to 1 and go_on_lr_share above 0 to 1")
         if not 1 <= self.deciding <= 16:
             raise ValueError(f"expected deciding to be 1 to 16, found {self.deciding}")
-        if not 0 <= self.mirrored <= 1:
-            raise ValueError(f"expected mirrored to be a share from 0 to 1, found {self.mirrored}")
+        if not (0 <= self.mirrored <= 1 and 0 <= self.tours_again <= 1):
+            raise ValueError("expected mirrored and tours_again to be shares from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -334,13 +336,19 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 
 
 def _tours(job: StageJob, dataset: Dataset) -> Dataset:
-    """Made where they are not there yet."""
+    """Those to learn from now, made where they are not there yet."""
     collected = job.recipe.collect or CollectConfig()
+    config, rounds = _config(job), retired(job.run_dir, STAGE)
     job.progress.say("carrying robots about")
-    return build_tours(
-        dataset, _config(job).tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
+    tours = build_tours(
+        dataset, config.tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
         stopped=lambda: job.stop.asked,
     )  # fmt: skip
+    if not rounds or not config.go_on_share:
+        return tours
+    chosen = np.random.default_rng((job.recipe.seed, _AGAIN, rounds)).permutation(len(tours))
+    entries = (tours.entries[int(i)] for i in sorted(chosen[: round(config.tours_again * len(tours))]))
+    return Dataset(tours.folder, tuple(entries))
 
 
 def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) -> Views:
