@@ -17,6 +17,7 @@ START, GOAL = (-8.0, 0.0), (8.0, 0.0)
 ROUND_THE_LEFT: tuple[Vec2, ...] = (START, (-1.0, 3.6), (1.0, 3.6), GOAL)
 # Of the two ways round it the right one is shorter.
 BLOCKED = hall(block(0.0, 0.8, 1.0, 4.0))
+NARROW = hall(block(0.0, 0.0, 1.0, 1.0))
 
 
 def _route(told: tuple[Vec2, ...]) -> np.ndarray:
@@ -53,3 +54,20 @@ def test_it_drives_at_the_speed_it_is_given_and_tells_what_it_chose() -> None:
     # Where it drives is where it looks.
     ways = np.diff(choice.future, axis=0)
     assert np.allclose(np.arctan2(ways[:, 1], ways[:, 0]), choice.headings_rad[1:], atol=0.05)
+
+
+def test_it_keeps_further_from_walls_and_things_if_it_is_to() -> None:
+    episode = corridor_episode(robot="carter", start=(*START, 0.0), goal_xy=GOAL, timeout_s=60.0, shortest_m=16.0)
+
+    def least_m(wall_m: float) -> float:
+        teacher, gaps = ExpertPolicy(speed_mps=0.8, wall_m=wall_m), []
+        with EpisodeWorld(episode, scene=NARROW) as world:
+            teacher.reset(episode, "Go.", world, 0)
+            while not world.done:
+                world.step(teacher.act(world.observe()))
+                x, y = world.pose().x_m, world.pose().y_m
+                gaps += [abs(y) - 0.5] if abs(x) < 0.5 else []
+            assert world.end == "reached"
+        return min(gaps)
+
+    assert least_m(0.15) > least_m(0.0) + 0.05

@@ -55,15 +55,16 @@ class ExpertPolicy:
 
     def __init__(
         self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (),
-        patient: bool = False, rests: bool = False,
+        patient: bool = False, rests: bool = False, wall_m: float = 0.0,
     ) -> None:  # fmt: skip
         """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
 
         `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
         `patient`: it keeps its distance to people even after standing long, for it is its pupil that stands.
         `rests`: it stands at its way's end, where the benchmark's, whose episode is over by then, turns about.
+        `wall_m`: wider than it is by so much on each side it drives where there is room: a pupil is less exact.
         """
-        self._rests = rests
+        self._rests, self._wall_m = rests, wall_m
         self._patient = patient
         self._told = told
         self._margin_m = margin_m
@@ -73,7 +74,9 @@ class ExpertPolicy:
 
     def alike(self) -> ExpertPolicy:
         """Another one that drives as this one does, told no way."""
-        return ExpertPolicy(margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient)
+        return ExpertPolicy(
+            margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient, wall_m=self._wall_m
+        )
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
         """Plan the episode. Raises ValueError without a world, or where the goal cannot be reached."""
@@ -94,7 +97,12 @@ class ExpertPolicy:
         self._world, self._planner = world, planner
         self._goal, self._threshold_m = episode.goal_xy, episode.threshold_m
         speed_mps = driving.speed_mps if self._speed_mps is None else self._speed_mps
-        self._driving = replace(driving, margin_m=driving.margin_m + self._margin_m, speed_mps=speed_mps)
+        self._driving = replace(
+            driving,
+            margin_m=driving.margin_m + self._margin_m,
+            speed_mps=speed_mps,
+            body_radius_m=driving.body_radius_m + self._wall_m,
+        )
         self._motion = Motion(planner.grid, self._driving)
         self._route = np.array([(pose.x_m, pose.y_m)])
         self._ticks = 0

@@ -32,6 +32,8 @@ class CollectConfig:
     """The expert's, which is what a policy may drive on board: it could not follow a faster one."""
     margin_m: float = 0.1
     """Kept to people beyond what the benchmark's expert keeps."""
+    wall_m: float = 0.0
+    """Kept to walls and things beyond what it keeps, where there is room."""
     arrive_share: float = 0.7
     """Of the distance that counts as arrived: so near the goal a drive goes, that the last metres are learned too."""
     linger_s: float = 0.0
@@ -57,5 +59,7 @@ class CollectConfig:
             raise ValueError("expected stray_share from 0 to 1 and stray_m from 1 to 50")
         if not 0 <= self.linger_s <= 10:
             raise ValueError(f"expected linger_s from 0 to 10, found {self.linger_s}")
+        if not 0 <= self.wall_m <= 0.3:
+            raise ValueError(f"expected wall_m from 0 to 0.3, found {self.wall_m}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:
             raise ValueError("expected margin_m from 0 to 0.5 and arrive_share from 0.3 to 1")

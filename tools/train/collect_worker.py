@@ -174,6 +174,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         told=scenario.task.path,
         patient=plan.pupil or detour is not None,
         rests=True,
+        wall_m=config.wall_m,
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
