@@ -22,8 +22,10 @@ MAX_STEP_S: Final = 0.2
 """Of a tick that came late no more is counted."""
 _TRAIL_M, _TRAIL_RAD = 0.05, 0.1  # between two poses of the trail
 _TRAIL: Final = 60  # poses
-_AT_M, _AT_RAD = 0.03, 0.1  # so near to one of them, it has been reached
-_REACH_S: Final = 0.5  # in which the next one would be reached, but for the limits
+_AT_M, _AT_RAD = 0.03, 0.1  # who has come no further, or turned no further, has not moved
+_LOOK_BACK_M: Final = 0.15  # it turns to how it looked there
+_TURN_RAD: Final = 0.6  # before it goes back
+_REACH_S: Final = 0.5  # in which it would have turned, but for the limits
 
 
 @dataclass(frozen=True)
@@ -146,21 +148,25 @@ class BackOff:
             back.last, back.moved_ns = pose, now_ns
         if now_ns - back.moved_ns >= config.stands_s * 1e9 or now_ns - back.since_ns >= config.at_most_s * 1e9:
             return None
-        while self._trail and self._is_passed(pose, self._trail[-1]):
+        while self._trail and _beyond_m(self._trail[-1], pose) < _AT_M:
             self._trail.pop()
         if not self._trail or _far_m(back.start, pose) >= config.distance_m:
             return None
-        before = pose.inverse() @ self._trail[-1]
-        vx_mps = -min(max(-before.x_m, 0.0) / _REACH_S, speed_mps)
+        turn_rad = wrap_angle(self._behind(pose).theta_rad - pose.theta_rad)
         most = config.turn_radps * scale
-        wz_radps = min(max(before.theta_rad / _REACH_S, -most), most)
-        return VelocityCommand(vx_mps, 0.0, wz_radps, wanted.target, BACKING_OFF)
+        wz_radps = min(max(turn_rad / _REACH_S, -most), most)
+        return VelocityCommand(
+            -speed_mps if abs(turn_rad) < _TURN_RAD else 0.0, 0.0, wz_radps, wanted.target, BACKING_OFF
+        )
 
-    @staticmethod
-    def _is_passed(pose: SE2, before: SE2) -> bool:
-        """Whether nothing of the way to a pose of the trail is left: neither to go back, nor to turn."""
-        there = pose.inverse() @ before
-        return there.x_m > -_AT_M and abs(there.theta_rad) < _AT_RAD
+    def _behind(self, pose: SE2) -> SE2:
+        """The newest pose of the trail that is a look back away, or the oldest that there is."""
+        return next((each for each in reversed(self._trail) if _beyond_m(each, pose) >= _LOOK_BACK_M), self._trail[0])
+
+
+def _beyond_m(before: SE2, pose: SE2) -> float:
+    """How far a pose lies ahead of another one, as that one looks."""
+    return (before.inverse() @ pose).x_m
 
 
 def _far_m(a: SE2, b: SE2) -> float:
