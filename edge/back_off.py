@@ -127,10 +127,8 @@ class BackOff:
         told.far_m += wanted.vx_mps * elapsed_s
         if told.for_s < config.after_s or told.far_m < config.told_m:
             return False
-        if _far_m(told.start, pose) >= config.share * told.far_m:
-            self._told = _Told(pose)
-            return False
-        return self._attempts < config.attempts
+        self._told = _Told(pose)  # each stretch is judged by itself: who comes free is not held by what was before
+        return _far_m(told.start, pose) < config.share * told.far_m and self._attempts < config.attempts
 
     def _begin(self, pose: SE2, now_ns: int) -> None:
         self._back = _Back(pose, now_ns, pose, now_ns)

@@ -152,6 +152,14 @@ def test_where_it_cannot_go_back_either_it_gives_up_in_a_second_and_tries_three_
     assert tries == 3 and run.said.count(BACKING_OFF) <= 3 * 11
 
 
+def test_who_comes_free_after_all_tries_is_not_sent_back() -> None:
+    run = Run(wall_at(1.0))
+    run.go(900, STRAIGHT)
+    run.moves, before = glide, run.said.count(BACKING_OFF)
+    run.go(100, STRAIGHT)
+    assert run.said.count(BACKING_OFF) == before and run.pose.x_m > 4.0
+
+
 def test_elsewhere_it_tries_again() -> None:
     run = Run(wall_at(1.0))
     run.go(600, STRAIGHT)
