@@ -207,6 +207,22 @@ def test_frames_near_turns_goals_and_people_are_drawn_more_often(tmp_path: Path)
     np.testing.assert_allclose(DriveFrames.of(policys, 30, config).weight, 11.0 * weight)
 
 
+def test_frames_of_one_that_stands_and_should_not_are_drawn_more_often() -> None:
+    drive = side_drive("left-a")
+    state, future = drive.state.copy(), drive.future.copy()
+    state[:], future[:] = (0.5, 0.0, 0.0), 0.0
+    state[20:50] = 0.0
+    future[25:, :, 0] = np.linspace(0.0, 1.0, 50)
+    future[40:, :, 0] = 0.0
+    future[45, :, 2] = np.linspace(0.0, 1.5, 50)
+    weight = DriveFrames.of(
+        dataclasses.replace(drive, state=state, future=future, future_steps=np.full_like(drive.future_steps, 50)),
+        30, dataclasses.replace(EVEN, stuck=4.0),
+    ).weight  # fmt: skip
+    # It stands from frame 20 on, so for a second from frame 30 on; it is led on until 40, and turned on the spot at 45.
+    assert set(np.flatnonzero(weight == 4.0)) == {*range(30, 40), 45} and set(weight) == {1.0, 4.0}
+
+
 def test_a_robot_that_stands_in_its_first_frame_has_stood_there_before(dataset: Dataset) -> None:
     samples = of(dataset, dataclasses.replace(PLAIN, standing_start=1.0))
     stood = 0

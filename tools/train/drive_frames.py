@@ -20,6 +20,7 @@ TURN_RAD: Final = 0.5
 _LABEL_STEPS: Final = 30
 _STANDS: Final = 0.1  # m/s and rad/s
 _BACKS_OFF_M: Final = 0.05
+_LEADS_M: Final = 0.3
 
 
 class DriveFramesError(ValueError):
@@ -41,9 +42,11 @@ class WeightConfig:
     """Something other than the expert commands within the next 5 s, so that the label leads back."""
     policy: float = 1.0
     """Its drive is a policy's (DAgger)."""
+    stuck: float = 1.0
+    """It has stood for a second and its label does not: a policy that sees this too seldom stands for good."""
 
     def __post_init__(self) -> None:
-        factors = (self.turn, self.people, self.goal, self.recovery, self.policy)
+        factors = (self.turn, self.people, self.goal, self.recovery, self.policy, self.stuck)
         if not all(0 < factor <= 100 for factor in factors) or not 0 <= self.goal_m <= 100:
             raise ValueError("expected factors above 0, up to 100, and goal_m from 0 to 100")
 
@@ -135,7 +138,17 @@ def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> 
         (near, config.goal),
         (led_back, config.recovery),
         (drive.about.driver.startswith(POLICY_DRIVER), config.policy),
+        (_stuck(drive.state, future), config.stuck),
     ):
         weight[np.broadcast_to(holds, weight.shape)] *= factor
     weight[drive.future_steps < LEAST_KNOWN] = 0.0
     return weight
+
+
+def _stuck(state: NDArray[np.float32], future: Array) -> NDArray[np.bool_]:
+    """[N]: frames before which the robot has stood for a second, and from which the label leads away within 3 s."""
+    moves = np.append(0, np.cumsum((np.hypot(*state[:, :2].T) >= _STANDS) | (np.abs(state[:, 2]) >= _STANDS)))
+    ks = np.arange(len(state))
+    stood = (ks >= RATE_HZ) & (moves[ks + 1] == moves[np.maximum(ks - RATE_HZ, 0)])
+    leads = np.hypot(*future[:, _LABEL_STEPS - 1, :2].T) >= _LEADS_M
+    return stood & (leads | (np.abs(future[:, _LABEL_STEPS - 1, 2]) > TURN_RAD))
