@@ -24,6 +24,7 @@ _TRAIL_M, _TRAIL_RAD = 0.05, 0.1  # between two poses of the trail
 _TRAIL: Final = 60  # poses
 _AT_M, _AT_RAD = 0.03, 0.1  # who has come no further, or turned no further, has not moved
 _LOOK_BACK_M: Final = 0.15  # it turns to how it looked there
+_VAIN_M: Final = 0.1  # who has not come so far back could not go back
 _TURN_RAD: Final = 0.6  # before it goes back
 _REACH_S: Final = 0.5  # in which it would have turned, but for the limits
 
@@ -44,14 +45,18 @@ class BackOffConfig:
     at_most_s: float = 3.0
     stands_s: float = 1.0
     """A way back on which odometry sees nothing for so long is given up."""
-    attempts: int = 3
+    further: int = 3
+    """Held at one place again it goes back twice as far, then so many times as far, and so on."""
+    vain: int = 3
+    """Tries at one place on which it could not go back either: then it is let be."""
     apart_m: float = 1.0
-    """Tries until it has come so far from where it first was held."""
+    """So far from where it first was held is another place."""
 
     def __post_init__(self) -> None:
         numbers = (
             self.after_s, self.told_m, self.share, self.speed_mps, self.turn_radps, self.distance_m, self.at_most_s,
-            self.stands_s, self.attempts, self.apart_m,
+            self.stands_s, self.further, self.vain,
+            self.apart_m,
         )  # fmt: skip
         if self.vx_min_mps > 0 or min(numbers) <= 0 or self.share >= 1:
             raise ValueError(f"back-off: expected vx_min_mps of 0 or below, share below 1, all above 0, found {self}")
@@ -68,12 +73,15 @@ class _Told:
 
 @dataclass
 class _Back:
-    """A way back under way."""
+    """A way back under way; `times` as far as the first."""
 
     start: SE2
     since_ns: int
+    times: int
     last: SE2
     moved_ns: int
+    asked: bool = False
+    """It was sent back: that the plan stands does not end it."""
 
 
 class BackOff:
@@ -85,7 +93,7 @@ class BackOff:
         self._told: _Told | None = None
         self._back: _Back | None = None
         self._held_at: SE2 | None = None
-        self._attempts = 0
+        self._tries = self._in_vain = 0
         self._last_ns: int | None = None
 
     def step(
@@ -106,9 +114,16 @@ class BackOff:
             self._begin(T_odom_base, now_ns)
         command = self._way_back(wanted, T_odom_base, now_ns, speed_mps, scale)
         if command is None:
+            self._in_vain += self._back is not None and _far_m(self._back.start, T_odom_base) < _VAIN_M
             self._told = self._back = None
             return wanted
         return command
+
+    def send_back(self, T_odom_base: SE2, now_ns: int) -> None:  # a pose's name
+        """Begin a way back though nothing has been told in vain, unless it cannot go back here either."""
+        self._forget_if_apart(T_odom_base)
+        if self._back is None and self._in_vain < self._config.vain:
+            self._begin(T_odom_base, now_ns, asked=True)
 
     def _remember(self, pose: SE2) -> None:
         if not self._trail or _gap(self._trail[-1], pose, _TRAIL_M, _TRAIL_RAD) >= 1.0:
@@ -116,8 +131,7 @@ class BackOff:
 
     def _is_wedged(self, wanted: VelocityCommand, pose: SE2, elapsed_s: float) -> bool:
         config = self._config
-        if self._held_at is not None and _far_m(self._held_at, pose) > config.apart_m:
-            self._held_at, self._attempts = None, 0
+        self._forget_if_apart(pose)
         if wanted.vx_mps <= 0.0:
             return False
         if self._told is None:
@@ -128,27 +142,36 @@ class BackOff:
         if told.for_s < config.after_s or told.far_m < config.told_m:
             return False
         self._told = _Told(pose)  # each stretch is judged by itself: who comes free is not held by what was before
-        return _far_m(told.start, pose) < config.share * told.far_m and self._attempts < config.attempts
+        return _far_m(told.start, pose) < config.share * told.far_m and self._in_vain < config.vain
 
-    def _begin(self, pose: SE2, now_ns: int) -> None:
-        self._back = _Back(pose, now_ns, pose, now_ns)
+    def _forget_if_apart(self, pose: SE2) -> None:
+        if self._held_at is not None and _far_m(self._held_at, pose) > self._config.apart_m:
+            self._held_at, self._tries, self._in_vain = None, 0, 0
+
+    def _begin(self, pose: SE2, now_ns: int, *, asked: bool = False) -> None:
+        self._tries += 1
+        self._back = _Back(pose, now_ns, min(self._tries, self._config.further), pose, now_ns, asked)
         self._held_at = self._held_at or pose
-        self._attempts += 1
 
     def _way_back(
         self, wanted: VelocityCommand, pose: SE2, now_ns: int, speed_mps: float, scale: float
     ) -> VelocityCommand | None:
         """Towards the pose before, or None where the way back ends."""
         config, back = self._config, self._back
-        if back is None or wanted.target is None or hypot(wanted.target.x_m, wanted.target.y_m) < _TRAIL_M:
+        if back is None or wanted.target is None:
+            return None
+        if not back.asked and hypot(wanted.target.x_m, wanted.target.y_m) < _TRAIL_M:
             return None
         if _gap(back.last, pose, _AT_M, _AT_RAD) >= 1.0:
             back.last, back.moved_ns = pose, now_ns
-        if now_ns - back.moved_ns >= config.stands_s * 1e9 or now_ns - back.since_ns >= config.at_most_s * 1e9:
+        if (
+            now_ns - back.moved_ns >= config.stands_s * 1e9
+            or now_ns - back.since_ns >= back.times * config.at_most_s * 1e9
+        ):
             return None
         while self._trail and _beyond_m(self._trail[-1], pose) < _AT_M:
             self._trail.pop()
-        if not self._trail or _far_m(back.start, pose) >= config.distance_m:
+        if not self._trail or _far_m(back.start, pose) >= back.times * config.distance_m:
             return None
         turn_rad = wrap_angle(self._behind(pose).theta_rad - pose.theta_rad)
         most = config.turn_radps * scale

@@ -18,6 +18,7 @@ from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
 from edge.geometry import SE2
 from edge.graph import GraphError
+from edge.guidance import waypoints_now
 from edge.monitors.watch import Watch, WatchConfig
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
@@ -25,6 +26,7 @@ from edge.reasoning_loop import SemanticSlot
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
+from edge.stalemate import TURNING, Stalemate, StalemateConfig
 from edge.stats import Samples
 from edge.supervisor import FaultEvent, State, Supervisor, SupervisorInputs, SupervisorOutputs
 from firmware_bridge.client import BridgeStatus
@@ -63,7 +65,7 @@ class ControlStatistics:
     """|Δt measured for the action expert − (instant of its call − anchor)|."""
     unsent: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
-    """Ticks by what decided their velocity: "ok", the reason for zero, or BACKING_OFF."""
+    """Ticks by what decided their velocity: "ok", the reason for zero, BACKING_OFF or TURNING."""
     faults: dict[str, int] = field(default_factory=dict)
     """How often each fault of the table was raised."""
 
@@ -97,7 +99,9 @@ class ControlLoop:
         """
         self._policy = policy
         self._controller = controller
-        self._back_off = BackOff(BackOffConfig(controller.config.limits.vx_min_mps))
+        limits = controller.config.limits
+        self._back_off = BackOff(BackOffConfig(limits.vx_min_mps))
+        self._stalemate = Stalemate(StalemateConfig(limits.wz_max_radps))
         self._newest_frame = newest_frame
         self._history = history
         self._ring = ring
@@ -194,14 +198,15 @@ class ControlLoop:
             speed_scale=self.supervision.speed_scale,
             hold=self._hold(acted_ns),
         )
-        command = self._back_off.step(
-            self._controller.step(inputs, acted_ns),
-            None if pose is None else pose.T_odom_base,
-            acted_ns,
-            inputs.speed_scale,
+        T_odom_base = None if pose is None else pose.T_odom_base
+        command, send_back = self._stalemate.step(
+            self._controller.step(inputs, acted_ns), _meant(semantic, offset), T_odom_base, acted_ns, inputs.speed_scale
         )
-        if command.reason == BACKING_OFF:
-            self._controller.halt(BACKING_OFF)  # what comes after it speeds up from standing
+        if send_back and T_odom_base is not None:
+            self._back_off.send_back(T_odom_base, acted_ns)
+        command = self._back_off.step(command, T_odom_base, acted_ns, inputs.speed_scale)
+        if command.reason in (BACKING_OFF, TURNING):
+            self._controller.halt(command.reason)  # what comes after it speeds up from standing
         self._send(command)
         end_ns = self._clock()
         self._last_tick_ns = end_ns - deadline_ns
@@ -337,3 +342,11 @@ class ControlLoop:
             return None
         every = max(1, round(TARGET_TIME_S / self._step_s))
         return [[float(v) for v in row] for row in trajectory[every - 1 :: every]]
+
+
+def _meant(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
+    """The waypoints that were said last, [points, 2], m in the robot's frame now."""
+    if semantic is None or semantic.waypoints is None or offset is None:
+        return None
+    points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
+    return points

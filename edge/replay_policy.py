@@ -24,6 +24,7 @@ from edge.reasoning_text import parse_waypoints
 from edge.replay_records import Event, RecordedFrame, RecordedGeneration, RecordedRun, RecordedTick, Rows
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState
+from edge.stalemate import TURNING
 from firmware_bridge.unitree.client import CameraError
 
 FRAMES_KEPT_NS = 120_000_000_000
@@ -238,7 +239,7 @@ class Replayer:
         inputs = ControllerInputs(trajectory, 0.0, 0.0, speed_scale=tick.speed_scale, hold=hold)
         command = self._controller.step(inputs, tick.acted_ns)
         self._command_known = self._command_known or hold is not None
-        # A way back is of what odometry saw while it was driven, not of the plan.
-        if self._command_known and tick.reason != BACKING_OFF:
+        # A way back, or a turn to what was said, is of what odometry saw meanwhile, not of the plan.
+        if self._command_known and tick.reason not in (BACKING_OFF, TURNING):
             apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
             self.comparison.command.append(float(np.abs(apart).max()))

@@ -152,21 +152,41 @@ def test_where_it_cannot_go_back_either_it_gives_up_in_a_second_and_tries_three_
     assert tries == 3 and run.said.count(BACKING_OFF) <= 3 * 11
 
 
-def test_who_comes_free_after_all_tries_is_not_sent_back() -> None:
+def ways_back_m(run: Run) -> list[float]:
+    """How far it went on each way back."""
+    ways, start = [], run.poses[0]
+    for k, (before, now) in enumerate(zip(run.said, run.said[1:], strict=False)):
+        if before != BACKING_OFF == now:
+            start = run.poses[k + 1]
+        if before == BACKING_OFF != now:
+            ways.append(hypot(run.poses[k + 1].x_m - start.x_m, run.poses[k + 1].y_m - start.y_m))
+    return ways
+
+
+def test_held_again_at_one_place_it_goes_further_back_up_to_three_times_as_far() -> None:
+    run = Run(wall_at(2.0))
+    run.go(900, STRAIGHT)
+    assert ways_back_m(run)[:5] == pytest.approx([0.3, 0.6, 0.9, 0.9, 0.9], abs=0.05)
+
+
+def test_who_comes_free_is_not_sent_back() -> None:
     run = Run(wall_at(1.0))
     run.go(900, STRAIGHT)
+    while run.said[-1] == BACKING_OFF:
+        run.go(1, STRAIGHT)
     run.moves, before = glide, run.said.count(BACKING_OFF)
     run.go(100, STRAIGHT)
     assert run.said.count(BACKING_OFF) == before and run.pose.x_m > 4.0
 
 
-def test_elsewhere_it_tries_again() -> None:
+def test_elsewhere_it_tries_again_as_at_first() -> None:
     run = Run(wall_at(1.0))
-    run.go(600, STRAIGHT)
-    before = run.said.count(BACKING_OFF)
-    run.moves = wall_at(3.0)
     run.go(300, STRAIGHT)
-    assert run.said.count(BACKING_OFF) > before
+    run.moves = lambda pose, _: pose
+    run.go(600, STRAIGHT)
+    run.moves, before = wall_at(3.0), len(ways_back_m(run))
+    run.go(300, STRAIGHT)
+    assert ways_back_m(run)[before] == pytest.approx(0.3, abs=0.05)
 
 
 def test_without_a_pose_nothing_is_known_of_a_wedge() -> None:
