@@ -80,8 +80,6 @@ class _Back:
     times: int
     last: SE2
     moved_ns: int
-    asked: bool = False
-    """It was sent back: that the plan stands does not end it."""
 
 
 class BackOff:
@@ -105,7 +103,7 @@ class BackOff:
         scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
         speed_mps = min(self._config.speed_mps, -self._config.vx_min_mps) * scale
         if T_odom_base is None or wanted.reason != OK or speed_mps <= 0:
-            self._back = None
+            self._end(T_odom_base)
             return wanted
         if self._back is None:
             self._remember(T_odom_base)
@@ -114,16 +112,10 @@ class BackOff:
             self._begin(T_odom_base, now_ns)
         command = self._way_back(wanted, T_odom_base, now_ns, speed_mps, scale)
         if command is None:
-            self._in_vain += self._back is not None and _far_m(self._back.start, T_odom_base) < _VAIN_M
-            self._told = self._back = None
+            self._end(T_odom_base)
+            self._told = None
             return wanted
         return command
-
-    def send_back(self, T_odom_base: SE2, now_ns: int) -> None:  # a pose's name
-        """Begin a way back though nothing has been told in vain, unless it cannot go back here either."""
-        self._forget_if_apart(T_odom_base)
-        if self._back is None and self._in_vain < self._config.vain:
-            self._begin(T_odom_base, now_ns, asked=True)
 
     def _remember(self, pose: SE2) -> None:
         if not self._trail or _gap(self._trail[-1], pose, _TRAIL_M, _TRAIL_RAD) >= 1.0:
@@ -131,7 +123,8 @@ class BackOff:
 
     def _is_wedged(self, wanted: VelocityCommand, pose: SE2, elapsed_s: float) -> bool:
         config = self._config
-        self._forget_if_apart(pose)
+        if self._held_at is not None and _far_m(self._held_at, pose) > config.apart_m:
+            self._held_at, self._tries, self._in_vain = None, 0, 0
         if wanted.vx_mps <= 0.0:
             return False
         if self._told is None:
@@ -144,13 +137,14 @@ class BackOff:
         self._told = _Told(pose)  # each stretch is judged by itself: who comes free is not held by what was before
         return _far_m(told.start, pose) < config.share * told.far_m and self._in_vain < config.vain
 
-    def _forget_if_apart(self, pose: SE2) -> None:
-        if self._held_at is not None and _far_m(self._held_at, pose) > self._config.apart_m:
-            self._held_at, self._tries, self._in_vain = None, 0, 0
+    def _end(self, pose: SE2 | None) -> None:
+        if self._back is not None:
+            self._in_vain += pose is None or _far_m(self._back.start, pose) < _VAIN_M
+        self._back = None
 
-    def _begin(self, pose: SE2, now_ns: int, *, asked: bool = False) -> None:
+    def _begin(self, pose: SE2, now_ns: int) -> None:
         self._tries += 1
-        self._back = _Back(pose, now_ns, min(self._tries, self._config.further), pose, now_ns, asked)
+        self._back = _Back(pose, now_ns, min(self._tries, self._config.further), pose, now_ns)
         self._held_at = self._held_at or pose
 
     def _way_back(
@@ -158,9 +152,7 @@ class BackOff:
     ) -> VelocityCommand | None:
         """Towards the pose before, or None where the way back ends."""
         config, back = self._config, self._back
-        if back is None or wanted.target is None:
-            return None
-        if not back.asked and hypot(wanted.target.x_m, wanted.target.y_m) < _TRAIL_M:
+        if back is None or wanted.target is None or hypot(wanted.target.x_m, wanted.target.y_m) < _TRAIL_M:
             return None
         if _gap(back.last, pose, _AT_M, _AT_RAD) >= 1.0:
             back.last, back.moved_ns = pose, now_ns

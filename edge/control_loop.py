@@ -23,6 +23,7 @@ from edge.monitors.watch import Watch, WatchConfig
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_loop import SemanticSlot
+from edge.reasoning_text import means_to_wait
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
@@ -199,11 +200,9 @@ class ControlLoop:
             hold=self._hold(acted_ns),
         )
         T_odom_base = None if pose is None else pose.T_odom_base
-        command, send_back = self._stalemate.step(
+        command = self._stalemate.step(
             self._controller.step(inputs, acted_ns), _meant(semantic, offset), T_odom_base, acted_ns, inputs.speed_scale
         )
-        if send_back and T_odom_base is not None:
-            self._back_off.send_back(T_odom_base, acted_ns)
         command = self._back_off.step(command, T_odom_base, acted_ns, inputs.speed_scale)
         if command.reason in (BACKING_OFF, TURNING):
             self._controller.halt(command.reason)  # what comes after it speeds up from standing
@@ -345,8 +344,8 @@ class ControlLoop:
 
 
 def _meant(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
-    """The waypoints that were said last, [points, 2], m in the robot's frame now."""
-    if semantic is None or semantic.waypoints is None or offset is None:
+    """The waypoints that were said last, [points, 2], m in the robot's frame now; None of words that mean to wait."""
+    if semantic is None or semantic.waypoints is None or offset is None or means_to_wait(semantic.text):
         return None
     points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
     return points

@@ -18,6 +18,9 @@ FARTHEST_M = 99.9
 """What is written of a waypoint that is farther."""
 MAX_COUNT = 99
 """Of turns and of openings that are counted."""
+PLAN_HEAD = "Plan: "
+WAIT = "wait, then "
+"""What a plan begins with that lets somebody pass first; the waypoints say where to go all the same."""
 PROGRESS_HEAD = "Progress: "
 MAX_PROGRESS_CHARS = len("last leg of 99, passed 99.")
 
@@ -66,6 +69,12 @@ def parse_waypoints(text: str) -> Waypoints | None:
         return None
     values = [float(group) for group in match.groups()]
     return tuple(zip(values[::2], values[1::2], strict=True))
+
+
+def means_to_wait(text: str) -> bool:
+    """Whether the text's plan begins with waiting."""
+    lines = text[:MAX_TEXT_CHARS].split("\n")
+    return any(line.startswith(PLAN_HEAD + WAIT) for line in lines)
 
 
 def format_waypoints(waypoints: Waypoints) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from edge.back_off import BACKING_OFF
@@ -9,7 +12,8 @@ from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
 from edge.geometry import SE2
 from edge.pose_history import StampedPose
-from tests.control_bench import PERIOD_NS, Bench
+from edge.stalemate import TURNING
+from tests.control_bench import LIMITS, PERIOD_NS, Bench
 
 
 @pytest.fixture
@@ -199,3 +203,32 @@ def test_a_robot_that_is_driven_and_does_not_come_on_goes_back_and_speeds_up_fro
     assert all(-0.2 <= speed <= 0.0 for speed, reason in said if reason == BACKING_OFF)
     assert bench.loop.statistics.reasons[BACKING_OFF] == reasons.count(BACKING_OFF) >= 10
     assert set(reasons[:first]) == {"ok"} and said[after][0] > 0
+
+
+def stand_and_hear(bench: Bench, text: str, ticks: int) -> list[tuple[str, float]]:
+    """A robot that has stood since it came to (1 m, 0), after words that were said at (0, 0): reasons and yaw rates."""
+    bench.policy.step, theta_rad, said = (0.0, 0.0, 0.0), 0.0, []
+    for k in range(ticks):
+        bench.history.put(StampedPose(bench.now_ns, SE2(1.0, 0.0, theta_rad), 0.0, 0.0, 0.0))
+        bench.look()
+        bench.think(k // 20, x_m=0.0, text=text)
+        _, reason = bench.tick()
+        said.append((reason, bench.sink.commands[-1][2]))
+        theta_rad += 0.1 * said[-1][1]
+    return said
+
+
+def test_a_robot_whose_plan_stands_turns_to_where_its_words_lead_and_speeds_up_from_standing() -> None:
+    bench = Bench(limits=dataclasses.replace(LIMITS, accel_mps2=1.0))
+    said = stand_and_hear(bench, "Plan: go on.\nwaypoints: (1.0, -1.0) (1.0, -2.0) (1.0, -4.0)", 100)
+    reasons = [reason for reason, _ in said]
+    assert reasons.index(TURNING) == pytest.approx(50, abs=1) and set(reasons) == {"ok", TURNING}
+    assert sum(rate for _, rate in said) * 0.1 == pytest.approx(-np.pi / 2, abs=0.2)
+    bench.policy.step = (0.05, 0.0, 0.0)
+    bench.see(x_m=1.0)
+    assert bench.tick() == (pytest.approx(0.1), "ok")
+
+
+def test_words_that_wait_for_somebody_let_it_stand() -> None:
+    text = "Plan: wait, then turn right.\nwaypoints: (1.0, -1.0) (1.0, -2.0) (1.0, -4.0)"
+    assert {reason for reason, _ in stand_and_hear(Bench(), text, 100)} == {"ok"}

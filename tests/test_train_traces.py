@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge.geometry import SE2
-from edge.reasoning_text import Progress, parse_progress, parse_waypoints
+from edge.reasoning_text import WAIT, Progress, parse_progress, parse_waypoints
 from sim_hil.camera import CameraWorld
 from sim_hil.people import RENDER_FIELDS, People
 from sim_hil.scene import Scene
@@ -66,7 +66,7 @@ def test_the_corpus_holds_every_name_place_and_way_of_moving() -> None:
     text = "\n".join(trace_words.corpus())
     phrases = [*trace_words.landmarks(), *trace_words.AREAS.values(), *trace_words.WAYS, trace_words.TURN_BACK]
     phrases += [trace_words.opening(kind) for kind in ("room", "corridor", "crossing")]
-    phrases += [trace_words.NOTHING, trace_words.NOBODY, trace_words.WAIT, "stop now", "cross ahead now"]
+    phrases += [trace_words.NOTHING, trace_words.NOBODY, WAIT, "stop now", "cross ahead now"]
     assert [phrase for phrase in phrases if phrase not in text] == []
 
 
@@ -145,9 +145,9 @@ def test_whoever_stands_before_somebody_waits() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(5.0, -0.2, 0.0)
     tracer, person, still = _tracer(scenario), _person(pose, 1.2, 0.0), np.zeros((1, 2))
-    assert tracer.trace(pose, person, still, [(0.1, 0.0)]).plan.startswith(trace_words.WAIT)
-    assert not tracer.trace(pose, person, still, AHEAD).plan.startswith(trace_words.WAIT)
-    assert not tracer.trace(pose, *NOBODY, [(0.1, 0.0)]).plan.startswith(trace_words.WAIT)
+    assert tracer.trace(pose, person, still, [(0.1, 0.0)]).plan.startswith(WAIT)
+    assert not tracer.trace(pose, person, still, AHEAD).plan.startswith(WAIT)
+    assert not tracer.trace(pose, *NOBODY, [(0.1, 0.0)]).plan.startswith(WAIT)
 
 
 def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> None:

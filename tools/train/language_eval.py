@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.reasoning_text import WAYPOINT_TIMES_S, Progress, parse_progress, parse_waypoints
+from edge.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, Progress, parse_progress, parse_waypoints
 from export.model.language import LanguageModel
 from tools.train import trace_words
 from tools.train.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
@@ -227,7 +227,7 @@ def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: 
 
 def side_of(text: str) -> str | None:
     """The side of the turn that the text plans: "left", "right"; None where it plans none."""
-    found = _SIDE.search(_line(text, trace_words.PLAN))
+    found = _SIDE.search(_line(text, PLAN_HEAD))
     return found.group() if found else None
 
 

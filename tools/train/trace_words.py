@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
-from edge.reasoning_text import PROGRESS_HEAD, Progress, format_progress, format_waypoints
+from edge.reasoning_text import PLAN_HEAD, PROGRESS_HEAD, WAIT, Progress, format_progress, format_waypoints
 
-SITUATION, OBJECTS, MOTION, PLAN = "Situation: ", "Objects: ", "Motion: ", "Plan: "
+SITUATION, OBJECTS, MOTION = "Situation: ", "Objects: ", "Motion: "
 MAX_WORDS: Final = 45  # of the five lines together
 MAX_RANGE_M: Final = 30
 MAX_THINGS: Final = 3
@@ -74,7 +74,7 @@ def stop(metres: float) -> str:
     return "stop now" if metres < 1.0 else f"stop in {distance(metres)}"
 
 
-WAIT, TURN_BACK = "wait, then ", "turn back"
+TURN_BACK: Final = "turn back"
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _lines(situation: str, objects: str, motion: str, progress: Progress, plan: 
     return "\n".join(
         (
             f"{SITUATION}{situation}.", f"{OBJECTS}{objects}.", f"{MOTION}{motion}.",
-            f"{PROGRESS_HEAD}{format_progress(progress)}", f"{PLAN}{plan}.",
+            f"{PROGRESS_HEAD}{format_progress(progress)}", f"{PLAN_HEAD}{plan}.",
         )
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2, wrap_angle
+from edge.reasoning_text import WAIT
 from sim_hil.benchmark.openings import Frame, Opening, bounds_of
 from sim_hil.benchmark.route import Step
 from sim_hil.benchmark.sights import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
@@ -99,7 +100,7 @@ class Tracer:
         if (step is not None and 0 < step.ordinal <= progress.passed) or x_m < _BACK_M:
             plan = words.TURN_BACK
         elif ahead and hypot(x_m, y_m) < _WAIT_M:
-            plan = words.WAIT + plan
+            plan = WAIT + plan
         motion = [
             words.person(_side(pose, people[index]), gap, _way(pose, people[index], velocities[index]))
             for index, gap in crowd[: words.MAX_PEOPLE]
