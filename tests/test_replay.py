@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from edge.back_off import BACKING_OFF
 from edge.camera import decode_frame
 from edge.controller import Controller, ControllerConfig, ControllerInputs
 from edge.geometry import SE2
@@ -24,6 +25,7 @@ from edge.recorder import Recorder
 from edge.replay import main
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState
+from edge.stalemate import TURNING
 from firmware_bridge.config import LimitsConfig
 from tests import synthetic_run
 
@@ -219,6 +221,13 @@ def test_another_command_than_the_controller_gives_is_found(log: Log) -> None:
     log.payload("/tick", 35)["command"] = [vx + 0.02, vy, wz]
     code, result = log.replay()
     assert code == 1 and result["command"]["max"] == pytest.approx(0.02, abs=1e-4)
+
+
+@pytest.mark.parametrize("reason", [BACKING_OFF, TURNING])
+def test_a_command_that_was_not_the_plans_is_not_compared(log: Log, reason: str) -> None:
+    log.payload("/tick", TICKS - 1).update(command=[0.0, 0.0, 0.5], reason=reason)
+    code, _ = log.replay()
+    assert code == 0
 
 
 def test_another_text_is_found(log: Log) -> None:
