@@ -224,7 +224,7 @@ class _Tour:
     ) -> None:  # fmt: skip
         episode, site = scenario.episode, scenario.site
         self._carriage, self._config, self._rng, self._site = carriage, config, rng, site
-        self._robot, self._goal = episode.robot, episode.goal_xy
+        self._robot, self._goal, self._task = episode.robot, episode.goal_xy, scenario.task
         self._near_m = collect.arrive_share * episode.threshold_m
         self._driving = driving_of(episode.robot)
         self._speed_mps = collect.speed_mps
@@ -251,9 +251,8 @@ class _Tour:
         """A way off the told one, and what leads there; None where it stays on it."""
         if float(self._rng.uniform()) >= self._config.stray_share:
             return None
-        length_m = self._tracer.progress.length_m
         for _ in range(_DECOYS):
-            detour = draw_detour(self._site, self._robot, length_m, self._config.stray_m, self._rng)
+            detour = draw_detour(self._site, self._robot, self._task, self._config.stray_m, self._rng)
             planner = None if detour is None else self._planner_to(detour.to, 0.5)
             if detour is not None and planner is not None and planner.reachable(*self._here):
                 self._left_s += 2 * detour.for_m / _ALLOWED_MPS

@@ -41,7 +41,8 @@ class CollectConfig:
     comes to rest, is to be learned as well."""
     stray_share: float = 0.0
     stray_m: float = 6.0
-    """Drives of the expert that leave their way for some other place, for up to so far, and come back."""
+    """Drives of the expert that leave their way and come back: as a rule for an opening near the one that is to be
+    taken, else for some other place, up to so far."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:

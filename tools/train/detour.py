@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot
 from typing import Final
@@ -12,8 +13,9 @@ from edge.geometry import SE2
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
-from sim_hil.benchmark.route import RouteError
-from sim_hil.benchmark.tasks import draw_start
+from sim_hil.benchmark.openings import LINEAR, Frame, Opening, bounds_of, side_openings
+from sim_hil.benchmark.route import RouteError, Step
+from sim_hil.benchmark.tasks import Task, draw_start
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import Vec2
 from tools.train.sites import Site
@@ -22,6 +24,13 @@ from tools.train.steering import Velocity
 _LATEST: Final = 0.8  # of the way is behind it at most where it leaves it
 _LEAST_M: Final = 1.0
 _NEAR_M: Final = 1.0  # to the other place, where it turns back at the latest
+_MISTAKEN: Final = 0.6  # of detours are into a wrong opening, where there is one
+_INTO_M: Final = 2.0  # so deep it goes into one before it turns back
+_BEFORE_M: Final = 1.5  # of the mouth, or of where the way turns off before it, it leaves the way
+_GRAIN_M: Final = 0.1
+_NEARBY_M: Final = 8.0  # from the one that is to be taken
+_SAME_M: Final = 1.0
+_NEXT_M: Final = 15.0  # the one counted next to it may be farther away
 
 
 @dataclass(frozen=True)
@@ -33,14 +42,71 @@ class Detour:
     for_m: float
 
 
-def draw_detour(site: Site, robot: str, length_m: float, most_m: float, rng: np.random.Generator) -> Detour | None:
-    """A detour of up to `most_m` from a way of `length_m`; None where no place was found."""
-    where, far = (float(value) for value in rng.uniform(size=2))
+def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.random.Generator) -> Detour | None:
+    """A detour from a task's way: into a wrong opening, as who has miscounted takes, or up to `most_m` to anywhere.
+
+    None where no place was found.
+    """
+    mistaken, where, far = (float(value) for value in rng.uniform(size=3))
+    if mistaken < _MISTAKEN and (found := wrong_opening(site, robot, task, rng)) is not None:
+        return found
     try:
         x, y, _ = draw_start(site.scene, site.robot_grid(robot), rng)
     except RouteError:
         return None
-    return Detour((x, y), where * _LATEST * length_m, _LEAST_M + far * (most_m - _LEAST_M))
+    return Detour((x, y), where * _LATEST * task.told.length_m, _LEAST_M + far * (most_m - _LEAST_M))
+
+
+def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) -> Detour | None:
+    """Into some other opening near one that is to be taken."""
+    choices = [(step, opening) for step in task.told.steps for opening in _others(site, step)]
+    if not choices:
+        return None
+    step, opening = choices[int(rng.integers(len(choices)))]
+    frame, sign = Frame(step.ahead), 1.0 if opening.side == "left" else -1.0
+    middle_m, across_m = opening.middle_m, frame.across(step.at)
+    mouth = frame.point(middle_m, across_m)
+    low_m, high_m = frame.span(bounds_of(opening.area))[1]
+    # A passage that is crossed begins on the other side already.
+    edge_m = max(low_m, across_m) if sign > 0 else min(high_m, across_m)
+    depth_m = high_m - edge_m if sign > 0 else edge_m - low_m
+    inside = frame.point(middle_m, edge_m + sign * min(_INTO_M + _NEAR_M, 0.7 * depth_m))
+    to = site.robot_grid(robot).nearest_free(*inside)
+    if to is None or not opening.area.contains(*to):
+        return None
+    along_m, (x, y) = _nearest_on(task.path, mouth)
+    return Detour(to, max(along_m - _BEFORE_M, 0.0), _BEFORE_M + 1.5 * hypot(to[0] - x, to[1] - y))
+
+
+def _others(site: Site, step: Step) -> list[Opening]:
+    """Openings that a step's is mistaken for: those counted next to it, and any to the sides not far from it."""
+    frame = Frame(step.ahead)
+    at_m, across_m = frame.along(step.at), frame.across(step.at)
+    found = [
+        opening
+        for number, opening in enumerate(step.counted, start=1)
+        if abs(number - step.ordinal) == 1 and abs(opening.middle_m - at_m) <= _NEXT_M
+    ]
+    before = frame.point(at_m - _GRAIN_M, across_m)
+    followed = [area for area in site.scene.areas if area.kind in LINEAR and area.contains(*before)][:1]
+    for side in ("left", "right") if followed else ():
+        for opening in side_openings(site.scene, site.grid, frame, followed, [], side):
+            past_m = opening.middle_m - at_m
+            taken = side == step.side and abs(past_m) < _SAME_M
+            if not taken and -min(step.before_m, _NEARBY_M) <= past_m <= _NEARBY_M:
+                found.append(opening)
+    return found
+
+
+def _nearest_on(path: Sequence[Vec2], point: Vec2) -> tuple[float, Vec2]:
+    """How far along a path its point nearest to another one is, m, and which that is."""
+    corners = np.array(path, np.float64)
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    marks = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = np.append(np.arange(0.0, marks[-1], _GRAIN_M), marks[-1])
+    xs, ys = (np.interp(at, marks, corners[:, axis]) for axis in range(2))
+    nearest = int(np.argmin(np.hypot(xs - point[0], ys - point[1])))
+    return float(at[nearest]), (float(xs[nearest]), float(ys[nearest]))
 
 
 class Course:

@@ -24,9 +24,9 @@ class TourConfig:
     people_most: int = 20
     """More people than these a scene never has: they hide what is spoken of, and take their time to be moved."""
     stray_share: float = 0.35
-    """Tours that leave their way somewhere, for some other place, and come back to it."""
+    """Tours that leave their way, as a rule for an opening near theirs, else for some other place, and come back."""
     stray_m: float = 8.0
-    """So far they are carried there at most."""
+    """So far they are carried to some other place at most."""
     linger_s: float = 5.0
     """A tour goes on for up to so long after it has arrived, half of it at least: on to the goal, where it stands."""
 

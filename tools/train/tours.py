@@ -21,7 +21,7 @@ from tools.train.job import StageProgress
 from tools.train.tour_config import TourConfig
 
 FOLDER: Final = "tours"
-FORMAT: Final = 2
+FORMAT: Final = 3
 PREFIX: Final = "w"
 _TURN: Final = 500  # of collections: rounds of DAgger take those from 0 on, their experts those from 1000 on
 _OF_DRIVES: Final = frozenset(  # what a tour has in common with the drives beside it
