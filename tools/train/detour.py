@@ -74,7 +74,8 @@ def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) 
     to = site.robot_grid(robot).nearest_free(*inside)
     if to is None or not opening.area.contains(*to):
         return None
-    along_m, (x, y) = _nearest_on(task.path, mouth)
+    # One that comes after the right one is missed by passing that, not by leaving where it leads.
+    along_m, (x, y) = min(_nearest_on(task.path, mouth), _nearest_on(task.path, step.at))
     return Detour(to, max(along_m - _BEFORE_M, 0.0), _BEFORE_M + 1.5 * hypot(to[0] - x, to[1] - y))
 
 
