@@ -123,7 +123,7 @@ class BackOff:
 
     def _is_wedged(self, wanted: VelocityCommand, pose: SE2, elapsed_s: float) -> bool:
         config = self._config
-        if self._held_at is not None and _far_m(self._held_at, pose) > config.apart_m:
+        if self._held_at is not None and far_m(self._held_at, pose) > config.apart_m:
             self._held_at, self._tries, self._in_vain = None, 0, 0
         if wanted.vx_mps <= 0.0:
             return False
@@ -135,11 +135,11 @@ class BackOff:
         if told.for_s < config.after_s or told.far_m < config.told_m:
             return False
         self._told = _Told(pose)  # each stretch is judged by itself: who comes free is not held by what was before
-        return _far_m(told.start, pose) < config.share * told.far_m and self._in_vain < config.vain
+        return far_m(told.start, pose) < config.share * told.far_m and self._in_vain < config.vain
 
     def _end(self, pose: SE2 | None) -> None:
         if self._back is not None:
-            self._in_vain += pose is None or _far_m(self._back.start, pose) < _VAIN_M
+            self._in_vain += pose is None or far_m(self._back.start, pose) < _VAIN_M
         self._back = None
 
     def _begin(self, pose: SE2, now_ns: int) -> None:
@@ -163,7 +163,7 @@ class BackOff:
             return None
         while self._trail and _beyond_m(self._trail[-1], pose) < _AT_M:
             self._trail.pop()
-        if not self._trail or _far_m(back.start, pose) >= back.times * config.distance_m:
+        if not self._trail or far_m(back.start, pose) >= back.times * config.distance_m:
             return None
         turn_rad = wrap_angle(self._behind(pose).theta_rad - pose.theta_rad)
         most = config.turn_radps * scale
@@ -182,10 +182,11 @@ def _beyond_m(before: SE2, pose: SE2) -> float:
     return (before.inverse() @ pose).x_m
 
 
-def _far_m(a: SE2, b: SE2) -> float:
+def far_m(a: SE2, b: SE2) -> float:
+    """Metres from one pose to another."""
     return hypot(b.x_m - a.x_m, b.y_m - a.y_m)
 
 
 def _gap(a: SE2, b: SE2, one_m: float, one_rad: float) -> float:
     """How far apart two poses are, in the larger of two units."""
-    return max(_far_m(a, b) / one_m, abs(wrap_angle(b.theta_rad - a.theta_rad)) / one_rad)
+    return max(far_m(a, b) / one_m, abs(wrap_angle(b.theta_rad - a.theta_rad)) / one_rad)

@@ -23,7 +23,6 @@ from edge.monitors.watch import Watch, WatchConfig
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
 from edge.reasoning_loop import SemanticSlot
-from edge.reasoning_text import means_to_wait
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
@@ -345,7 +344,7 @@ class ControlLoop:
 
 def _meant(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
     """The waypoints that were said last, [points, 2], m in the robot's frame now; None of words that mean to wait."""
-    if semantic is None or semantic.waypoints is None or offset is None or means_to_wait(semantic.text):
+    if semantic is None or semantic.waypoints is None or offset is None or semantic.waits:
         return None
     points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
     return points

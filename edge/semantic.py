@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.geometry import SE2
-from edge.reasoning_text import Waypoints
+from edge.reasoning_text import Waypoints, means_to_wait
 
 Context = Mapping[str, npt.NDArray[np.generic]]
 """The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
@@ -33,6 +34,11 @@ class SemanticState:
     waypoints: Waypoints | None
     text_complete: bool = True
     """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether its words mean to let somebody pass first; read once, not in every tick."""
+        return means_to_wait(self.text)
 
     def delay_s(self, now_ns: int) -> float:
         """Δt: now − anchor (inference time plus time since it finished)."""

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from edge.back_off import MAX_STEP_S, OK
+from edge.back_off import MAX_STEP_S, OK, far_m
 from edge.controller import TARGET_TIME_S, VelocityCommand, arc_to
 from edge.geometry import SE2, wrap_angle
 
@@ -99,13 +99,13 @@ class Stalemate:
         if self._turn is not None:
             return self._go_on(self._turn, speed_mps, wanted, T_odom_base, now_ns, speed_scale)
         stands = speed_mps < self._config.slower_mps and abs(yaw_radps) < self._config.slower_radps
-        if self._stood_at is None or not stands or _far_m(self._stood_at, T_odom_base) > self._config.within_m:
+        if self._stood_at is None or not stands or far_m(self._stood_at, T_odom_base) > self._config.within_m:
             self._stood_at, self._stood_ns = T_odom_base, 0
         self._stood_ns += elapsed_ns
         bearing_rad = atan2(point[1], point[0])
         if self._stood_ns < self._config.after_s * 1e9 or abs(bearing_rad) < self._config.aside_rad:
             return wanted
-        if self._place is None or _far_m(self._place, T_odom_base) > self._config.apart_m:
+        if self._place is None or far_m(self._place, T_odom_base) > self._config.apart_m:
             self._place, self._turns = T_odom_base, 0
         if self._turns >= self._config.turns:
             return wanted
@@ -133,7 +133,3 @@ class Stalemate:
         most = min(config.turn_radps, config.wz_max_radps) * min(speed_scale, 1.0)
         turn_radps = copysign(min(most, 2.0 * abs(left_rad)), left_rad)
         return VelocityCommand(0.0, 0.0, turn_radps, wanted.target, TURNING)
-
-
-def _far_m(a: SE2, b: SE2) -> float:
-    return hypot(b.x_m - a.x_m, b.y_m - a.y_m)

@@ -8,7 +8,7 @@ from math import pi
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from edge.controller import VelocityCommand
@@ -66,6 +66,7 @@ def test_it_stands_for_five_seconds_and_then_turns_to_what_was_said() -> None:
 
 @given(st.floats(-3.1, 3.1), st.floats(0.3, 1.0))
 def test_it_turns_the_short_way_within_the_limits(bearing_rad: float, wz_max_radps: float) -> None:
+    assume(abs(abs(bearing_rad) - CONFIG.aside_rad) > 1e-4)  # waypoints are float32
     far = tuple((r * np.cos(bearing_rad), r * np.sin(bearing_rad)) for r in (2.0, 4.0, 6.0))
     run = Run(far, StalemateConfig(wz_max_radps=wz_max_radps))
     run.go(80, speed_scale=0.5)
