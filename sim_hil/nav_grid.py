@@ -7,6 +7,7 @@ free cells to 16 neighbours (off by at most 2.8 % before smoothing); a path is t
 from __future__ import annotations
 
 import itertools
+from functools import cached_property
 from math import ceil, cos, floor, hypot, sin
 
 import numpy as np
@@ -69,7 +70,6 @@ class NavGrid:
         if not self._free.any():
             raise ValueError(f"navigation grid: scene {scene.name} has no room for a clearance of {clearance_m} m")
         self._nearest = self._snaps()
-        self._links = self._graph()
         self._trees: dict[tuple[int, int], tuple[Array, NDArray[np.int32]]] = {}
 
     @property
@@ -146,11 +146,12 @@ class NavGrid:
         nearest = distance_transform_edt(~self._free, return_distances=False, return_indices=True)
         return np.asarray(nearest, dtype=np.int32)
 
-    def _graph(self) -> csr_matrix:
-        self._ids, source, target, length = links(self._free, self.resolution_m)
-        self._cells = np.argwhere(self._free)
-        count = len(self._cells)
-        return csr_matrix((length, (source, target)), shape=(count, count))
+    @cached_property
+    def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int64], csr_matrix]:
+        """Numbers of the free cells [rows, columns], their places [n, 2], and the steps between them [n, n]."""
+        ids, source, target, length = links(self._free, self.resolution_m)
+        cells = np.argwhere(self._free)
+        return ids, cells, csr_matrix((length, (source, target)), shape=(len(cells), len(cells)))
 
     def cell(self, x_m: float, y_m: float) -> tuple[int, int]:
         """Row and column of the cell that holds a point (the nearest one for a point off the floor)."""
@@ -207,8 +208,9 @@ class NavGrid:
         if (row, column) not in self._trees:
             if len(self._trees) >= 32:
                 self._trees.pop(next(iter(self._trees)))
+            ids, _, steps = self._graph
             self._trees[row, column] = dijkstra(
-                self._links, directed=False, indices=int(self._ids[row, column]), return_predecessors=True
+                steps, directed=False, indices=int(ids[row, column]), return_predecessors=True
             )
         return self._trees[row, column]
 
@@ -245,12 +247,13 @@ class NavGrid:
         if first is None or last is None or tree is None:
             return None
         _, onwards = tree
-        node = int(self._ids[self.free_cell(*first)])
+        ids, cells, _ = self._graph
+        node = int(ids[self.free_cell(*first)])
         if not np.isfinite(tree[0][node]):
             return None
         points = [first]
         while node >= 0:
-            points.append(self.centre(*(int(v) for v in self._cells[node])))
+            points.append(self.centre(*(int(v) for v in cells[node])))
             node = int(onwards[node])
         points.append(last)
         taut = self._pulled(points)

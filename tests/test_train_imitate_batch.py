@@ -13,7 +13,8 @@ from export.model.action import ActionExpert
 from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.train_drives import tiny_model
-from tools.train.action_batch import Group, collate, errors, plan, smooth_l1, trunk
+from tools.train.action_batch import Group, collate, plan, smooth_l1, trunk
+from tools.train.imitation_pupils import ExpertPupil, LossConfig
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)
@@ -159,7 +160,7 @@ def test_what_every_head_makes_small_is_about_its_own_frame(head: str) -> None:
 
     def value(given: Group) -> torch.Tensor:
         generator = torch.Generator().manual_seed(5)
-        return errors(action, collate([given], CPU), generator, beta=1.0, heading_weight=1.0)
+        return ExpertPupil(action, LossConfig()).errors(collate([given], CPU), generator)
 
     first, second = value(one), value(other)
     assert first.shape == (3,) and torch.isfinite(first).all()

@@ -25,6 +25,17 @@ Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
+class Around:
+    """What is solid about g frames' robots, as `tools.train.walls` measures it: which no policy is given.
+
+    `patches` f16 [g, rows, columns] m, `body` f32 [g, 2] reach and radius, m.
+    """
+
+    patches: NDArray[np.float16]
+    body: Array
+
+
+@dataclass(frozen=True)
 class Group:
     """g frames of one drive that act on one semantic state.
 
@@ -44,6 +55,8 @@ class Group:
     keep_state: NDArray[np.bool_]
     target: Array
     known: NDArray[np.bool_]
+    around: Around | None = None
+    """Where plans are to keep off walls."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +75,8 @@ class ActionBatch:
     keep_state: Tensor
     target: Tensor
     known: Tensor
+    around: tuple[Tensor, Tensor] | None = None
+    """Patches and bodies, if the groups have any."""
 
     def __len__(self) -> int:
         return len(self.state)
@@ -84,6 +99,9 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
             at += len(array)
         return torch.from_numpy(whole).to(device)
 
+    near = [group.around for group in groups if group.around is not None]
+    if len(near) not in (0, len(groups)):
+        raise ValueError("expected walls around all groups of a batch or around none")
     lengths = torch.tensor([group.guidance.shape[1] for group in groups for _ in group.guidance], device=device)
     return ActionBatch(
         visual_tokens=joined("visual_tokens").float(),
@@ -96,7 +114,13 @@ def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
         keep_state=joined("keep_state"),
         target=joined("target"),
         known=joined("known"),
+        around=_around(near, device) if near else None,
     )
+
+
+def _around(near: Sequence[Around], device: torch.device) -> tuple[Tensor, Tensor]:
+    patches, body = (np.concatenate([getattr(each, name) for each in near]) for name in ("patches", "body"))
+    return torch.from_numpy(patches).to(device).float(), torch.from_numpy(body).to(device)
 
 
 @dataclass(frozen=True)
@@ -155,12 +179,8 @@ def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
     return integrated(action.out(found).float(), action.config.action.parameterisation)
 
 
-def errors(
-    action: ActionExpert, batch: ActionBatch, generator: torch.Generator, *, beta: float, heading_weight: float
-) -> Tensor:
-    """What training makes small, for every frame [B]: equation 4, or what another head than `query` learns by."""
-    if action.config.action.head == "query":
-        return smooth_l1(plan(action, batch), batch, beta=beta, heading_weight=heading_weight)
+def errors(action: ActionExpert, batch: ActionBatch, generator: torch.Generator) -> Tensor:
+    """What another head than `query` learns by, for every frame [B]."""
     terms = action.errors(trunk(action, batch), batch.target, generator)
     return (terms.sum(-1) * batch.known).mean(1)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from edge.geometry import SE2
 from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, RATE_HZ, Drive
 from tools.train.trace_words import NOBODY
+from tools.train.walls import Walls
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,8 @@ class DriveFrames:
     """[N]: steps of the label that are real."""
     weight: Array
     """[N]: chance to be drawn, not normalised; 0 where too little of the label is known."""
+    walls: Walls | None = None
+    """Around it; None where nobody asks for them or they are not known."""
 
     def __len__(self) -> int:
         return len(self.state)
@@ -80,7 +83,7 @@ class DriveFrames:
         return bool(hypot(*self.state[0, :2]) < _STANDS and abs(self.state[0, 2]) < _STANDS)
 
     @staticmethod
-    def of(drive: Drive, steps: int, weights: WeightConfig) -> DriveFrames:
+    def of(drive: Drive, steps: int, weights: WeightConfig, walls: Walls | None = None) -> DriveFrames:
         """Of a drive whose pictures need not be loaded. Raises DriveFramesError for more steps than a label has."""
         if not LEAST_KNOWN <= steps <= FUTURE_STEPS:
             raise DriveFramesError(f"action.steps: expected {LEAST_KNOWN} to {FUTURE_STEPS}, found {steps}")
@@ -102,6 +105,7 @@ class DriveFrames:
             target=future[:, :steps].astype(np.float32),
             known=drive.future_steps,
             weight=_weights(drive, future, goal, weights),
+            walls=walls,
         )
 
     def offset(self, anchor: int, k: int) -> SE2:

@@ -47,6 +47,7 @@ from tools.train.network_file import finish_network, read_network, stage_weights
 from tools.train.optim import OptimConfig
 from tools.train.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
 from tools.train.tokens import TokenCache
+from tools.train.walls import Scenes
 
 if TYPE_CHECKING:
     from tools.train.recipe import Recipe
@@ -221,13 +222,14 @@ def fit(
     """
     config = _config(job)
     delays = config.delays.load() if config.inject_delay and pupil.hears else Delays.none()
-    drives = _frames(job, dataset, dataset.train, config.sample)
+    scenes = Scenes() if config.loss.walls else None
+    drives = _frames(job, dataset, dataset.train, config.sample, scenes)
     if mirror is not None:
-        reflected = _frames(job, MirroredDrives.of(dataset), dataset.train, config.sample)
+        reflected = _frames(job, MirroredDrives.of(dataset), dataset.train, config.sample, scenes)
         drives = balanced(drives, [mirrored_frames(drive) for drive in reflected], config.mirrored)
         tokens, states = BothTokens(tokens, mirror.tokens), BothStates(states, mirror.states)
     data = _samples(job, drives, tokens, states, delays, pupil)
-    unseen = _frames(job, dataset, dataset.val, config.sample.undisturbed())
+    unseen = _frames(job, dataset, dataset.val, config.sample.undisturbed(), scenes)
     held = _held(job, unseen, tokens, states, delays, pupil)
     pupil.begin(data.drives)
     total = max(1, round(config.samples * share) // config.batch)
@@ -253,9 +255,15 @@ def fit(
     return result
 
 
-def _frames(job: StageJob, dataset: Dataset, ids: Sequence[str], config: SampleConfig) -> list[DriveFrames]:
-    steps = job.recipe.model.action.steps
-    return [DriveFrames.of(drive, steps, config.weights) for drive in dataset.drives(ids, pictures=False)]
+def _frames(
+    job: StageJob, dataset: Dataset, ids: Sequence[str], config: SampleConfig, scenes: Scenes | None
+) -> list[DriveFrames]:
+    """`scenes`: where walls are looked at."""
+    steps, in_mirror = job.recipe.model.action.steps, isinstance(dataset, MirroredDrives)
+    return [
+        DriveFrames.of(drive, steps, config.weights, scenes and scenes.along(drive, in_mirror=in_mirror))
+        for drive in dataset.drives(ids, pictures=False)
+    ]
 
 
 def _samples(

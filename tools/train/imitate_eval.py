@@ -26,6 +26,7 @@ from edge.reasoning_text import WAYPOINT_TIMES_S, Waypoints
 from tools.train.action_batch import ActionBatch, Group, collate
 from tools.train.drive import RATE_HZ
 from tools.train.imitation_data import Chosen, Samples
+from tools.train.walls import OPEN_M, room
 
 Array = NDArray[np.float64]
 Planner = Callable[[ActionBatch], Tensor]
@@ -166,7 +167,7 @@ def evaluate(
     words: bool = True,
 ) -> dict[str, Any]:
     """Errors of `planner` and of what stands beside it; `words` False: it is told none, so others change nothing."""
-    scores = _Scores(config.edges_s)
+    scores, into_walls = _Scores(config.edges_s), dict[str, list[NDArray[np.bool_]]]()
     groups = -(-config.samples // samples.group)
     each = max(2, config.batch // samples.group)
     for start in range(0, groups, each):
@@ -180,7 +181,19 @@ def evaluate(
                 plans[OTHER_WORDS] = planner(_with_others_words(batch, len(taken)))
         arrays = {name: tensor.double().cpu().numpy() for name, tensor in plans.items()}
         _score(scores, samples, chosen, taken, arrays)
-    return {"samples": groups * samples.group, **scores.result()}
+        for name, tensor in plans.items() if batch.around is not None else ():
+            into_walls.setdefault(name, []).append(_into_walls(tensor, batch))
+    shares = {name: float(np.concatenate(found).mean()) for name, found in into_walls.items()}
+    return {"samples": groups * samples.group, **scores.result(), **({"into_walls": shares} if shares else {})}
+
+
+def _into_walls(plans: Tensor, batch: ActionBatch) -> NDArray[np.bool_]:
+    """[B]: plans that touch what the expert's own do not."""
+    assert batch.around is not None
+    least = [
+        room(each.float(), *batch.around).masked_fill(~batch.known, OPEN_M).amin(1) for each in (plans, batch.target)
+    ]
+    return ((least[0] < 0) & (least[1] >= 0)).cpu().numpy()
 
 
 def _with_others_words(batch: ActionBatch, groups: int) -> ActionBatch:

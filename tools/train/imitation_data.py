@@ -22,12 +22,13 @@ from edge.geometry import SE2
 from edge.guidance import waypoints_now
 from edge.reasoning_text import Waypoints
 from export.model.config import TicVlaConfig
-from tools.train.action_batch import Group
+from tools.train.action_batch import Around, Group
 from tools.train.delays import Delays
 from tools.train.drive import RATE_HZ
 from tools.train.drive_frames import DriveFrames, WeightConfig
 from tools.train.kv_cache import CachedState
 from tools.train.language_batch import FrameTokens
+from tools.train.walls import nothing_near
 
 Array = NDArray[np.float64]
 
@@ -126,6 +127,7 @@ class Samples:
         self.config = config
         self._tokens, self._states, self._delays = tokens, states, delays
         self._by_waypoints = model.action.semantic_interface == "waypoints"
+        self._near_walls = any(drive.walls is not None for drive in self.drives)
         self._drop_kv, self._drop_state = (model.action.kv_dropout, model.action.state_dropout) if drop else (0.0, 0.0)
         # Frames of one state that are all the same age are all the same frame.
         self.group = config.group if np.count_nonzero(delays.mass) > 1 else 1
@@ -230,7 +232,16 @@ class Samples:
             keep_state=keep_state,
             target=drive.target[ks],
             known=np.arange(drive.target.shape[1]) < drive.known[ks][:, None],
+            around=self._around(drive, ks) if self._near_walls else None,
         )
+
+    @staticmethod
+    def _around(drive: DriveFrames, ks: list[int]) -> Around:
+        """Walls around the robot in some frames."""
+        if drive.walls is None:
+            return Around(nothing_near(len(ks)), np.zeros((len(ks), 2), np.float32))
+        body = drive.walls.body
+        return Around(drive.walls.patches(ks), np.full((len(ks), 2), (body.reach_m, body.radius_m), np.float32))
 
     def said(self, chosen: Chosen) -> Waypoints | None:
         """Waypoints of the state that a choice acts on, m in the anchor's robot frame; None where it has none."""

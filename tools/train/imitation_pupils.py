@@ -14,6 +14,7 @@ from tools.train import action_batch
 from tools.train.action_batch import ActionBatch
 from tools.train.drive_frames import DriveFrames
 from tools.train.point_goal_net import PointGoalNet
+from tools.train.walls import too_near
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,24 @@ class LossConfig:
     heading_weight: float = 1.0
     """Of an error of one radian beside one of a metre."""
 
+    walls: float = 0.0
+    """Of a metre that a plan comes too near to what is solid, beside one of error; 0: walls are not looked at. Heads
+    that learn by another objective leave it out."""
+    room_m: float = 0.2
+    """Nearer than this is too near, where the expert's own plan keeps it."""
+
     def __post_init__(self) -> None:
         if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
             raise ValueError("expected beta above 0 and heading_weight from 0 on, both up to 100")
+        if not (0 <= self.walls <= 100 and 0 <= self.room_m <= 1):
+            raise ValueError("expected walls from 0 to 100 and room_m from 0 to 1")
+
+    def of(self, plan: Tensor, batch: ActionBatch) -> Tensor:
+        """Of every frame's plan [B, steps, 3]: equation 4, and what it comes too near to walls."""
+        loss = action_batch.smooth_l1(plan, batch, beta=self.beta, heading_weight=self.heading_weight)
+        if not self.walls or batch.around is None:
+            return loss
+        return loss + self.walls * too_near(plan.float(), batch.target, batch.known, *batch.around, self.room_m)
 
 
 class Pupil(ABC):
@@ -66,10 +82,9 @@ class ExpertPupil(Pupil):
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """Equation 4; a diffusion's or a flow's own objective (paper appendix D)."""
-        loss = self._loss
-        return action_batch.errors(
-            self._action, batch, generator, beta=loss.beta, heading_weight=loss.heading_weight
-        )  # fmt: skip
+        if self._action.config.action.head == "query":
+            return self._loss.of(self.plan(batch), batch)
+        return action_batch.errors(self._action, batch, generator)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
         """Heads that work on normalised actions take mean and deviation from the labels."""
@@ -97,8 +112,7 @@ class PointGoalPupil(Pupil):
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """Equation 4."""
-        loss = self._loss
-        return action_batch.smooth_l1(self.plan(batch), batch, beta=loss.beta, heading_weight=loss.heading_weight)
+        return self._loss.of(self.plan(batch), batch)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
         """There is nothing to be looked at."""
