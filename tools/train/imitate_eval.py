@@ -182,18 +182,19 @@ def evaluate(
         arrays = {name: tensor.double().cpu().numpy() for name, tensor in plans.items()}
         _score(scores, samples, chosen, taken, arrays)
         for name, tensor in plans.items() if batch.around is not None else ():
-            into_walls.setdefault(name, []).append(_into_walls(tensor, batch))
-    shares = {name: float(np.concatenate(found).mean()) for name, found in into_walls.items()}
+            into_walls.setdefault(name, []).append(plans_into_walls(tensor, batch))
+    shares = {name: float(np.concatenate(found).mean()) for name, found in into_walls.items() if sum(map(len, found))}
     return {"samples": groups * samples.group, **scores.result(), **({"into_walls": shares} if shares else {})}
 
 
-def _into_walls(plans: Tensor, batch: ActionBatch) -> NDArray[np.bool_]:
-    """[B]: plans that touch what the expert's own do not."""
+def plans_into_walls(plans: Tensor, batch: ActionBatch) -> NDArray[np.bool_]:
+    """[n]: of the frames whose walls are known, whether the plan touches something where the expert's own does not."""
     assert batch.around is not None
     least = [
         room(each.float(), *batch.around).masked_fill(~batch.known, OPEN_M).amin(1) for each in (plans, batch.target)
     ]
-    return ((least[0] < 0) & (least[1] >= 0)).cpu().numpy()
+    found: NDArray[np.bool_] = ((least[0] < 0) & (least[1] >= 0))[batch.around[1][:, 1] > 0].cpu().numpy()
+    return found
 
 
 def _with_others_words(batch: ActionBatch, groups: int) -> ActionBatch:

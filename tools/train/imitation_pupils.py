@@ -19,7 +19,7 @@ from tools.train.walls import too_near
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Equation 4, of the query head and of the point-goal network: smooth L1 of the integrated poses."""
+    """Equation 4, of the query head and of the point-goal network: smooth L1 of the integrated poses; and walls."""
 
     beta: float = 1.0
     """Below this error it is quadratic, m and rad; torch's own value, the paper names none."""
@@ -27,10 +27,10 @@ class LossConfig:
     """Of an error of one radian beside one of a metre."""
 
     walls: float = 0.0
-    """Of a metre that a plan comes too near to what is solid, beside one of error; 0: walls are not looked at. Heads
-    that learn by another objective leave it out."""
+    """Of each metre that a plan comes too near to walls (`tools.train.walls`); 0: these are not looked at. Heads that
+    learn by another objective leave it out."""
     room_m: float = 0.2
-    """Nearer than this is too near, where the expert's own plan keeps it."""
+    """Nearer than this is too near, unless the expert's own plan comes as near."""
 
     def __post_init__(self) -> None:
         if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
@@ -81,7 +81,7 @@ class ExpertPupil(Pupil):
         return action_batch.plan(self._action, batch)
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """Equation 4; a diffusion's or a flow's own objective (paper appendix D)."""
+        """Equation 4 and walls; a diffusion's or a flow's own objective (paper appendix D)."""
         if self._action.config.action.head == "query":
             return self._loss.of(self.plan(batch), batch)
         return action_batch.errors(self._action, batch, generator)
@@ -111,7 +111,7 @@ class PointGoalPupil(Pupil):
         return self._network(batch.visual_tokens, batch.state * batch.keep_state[:, None], batch.goal)
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """Equation 4."""
+        """Equation 4 and walls."""
         return self._loss.of(self.plan(batch), batch)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
