@@ -136,8 +136,9 @@ def test_nothing_after_the_frame_reaches_the_inputs_of_its_sample(tmp_path: Path
     drive = side_drive("left-a")
     before = inputs(drive, TOKENS, tmp_path / "true")
     after = inputs(spoiled(drive, k), SpoiledTokens(k), tmp_path / "spoiled")
+    given = [field for field in dataclasses.fields(Group) if field.name != "around"]  # no policy is given walls
     for true, other in zip(before, after, strict=True):
-        for field in dataclasses.fields(Group):
+        for field in given:
             # States are made in batches of other lengths, which rounds otherwise.
             close = 4e-3 if field.name == "guidance" else 0.0
             np.testing.assert_allclose(
