@@ -302,7 +302,7 @@ def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | Non
     if free[0] >= floor:
         return None
     return (
-        f"--record {path}: {free[0] / 2**20:.0f} MiB of its file system are free, recording needs {floor / 2**20:.0f} "
+        f"{path}: {free[0] / 2**20:.0f} MiB of its file system are free, recording needs {floor / 2**20:.0f} "
         f"MiB ({ARMING_FREE_SHARE:.0%} of it, and what is left to others); delete old logs or record elsewhere"
     )
 

@@ -13,6 +13,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
+from edge.recorder import space_refusal
 from tools.host_stall import HostStall
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -60,6 +63,13 @@ def running(module: str, *arguments: object, folder: Path, ready: str = "ready")
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+def need_room_to_record(folder: Path) -> None:
+    """Skip where so little of the disk is free that a robot which records would rightly not be armed."""
+    refusal = space_refusal(folder / "flight.mcap")
+    if refusal is not None:
+        pytest.skip(refusal)
 
 
 def check_stop_latency(latency_ns: int, bound_ns: int, since_ns: int, host: HostStall) -> None:

@@ -22,6 +22,7 @@ from tests.processes import (
     Running,
     check_stop_latency,
     hil_arguments,
+    need_room_to_record,
     read_trace,
     running,
     wait_for,
@@ -78,6 +79,7 @@ def drive(robot: Robot, *more: object) -> Running:
 
 
 def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> None:
+    need_room_to_record(robot.folder)
     flight = robot.folder / "flight.mcap"
     done = run(*robot.arguments("--duration", 8, "--release-delay", 1, "--record", flight, "--json", "-"))
     assert done.returncode == 0, done.stderr

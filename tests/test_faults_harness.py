@@ -6,6 +6,7 @@ import json
 import math
 import random
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,7 @@ from edge.geometry import SE2
 from sim_hil.faults.client import FaultClient, FaultError
 from tools.faults import __main__ as command
 from tools.faults import circle
+from tools.faults import rig as rigs
 from tools.faults.heard import Hearing, Tail, first_lasting, longest_gap_ms
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult
@@ -63,6 +65,21 @@ def row(bound: float = 300.0) -> Row:
 def test_a_row_passes_when_every_sample_is_within_the_bound(sample: Sample, problem: str | None) -> None:
     problems = RowResult(row(), [Sample(100.0, 0.0)] * 5 + [sample]).problems
     assert (problem is None and not problems) or problem in problems
+
+
+@pytest.mark.parametrize(("free", "recorded"), [(69, False), (70, True)])
+def test_rows_go_on_without_a_recording_where_the_disk_is_too_full(
+    free: int, recorded: bool, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    started: list[str] = []
+    monkeypatch.setattr("edge.recorder._free", lambda _: (free << 30, 1000 << 30))
+    monkeypatch.setattr(rigs, "FaultClient", lambda *_: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(rigs.Children, "start", lambda _self, _name, command: started.extend(command))
+    with rigs.Rig(tmp_path, artifacts_dir, 1, said.append) as rig:
+        rig.start_runner()
+    assert ("--record" in started) == recorded
+    assert recorded or ("not recorded" in said[0] and "7%" in said[0])
 
 
 def test_time_that_the_machine_stood_still_is_granted_and_counted() -> None:

@@ -27,7 +27,7 @@ from sim_hil.soak.journey import Journey, SoakTask
 from sim_hil.soak.leg import EVENTS, SAMPLES, Leg
 from sim_hil.soak.measures import measures
 from sim_hil.soak.soak_run import SoakFolder
-from tests.processes import wait_for
+from tests.processes import need_room_to_record, wait_for
 
 DURATION_S = 20
 # On a machine with many others on it all is slow. These only bound how long a test waits for what it looks for.
@@ -126,6 +126,7 @@ def patient(left_s: Callable[[Leg, int], float]) -> Callable[[Leg, int], float]:
 @pytest.fixture(scope="module")
 def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soaked:
     folder = tmp_path_factory.mktemp("soak")
+    need_room_to_record(folder)
     faults = folder / "faults.toml"
     faults.write_text(FAULTS, encoding="utf-8")
     arguments = ["--artifacts", str(artifacts_dir), "--duration", f"{DURATION_S}s", "--leg", "10m", "--scene", "office"]
@@ -264,7 +265,18 @@ def test_artifacts_that_are_none_are_refused(tmp_path: Path) -> None:
     assert cli.main(["--artifacts", str(tmp_path), "--duration", "1m", "--out", str(tmp_path / "out")]) == 3
 
 
+def test_a_disk_too_full_to_record_to_is_refused_before_anything_starts(
+    artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("edge.recorder._free", lambda _: (60 << 30, 1000 << 30))
+    out = tmp_path / "not yet" / "out"
+    assert cli.main(["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(out)]) == 3
+    error = capsys.readouterr().err
+    assert "7%" in error and error.count("\n") == 1 and not out.parent.exists()
+
+
 def test_ctrl_c_writes_the_report_of_what_there_is(artifacts_dir: Path, tmp_path: Path) -> None:
+    need_room_to_record(tmp_path)
     out = tmp_path / "out"
     command = [sys.executable, "-m", "sim_hil.soak.cli", "--artifacts", str(artifacts_dir), "--duration", "1h"]
     samples = out / "legs" / "001" / SAMPLES

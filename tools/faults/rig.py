@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from edge.recorder import space_refusal
 from firmware_bridge.config import RobotConfig, load_robot_config
 from sim_hil.faults.client import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError, tail
@@ -95,9 +96,17 @@ class Rig:
         socket = self.folder / f"r{self._runs}.faults"
         command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
-        command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
+        command += self._recording(self.folder / f"flight{self._runs}.mcap")
         self.runner = self._children.start(f"edge-run-{self._runs}", command)
         self._inside = FaultClient(socket, self.folder / f"i{self._runs}")
+
+    def _recording(self, log: Path) -> list[str]:
+        """Record as a robot does; where the disk is too full for that, the rows are of a runner that does not."""
+        refusal = space_refusal(log)
+        if refusal is None:
+            return ["--record", str(log)]
+        self._say(f"not recorded: {refusal}")
+        return []
 
     def ensure_moving(self) -> None:
         """Have the robot driven, steadily and at full speed; starts what is not running. Raises StepError."""
