@@ -27,6 +27,27 @@ def test_bounds_of_the_uniform_delays_are_kept() -> None:
     assert mass.sum() == pytest.approx(1.0)
 
 
+def test_a_share_of_the_ages_can_be_near_without_the_others_going() -> None:
+    config = DelayConfig(near_share=0.6, near_s=4.0)
+    mass = config.load().mass
+    np.testing.assert_allclose(mass[1:40], 0.4 * 0.01 + 0.6 * 0.025)
+    np.testing.assert_allclose(mass[41:100], 0.4 * 0.01)
+    assert config.load().mean_s == pytest.approx(0.4 * 5.0 + 0.6 * 2.0)
+
+
+@pytest.mark.parametrize(
+    ("low_s", "share", "near_s", "named"),
+    [(0.0, 1.1, 4.0, "near_share"), (4.0, 0.5, 4.0, "near_s"), (0.0, 0.5, 11.0, "near_s")],
+)
+def test_a_near_share_that_makes_no_sense_is_refused(low_s: float, share: float, near_s: float, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        DelayConfig(low_s=low_s, near_share=share, near_s=near_s)
+
+
+def test_far_ages_alone_need_no_near_end() -> None:
+    assert set(np.flatnonzero(DelayConfig(low_s=4.0, high_s=5.0).load().mass)) == set(range(40, 51))
+
+
 @pytest.mark.parametrize("seconds", [0.4, 2.0, 7.0])
 def test_generations_that_all_take_as_long_are_between_one_and_two_of_their_times_old(seconds: float) -> None:
     delays = Delays.of_profile(LatencyProfile.constant(seconds))

@@ -34,12 +34,19 @@ class DelayConfig:
     high_s: float = 10.0
     profile: str = ""
     """A file of `edge-calib latency`; empty: uniform."""
+    near_share: float = 0.0
+    """Share of ages that are uniform up to `near_s` instead: it is by fresh words that a policy learns to listen."""
+    near_s: float = 4.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.low_s < self.high_s <= LONGEST_S:
             raise ValueError(
                 f"expected 0 <= low_s < high_s <= {LONGEST_S:g} s, found {self.low_s:g} and {self.high_s:g}"
             )
+        if not 0 <= self.near_share <= 1:
+            raise ValueError(f"near_share: expected 0 to 1, found {self.near_share:g}")
+        if self.near_share and not self.low_s < self.near_s <= self.high_s:
+            raise ValueError(f"near_s: expected above low_s and up to high_s, found {self.near_s:g}")
 
     def load(self) -> Delays:
         """The distribution; raises LatencyError for a profile that cannot be used."""
@@ -65,9 +72,12 @@ class Delays:
 
     @staticmethod
     def uniform(config: DelayConfig) -> Delays:
-        """U(low_s, high_s)."""
-        edges = _edges(config.high_s)
-        return _of_cdf(np.clip((edges - config.low_s) / (config.high_s - config.low_s), 0.0, 1.0))
+        """U(low_s, high_s), mixed with U(low_s, near_s)."""
+        edges, low_s = _edges(config.high_s), config.low_s
+        reached = np.clip((edges - low_s) / (config.high_s - low_s), 0.0, 1.0)
+        if config.near_share:
+            reached += config.near_share * (np.clip((edges - low_s) / (config.near_s - low_s), 0.0, 1.0) - reached)
+        return _of_cdf(reached)
 
     @staticmethod
     def of_profile(profile: LatencyProfile) -> Delays:
