@@ -294,7 +294,7 @@ class Recorder:
 
 
 def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | None:
-    """Why a robot that is to record to `path` must not be armed (fault matrix row 51), in one line; None: it may."""
+    """Why a robot that is to record to `path` must not be armed (fault matrix row 51); None: it may."""
     free = _free(path)
     if free is None:
         return None
@@ -302,8 +302,8 @@ def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | Non
     if free[0] >= floor:
         return None
     return (
-        f"{path}: {free[0] / 2**20:.0f} MiB of its file system are free, recording needs {floor / 2**20:.0f} "
-        f"MiB ({ARMING_FREE_SHARE:.0%} of it, and what is left to others); delete old logs or record elsewhere"
+        f"{free[0] / 2**20:.0f} MiB of its file system are free, recording needs {floor / 2**20:.0f} MiB "
+        f"({ARMING_FREE_SHARE:.0%} of it, and what is left to others); delete old logs or record elsewhere"
     )
 
 

@@ -119,7 +119,7 @@ class RunSession:
         """
         refusal = None if self._options.record is None else space_refusal(self._options.record)
         if refusal is not None:
-            raise RefusedError(f"--record {refusal}")
+            raise RefusedError(f"--record {self._options.record}: {refusal}")
         self._reporter.starting("waiting for the robot", READY_TIMEOUT_S + self._robot.bridge.arm_timeout_s + OPEN_S)
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None

@@ -52,7 +52,11 @@ def running(module: str, *arguments: object, folder: Path, ready: str = "ready")
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=file, cwd=REPOSITORY)
     started = Running(process, stderr)
     try:
-        wait_for(lambda: ready in started.stderr() or process.poll() is not None, _READY_TIMEOUT_S, f"{module} ready")
+        try:
+            over = _READY_TIMEOUT_S, f"{module} ready"
+            wait_for(lambda: ready in started.stderr() or process.poll() is not None, *over)
+        except AssertionError as error:
+            raise AssertionError(f"{error}; it has said: {started.stderr()}") from error
         assert process.poll() is None, f"{module} ended with {process.returncode}: {started.stderr()}"
         yield started
     finally:

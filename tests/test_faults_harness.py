@@ -6,7 +6,6 @@ import json
 import math
 import random
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -16,7 +15,6 @@ from edge.geometry import SE2
 from sim_hil.faults.client import FaultClient, FaultError
 from tools.faults import __main__ as command
 from tools.faults import circle
-from tools.faults import rig as rigs
 from tools.faults.heard import Hearing, Tail, first_lasting, longest_gap_ms
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult
@@ -67,19 +65,13 @@ def test_a_row_passes_when_every_sample_is_within_the_bound(sample: Sample, prob
     assert (problem is None and not problems) or problem in problems
 
 
-@pytest.mark.parametrize(("free", "recorded"), [(69, False), (70, True)])
-def test_rows_go_on_without_a_recording_where_the_disk_is_too_full(
-    free: int, recorded: bool, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_on_a_disk_too_full_to_record_to_nothing_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said: list[str] = []
-    started: list[str] = []
-    monkeypatch.setattr("edge.recorder._free", lambda _: (free << 30, 1000 << 30))
-    monkeypatch.setattr(rigs, "FaultClient", lambda *_: SimpleNamespace(close=lambda: None))
-    monkeypatch.setattr(rigs.Children, "start", lambda _self, _name, command: started.extend(command))
-    with rigs.Rig(tmp_path, artifacts_dir, 1, said.append) as rig:
-        rig.start_runner()
-    assert ("--record" in started) == recorded
-    assert recorded or ("not recorded" in said[0] and "7%" in said[0])
+    monkeypatch.setattr("edge.recorder._free", lambda _: (69 << 30, 1000 << 30))
+    monkeypatch.setattr(command, "Rig", lambda *_: pytest.fail("a rig was made"))
+    assert command.main(["--artifacts", str(tmp_path), "--out", str(tmp_path / "out"), "--domain", "1"]) == 1
+    assert "recording needs 71680 MiB" in capsys.readouterr().err
 
 
 def test_time_that_the_machine_stood_still_is_granted_and_counted() -> None:

@@ -223,6 +223,11 @@ def test_resumed_with_other_options_is_refused(soaked: Soaked, capsys: pytest.Ca
     assert "people" in capsys.readouterr().err
 
 
+def test_a_soak_that_is_over_needs_no_room_to_record(soaked: Soaked, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge.recorder._free", lambda _: (60 << 30, 1000 << 30))
+    assert cli.main([*soaked.arguments, "--resume"]) == soaked.code
+
+
 def test_what_a_killed_soak_had_written_is_counted(soaked: Soaked, tmp_path: Path) -> None:
     copy = tmp_path / "out"
     shutil.copytree(soaked.folder, copy)
@@ -270,9 +275,9 @@ def test_a_disk_too_full_to_record_to_is_refused_before_anything_starts(
 ) -> None:
     monkeypatch.setattr("edge.recorder._free", lambda _: (60 << 30, 1000 << 30))
     out = tmp_path / "not yet" / "out"
-    assert cli.main(["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(out)]) == 3
+    assert cli.main(["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(out)]) == 2
     error = capsys.readouterr().err
-    assert "7%" in error and error.count("\n") == 1 and not out.parent.exists()
+    assert f"--out {out}: 61440 MiB" in error and error.count("\n") == 1 and not out.parent.exists()
 
 
 def test_ctrl_c_writes_the_report_of_what_there_is(artifacts_dir: Path, tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from edge.cli import (
     write_result,
 )
 from edge.manifest import load_artifacts
-from edge.recorder import space_refusal
 from firmware_bridge.config import load_robot_config
 from sim_hil.hil import stop_signals
 from sim_hil.odometry_noise import LEVELS
@@ -52,8 +51,8 @@ EXAMPLES = """examples:
 
 A leg is one stack (edge-hil, edge-bridge, edge-run) in one scene; within it the runner goes on from task to task.
 The default budget and faults: sim_hil/soak/budget.toml and faults.toml; copy and change them.
-exit codes: 0 the budget is kept, 1 it is not or nothing could be run, 2 bad arguments or input, 3 refused (artifacts,
-            a disk too full to record to), 130 interrupted (the report of what there is is written)
+exit codes: 0 the budget is kept, 1 it is not or nothing could be run, 2 bad arguments or input, 3 refused (artifacts),
+            130 interrupted (the report of what there is is written)
 """
 
 
@@ -100,9 +99,6 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     args = parser().parse_args(argv)
     try:
         check_result_target(args.json)
-        refusal = _no_room(args.out.absolute())
-        if refusal is not None:
-            return _complain(refusal, EXIT_REFUSED)
         options = options_of(args)
         menu = _menu(args.faults)
         budget = budgets.load_budget(args.budget or budgets.DEFAULT)
@@ -134,12 +130,6 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     if not finished:
         return _complain(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
     return EXIT_CHECK_FAILED if result["verdict"] == FAIL else EXIT_DONE
-
-
-def _no_room(out: Path) -> str | None:
-    """Why no runner would be armed with its flight logs under `out`, which need not be there yet; None: it would."""
-    there = next(folder for folder in (out, *out.parents) if folder.exists())
-    return space_refusal(there / "flight.mcap")
 
 
 def options_of(args: argparse.Namespace) -> SoakOptions:

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge.cli import write_whole
+from edge.recorder import space_refusal
 from edge.stats import percentiles
 from sim_hil.faults.client import FaultError
 from sim_hil.realtime.children import StepError
@@ -92,9 +93,10 @@ class SoakFolder:
 
     @staticmethod
     def create(path: Path, options: SoakOptions) -> SoakFolder:
-        """A new one; raises SoakInputError where there is one already."""
+        """A new one; raises SoakInputError where there is one already, or no room to record to."""
         if (path / CONFIG).exists():
             raise SoakInputError(f"--out {path}: holds a soak; continue it with --resume or name another folder")
+        _need_room(path)
         (path / LEGS).mkdir(parents=True, exist_ok=True)
         write_whole(path / CONFIG, json.dumps(options.config(), indent=1) + "\n")
         return SoakFolder(path)
@@ -111,7 +113,10 @@ class SoakFolder:
         if differ:
             key = differ[0]
             raise SoakInputError(f"--resume: {path} was begun with {key} {before.get(key)!r}, found {now[key]!r}")
-        return SoakFolder.open(path)
+        found = SoakFolder.open(path)
+        if options.duration_s - found.elapsed_s >= SHORTEST_LEG_S:
+            _need_room(path)
+        return found
 
     @staticmethod
     def open(path: Path) -> SoakFolder:
@@ -125,6 +130,14 @@ class SoakFolder:
             else:
                 shutil.rmtree(folder)  # killed before its first second
         return found
+
+
+def _need_room(path: Path) -> None:
+    """Raises SoakInputError where no runner would be armed with its flight logs under `path`, there already or not."""
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
+    refusal = space_refusal(there / "flight.mcap")
+    if refusal is not None:
+        raise SoakInputError(f"--out {path}: {refusal}")
 
 
 def run_legs(

@@ -26,6 +26,7 @@ from edge.cli import (
     check_result_target,
     write_result,
 )
+from edge.recorder import space_refusal
 from sim_hil.faults.client import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.stack import free_domain, socket_dir
@@ -124,11 +125,17 @@ def say(line: str) -> None:
 
 
 def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
-    """Everything; what was measured until an interrupt or a failure of the rig is kept and shown."""
+    """Everything; what was measured until an interrupt or a failure of the rig is kept and shown.
+
+    Raises StepError where no runner would be armed, FaultError when the robot's side does not answer.
+    """
     results: list[RowResult] = []
     domain = free_domain() if args.domain is None else args.domain
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
+        refusal = space_refusal(folder / "flight.mcap")
+        if refusal is not None:
+            raise StepError(f"{folder}: {refusal}")
         stack.callback(keep_logs, folder, args.out)
         host = stack.enter_context(HostStall())
         rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), domain, say))

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from edge.recorder import space_refusal
 from firmware_bridge.config import RobotConfig, load_robot_config
 from sim_hil.faults.client import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError, tail
@@ -32,8 +31,10 @@ _COMMANDER_S = 2.2
 class Rig:
     """One domain's worth of processes; a context manager that ends exactly those it started."""
 
-    def __init__(self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None]) -> None:
-        """`folder` takes sockets and logs; a short path, since a socket's may have 107 bytes."""
+    def __init__(
+        self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None], *, record: bool = True
+    ) -> None:
+        """`folder` takes sockets and logs; a short path, since a socket's may have 107 bytes. `record`: flights too."""
         self.folder = folder
         self.domain = domain
         self.hearing = Hearing(folder / "heard.jsonl")
@@ -41,6 +42,7 @@ class Rig:
         self.runner_starts = 0
         self.jump_m = 1.0
         self._artifacts = artifacts
+        self._record = record
         self._say = say
         self._children = Children(folder, grace_s=5.0)
         self._trace = Tail(folder / "trace.jsonl")
@@ -96,17 +98,10 @@ class Rig:
         socket = self.folder / f"r{self._runs}.faults"
         command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
-        command += self._recording(self.folder / f"flight{self._runs}.mcap")
+        if self._record:
+            command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
         self.runner = self._children.start(f"edge-run-{self._runs}", command)
         self._inside = FaultClient(socket, self.folder / f"i{self._runs}")
-
-    def _recording(self, log: Path) -> list[str]:
-        """Record as a robot does; where the disk is too full for that, the rows are of a runner that does not."""
-        refusal = space_refusal(log)
-        if refusal is None:
-            return ["--record", str(log)]
-        self._say(f"not recorded: {refusal}")
-        return []
 
     def ensure_moving(self) -> None:
         """Have the robot driven, steadily and at full speed; starts what is not running. Raises StepError."""

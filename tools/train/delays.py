@@ -35,7 +35,8 @@ class DelayConfig:
     profile: str = ""
     """A file of `edge-calib latency`; empty: uniform."""
     near_share: float = 0.0
-    """Share of ages that are uniform up to `near_s` instead: it is by fresh words that a policy learns to listen."""
+    """Share of ages that are uniform up to `near_s` instead: it is by fresh words that a policy learns to listen. Of a
+    profile's it is not used."""
     near_s: float = 4.0
 
     def __post_init__(self) -> None:
