@@ -53,8 +53,7 @@ def running(module: str, *arguments: object, folder: Path, ready: str = "ready")
     started = Running(process, stderr)
     try:
         try:
-            over = _READY_TIMEOUT_S, f"{module} ready"
-            wait_for(lambda: ready in started.stderr() or process.poll() is not None, *over)
+            wait_for(lambda: ready in started.stderr() or process.poll() is not None, _READY_TIMEOUT_S, module)
         except AssertionError as error:
             raise AssertionError(f"{error}; it has said: {started.stderr()}") from error
         assert process.poll() is None, f"{module} ended with {process.returncode}: {started.stderr()}"
