@@ -32,7 +32,7 @@ from tools.train.anchors import (
     too_far,
     waiting,
 )
-from tools.train.trace_words import Trace
+from tools.train.trace_words import TURN_BACK, Trace
 
 NANO = PRESETS["nano"]
 PERIOD_NS = 100_000_000
@@ -199,6 +199,13 @@ def test_anchors_decide_near_which_the_progress_changes(anchors: dict[int, Ancho
     for anchor in anchors.values():
         near = [other.progress for other in anchors.values() if abs(other.k - anchor.k) <= 30]
         assert anchor.decides == (near[0] != near[-1])
+
+
+def test_anchors_decide_where_the_robot_has_to_turn_back() -> None:
+    traces = tuple({"k": k, **trace_at(k), "plan": TURN_BACK if k == 20 else trace_at(k)["plan"]} for k in (0, 10, 20))
+    found = {anchor.k: anchor for anchor in anchors_of(made_up_drive("a", 30, traces=traces))}
+    assert {anchor.progress for anchor in found.values()} == {progress_at(0)}
+    assert [k for k, anchor in found.items() if anchor.decides] == [20]
 
 
 @pytest.mark.parametrize("progress", [Progress(1, 1, 0), Progress(2, 3, 2), Progress(4, 3, 0), Progress(1, 0, 0)])

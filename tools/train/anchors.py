@@ -27,7 +27,7 @@ from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
 from export.model.config import TicVlaConfig
 from tools.train.drive import RATE_HZ, TRACE_EVERY, Drive
-from tools.train.trace_words import Trace
+from tools.train.trace_words import TURN_BACK, Trace
 
 FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """How far before the newest frame the older ones are (paper appendix A), the oldest first."""
@@ -88,7 +88,7 @@ class Anchor:
     earlier: tuple[Progress, ...]
     """The progress at every second from the drive's start up to k, which is the last."""
     decides: bool = False
-    """The progress changes within 3 s: here repeating what was said before does not help."""
+    """The progress changes within 3 s, or the robot has to turn back: repeating what was said before does not help."""
     around: tuple[Waypoints | None, ...] = ()
     """`points` of the frames from AROUND before it to AROUND after it; None where the drive has none."""
     waited: bool = False
@@ -134,6 +134,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
     found: list[Anchor] = []
     earlier: list[Progress] = []
     said = [Progress(**trace["progress"]) for trace in drive.traces]
+    last = len(said) - 1
     for number, trace in enumerate(drive.traces):
         k = int(trace["k"])
         if k >= len(drive):
@@ -158,7 +159,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 progress=earlier[-1],
                 earlier=tuple(earlier),
                 around=around,
-                decides=said[max(0, number - _NEAR)] != said[min(number + _NEAR, len(said) - 1)],
+                decides=trace["plan"] == TURN_BACK or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
             )
         )
     return found

@@ -76,7 +76,7 @@ class SftConfig:
     go_on_lr_share: float = 0.3
     """Of epochs and of the learning rate, after a round of DAgger, from the weights before; 0: from the beginning."""
     deciding: int = 2
-    """How often an anchor is shown in an epoch near which the progress changes; the others once."""
+    """How often an anchor that decides (`tools.train.anchors`) is shown in an epoch; the others once."""
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=1e-3, final_lr_share=0.02, warmup_steps=200, bf16=True)
     )
