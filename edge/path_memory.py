@@ -118,11 +118,11 @@ class PathMemory:
         # One more than is told: the end is the robot's own place.
         told = simplified([*self._points, here], MAX_POINTS + 1, TOLERANCE_M)[:-1]
         T_base_odom = T_odom_base.inverse()
-        return tuple(_told(T_base_odom @ SE2(x, y, 0.0)) for x, y in told)
+        return tuple(told_point(T_base_odom @ SE2(x, y, 0.0)) for x, y in told)
 
 
-def _told(T_base_point: SE2) -> Point:
-    """0.1 m, without a negative zero."""
+def told_point(T_base_point: SE2) -> Point:
+    """A place in the robot's frame as a prompt tells it: 0.1 m, without a negative zero, of a bounded length."""
     x_m, y_m = (
         round(min(max(value, -FARTHEST_M), FARTHEST_M), 1) + 0.0 for value in (T_base_point.x_m, T_base_point.y_m)
     )

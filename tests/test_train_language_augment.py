@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.geometry import SE2
 from edge.reasoning_text import parse_waypoints
 from tests.training_drives import drive
 from tools.train.anchors import AROUND, Anchor, anchors_of, waiting
@@ -31,6 +32,14 @@ def test_the_newest_frame_is_any_of_those_around_and_its_waypoints_are_its_own(a
         assert each.frames[-1] == each.k
         assert np.allclose(each.points, recorded.plan_xy[each.k])
         assert parse_waypoints(each.reasoning) == pytest.approx(np.round(np.array(each.points), 2), abs=0.06)
+
+
+def test_the_way_is_told_in_the_frame_that_is_shown(anchors: list[Anchor]) -> None:
+    recorded, anchor = drive(frames=150), anchors[11]
+    for each in drawn(anchor, ShowConfig()):
+        T_shown_anchor = recorded.T_odom_base(each.k).inverse() @ recorded.T_odom_base(anchor.k)
+        moved = [T_shown_anchor @ SE2(x_m, y_m, 0.0) for x_m, y_m in anchor.way]
+        assert each.way == tuple(pytest.approx((point.x_m, point.y_m), abs=0.051) for point in moved)
 
 
 def test_older_frames_are_near_where_they_should_be_and_in_order(anchors: list[Anchor]) -> None:

@@ -87,6 +87,8 @@ class Anchor:
     progress: Progress
     earlier: tuple[Progress, ...]
     """The progress at every second from the drive's start up to k, which is the last."""
+    poses: tuple[SE2, ...]
+    """`T_odom_base` of every frame of its drive as it was recorded, in the mirror too; its anchors share them."""
     decides: bool = False
     """The progress changes within 3 s, or the robot has to turn back: repeating what was said before does not help."""
     around: tuple[Waypoints | None, ...] = ()
@@ -131,6 +133,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
     if every < 1 or every % TRACE_EVERY:
         raise ValueError(f"anchors: expected a multiple of {TRACE_EVERY} frames, found {every}")
     memory, seen = PathMemory(), 0
+    poses = tuple(drive.T_odom_base(k) for k in range(len(drive)))
     found: list[Anchor] = []
     earlier: list[Progress] = []
     said = [Progress(**trace["progress"]) for trace in drive.traces]
@@ -140,7 +143,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         if k >= len(drive):
             break
         while seen <= k:
-            memory.put(seen * _NS // RATE_HZ, drive.T_odom_base(seen))
+            memory.put(seen * _NS // RATE_HZ, poses[seen])
             seen += 1
         earlier.append(said[number])
         if k % every:
@@ -152,12 +155,13 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 drive_id=drive.id,
                 k=k,
                 frames=frames_at(k),
-                way=memory.way(drive.T_odom_base(k)),
+                way=memory.way(poses[k]),
                 wordings=drive.wordings,
                 points=points,
                 reasoning=Trace.from_json(trace).text(points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
+                poses=poses,
                 around=around,
                 decides=trace["plan"] == TURN_BACK or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
             )

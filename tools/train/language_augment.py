@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.geometry import SE2
+from edge.path_memory import Way, told_point
 from edge.reasoning_text import format_waypoints
 from tools.train.anchors import AROUND, Anchor, frames_at
 from tools.train.language_batch import Halves
@@ -47,10 +49,16 @@ def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anc
     return replace(
         anchor,
         k=anchor.k + by,
+        way=_seen_from(anchor.way, anchor.poses[anchor.k + by].inverse() @ anchor.poses[anchor.k]),
         frames=_jittered(frames_at(anchor.k + by), jitter),
         points=points,
         reasoning=f"{lines}\n{format_waypoints(points)}",
     )
+
+
+def _seen_from(way: Way, T_there_here: SE2) -> Way:
+    """A way's points in the robot's frame a few frames off."""
+    return tuple(told_point(T_there_here @ SE2(x_m, y_m, 0.0)) for x_m, y_m in way)
 
 
 def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, ...]:
