@@ -87,12 +87,12 @@ class Anchor:
     progress: Progress
     earlier: tuple[Progress, ...]
     """The progress at every second from the drive's start up to k, which is the last."""
-    poses: tuple[SE2, ...]
-    """`T_odom_base` of every frame of its drive as it was recorded, in the mirror too; its anchors share them."""
     decides: bool = False
     """The progress changes within 3 s, or the robot has to turn back: repeating what was said before does not help."""
     around: tuple[Waypoints | None, ...] = ()
     """`points` of the frames from AROUND before it to AROUND after it; None where the drive has none."""
+    moved: tuple[SE2 | None, ...] = ()
+    """The robot's pose at k in its frame at each of those, as odometry told it."""
     waited: bool = False
     """The robot has stood here since the instruction, for a generation or more."""
     by_seconds: bool = False
@@ -133,7 +133,6 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
     if every < 1 or every % TRACE_EVERY:
         raise ValueError(f"anchors: expected a multiple of {TRACE_EVERY} frames, found {every}")
     memory, seen = PathMemory(), 0
-    poses = tuple(drive.T_odom_base(k) for k in range(len(drive)))
     found: list[Anchor] = []
     earlier: list[Progress] = []
     said = [Progress(**trace["progress"]) for trace in drive.traces]
@@ -143,30 +142,36 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         if k >= len(drive):
             break
         while seen <= k:
-            memory.put(seen * _NS // RATE_HZ, poses[seen])
+            memory.put(seen * _NS // RATE_HZ, drive.T_odom_base(seen))
             seen += 1
         earlier.append(said[number])
         if k % every:
             continue
-        around = tuple(_points(drive, i) if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1))
+        near = [i if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1)]
+        T_odom_base = drive.T_odom_base(k)
         points = _points(drive, k)
         found.append(
             Anchor(
                 drive_id=drive.id,
                 k=k,
                 frames=frames_at(k),
-                way=memory.way(poses[k]),
+                way=memory.way(T_odom_base),
                 wordings=drive.wordings,
                 points=points,
                 reasoning=Trace.from_json(trace).text(points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
-                poses=poses,
-                around=around,
+                around=tuple(None if i is None else _points(drive, i) for i in near),
+                moved=tuple(None if i is None else _from(drive.T_odom_base(i), T_odom_base) for i in near),
                 decides=trace["plan"] == TURN_BACK or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
             )
         )
     return found
+
+
+def _from(T_odom_there: SE2, T_odom_here: SE2) -> SE2:
+    """`T_there_here` without its last digits, which an angle's wrapping leaves other ones of in the mirror."""
+    return SE2(*(round(value, 9) for value in (T_odom_there.inverse() @ T_odom_here).as_tuple()))
 
 
 def _points(drive: Drive, k: int) -> Waypoints:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2
-from edge.path_memory import Way, told_point
+from edge.path_memory import told_point
 from edge.reasoning_text import format_waypoints
 from tools.train.anchors import AROUND, Anchor, frames_at
 from tools.train.language_batch import Halves
@@ -43,22 +43,18 @@ def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anc
     by = int(rng.integers(-config.shift_frames, config.shift_frames + 1))
     jitter = rng.integers(-config.jitter_frames, config.jitter_frames + 1, 8)
     points = anchor.around[AROUND + by] if anchor.around else None
-    if anchor.waited or points is None:
+    T_shown_anchor = anchor.moved[AROUND + by] if anchor.moved else None
+    if anchor.waited or points is None or T_shown_anchor is None:
         return anchor
     lines, _ = anchor.reasoning.rsplit("\n", 1)
     return replace(
         anchor,
         k=anchor.k + by,
-        way=_seen_from(anchor.way, anchor.poses[anchor.k + by].inverse() @ anchor.poses[anchor.k]),
+        way=tuple(told_point(T_shown_anchor @ SE2(x_m, y_m, 0.0)) for x_m, y_m in anchor.way),
         frames=_jittered(frames_at(anchor.k + by), jitter),
         points=points,
         reasoning=f"{lines}\n{format_waypoints(points)}",
     )
-
-
-def _seen_from(way: Way, T_there_here: SE2) -> Way:
-    """A way's points in the robot's frame a few frames off."""
-    return tuple(told_point(T_there_here @ SE2(x_m, y_m, 0.0)) for x_m, y_m in way)
 
 
 def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, ...]:

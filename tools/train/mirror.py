@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.geometry import SE2
 from edge.reasoning_text import Waypoints, format_waypoints
 from tools.train.anchors import Anchor
 from tools.train.drive import TRACE_EVERY, Dataset, Drive
@@ -38,6 +39,7 @@ def mirrored(anchor: Anchor) -> Anchor:
         wordings=tuple(mirrored_text(wording) for wording in anchor.wordings),
         points=points,
         around=tuple(None if near is None else _across(near) for near in anchor.around),
+        moved=tuple(None if T is None else SE2(T.x_m, 0.0 - T.y_m, 0.0 - T.theta_rad) for T in anchor.moved),
         reasoning=f"{mirrored_text(lines)}\n{format_waypoints(points)}",
     )
 
