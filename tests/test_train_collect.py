@@ -21,12 +21,14 @@ from tests.train_fake_worker import BEGUN
 from tools.train import collect, collection
 from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import Draw, Order, messages
-from tools.train.collection import CollectError, Collection, fill, job_count
+from tools.train.collection import CollectError, CollectFailedError, Collection, fill, job_count
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.distributed import Ranks
 from tools.train.drive import Dataset, Drive
+from tools.train.evaluate import EvaluateConfig
 from tools.train.job import QuietProgress
+from tools.train.scenarios import KEPT_SEEDS
 
 FAKE = (sys.executable, "-m", "tests.train_fake_worker")
 Faulty = Callable[..., None]
@@ -124,19 +126,19 @@ def test_a_process_that_ends_badly_after_its_last_drive_costs_nothing(tmp_path: 
 
 def test_a_process_that_never_begins_ends_the_collection_with_its_last_words(tmp_path: Path, faulty: Faulty) -> None:
     faulty(deaf=True)
-    with pytest.raises(CollectError, match=r"e00000 .* exit code 5: no hands"):
+    with pytest.raises(CollectFailedError, match=r"e00000 .* exit code 5: no hands"):
         _collect(tmp_path, count=8)
 
 
 def test_a_refusal_ends_the_collection(tmp_path: Path, faulty: Faulty) -> None:
     faulty(refuse=True)
-    with pytest.raises(CollectError, match="not these artifacts"):
+    with pytest.raises(CollectFailedError, match="not these artifacts"):
         _collect(tmp_path, count=8)
 
 
 def test_when_most_drives_give_nothing_it_says_so_instead_of_going_on(tmp_path: Path, faulty: Faulty) -> None:
     faulty(drop=[f"e{number:05d}" for number in range(80)])
-    with pytest.raises(CollectError, match="gave nothing to learn, the last: it left the way"):
+    with pytest.raises(CollectFailedError, match="gave nothing to learn, the last: it left the way"):
         _collect(tmp_path, count=80)
 
 
@@ -150,7 +152,7 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
             opened.append(self)
 
     monkeypatch.setattr(collection, "Workers", Watched)
-    with pytest.raises(CollectError):
+    with pytest.raises(CollectFailedError):
         _collect(tmp_path)
     assert [workers.running() for workers in opened] == [0]
 
@@ -180,6 +182,15 @@ def test_another_turn_of_the_same_run_has_other_scenarios() -> None:
     one = _collection().orders(Path("folder"), lambda _: False)[0]
     other = replace(_collection(), turn=1).orders(Path("folder"), lambda _: False)[0]
     assert one.scenario_seed != other.scenario_seed and one.seed != other.seed
+
+
+def test_nothing_is_collected_from_what_evaluation_and_reinforcement_learning_drive_in() -> None:
+    found = {
+        replace(_collection(), seed=seed, turn=1).orders(Path("folder"), lambda _: False)[0].scenario_seed
+        for seed in range(2000)
+    }
+    assert len(found) > 1000 and found.isdisjoint(KEPT_SEEDS)
+    assert EvaluateConfig().scenario_seed in KEPT_SEEDS
 
 
 def test_what_is_drawn_has_the_shares_that_were_asked_for() -> None:

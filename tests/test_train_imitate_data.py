@@ -75,6 +75,14 @@ def test_age_and_motion_offset_are_exactly_those_between_state_and_frame(dataset
             np.testing.assert_allclose(latency[1:], (anchor.inverse() @ now).as_tuple(), atol=1e-6)
 
 
+def test_an_age_beyond_what_the_robot_tells_is_told_as_the_robot_tells_it(dataset: Dataset) -> None:
+    samples = of(dataset, dataclasses.replace(PLAIN, longest_told_s=2.0))
+    ages = [age for chosen, _ in drawn(samples, 60) for age in chosen.ages]
+    told_s = [row[0] for _, group in drawn(samples, 60) for row in group.latency]
+    assert max(ages) > 20
+    np.testing.assert_allclose(told_s, np.minimum(np.array(ages) / 10, 2.0), atol=1e-6)
+
+
 def test_picture_state_and_label_are_those_of_the_frame(dataset: Dataset) -> None:
     samples = of(dataset)
     for chosen, group in drawn(samples, 30):

@@ -20,6 +20,7 @@ from export.model.weights import WeightsInfo, save_weights
 from export.shipped import shipped_weights
 from tools.train import chain, cli
 from tools.train.chain import Step, adopt, is_done, may_begin, retired, run_step, steps_of, steps_until
+from tools.train.collection import CollectFailedError
 from tools.train.exported import ExportError, export_artifacts, model_argument
 from tools.train.job import StageJob
 from tools.train.model_card import CardError, card, ship, write_card
@@ -33,6 +34,7 @@ from tools.train.network_file import (
 )
 from tools.train.recipe import DaggerConfig, Recipe, load_recipe
 from tools.train.run_dir import RunDir, RunDirError
+from tools.train.vector_env import RolloutFailedError
 
 TINY = load_recipe("tiny")
 SCORE = {
@@ -304,7 +306,23 @@ def test_a_devices_delays_are_those_of_every_stage_that_injects_any(tmp_path: Pa
     out = tmp_path / "out"
     recipe = cli._recipe(cli.parser().parse_args(["all", "--out", str(out), "--delay-profile", str(profile)]))
     assert recipe.imitate is not None and recipe.rl is not None
-    assert recipe.imitate.delays.profile == recipe.rl.delay_profile == str(profile)
+    assert recipe.imitate.delays.profile == recipe.rl.delay_profile
+    assert Path(recipe.rl.delay_profile).parent == out
+
+
+def test_a_run_keeps_its_own_copy_of_a_devices_delays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    profile, out = tmp_path / "orin.json", tmp_path / "out"
+    monkeypatch.setattr(chain, "module_run", stage_that("weights"))
+    asked = ("imitate", "--preset", "tiny", "--out", out, "--delay-profile", profile)
+    profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
+    assert run(*asked) == EXIT_DONE
+    profile.write_text(json.dumps(LatencyProfile.constant(5.0).as_json()))
+    imitation = load_recipe(str(out / "recipe.toml")).imitate
+    assert imitation is not None and imitation.delays.load().mean_s == pytest.approx(3.0, abs=0.1)
+    assert run(*asked, "--resume") == EXIT_BAD_INPUT
+    assert "begun with other numbers (imitate.delays.profile" in capsys.readouterr().err
 
 
 def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[str, Any]]]:
@@ -322,6 +340,8 @@ def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[s
     [
         (KeyboardInterrupt(), EXIT_INTERRUPTED),
         (ExportError("a gate failed"), EXIT_CHECK_FAILED),
+        (CollectFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (RolloutFailedError("its process ended"), EXIT_CHECK_FAILED),
         (RunDirError("no such drive"), EXIT_BAD_INPUT),
         (OSError("the disk is full"), EXIT_BAD_INPUT),
     ],

@@ -14,6 +14,7 @@ import pytest
 
 from edge.controller import Controller, ControllerConfig, ControllerInputs
 from edge.geometry import SE2
+from edge.latency_profile import LatencyProfile
 from edge.monitors.semantic import SemanticConfig
 from edge.semantic import SemanticState
 from sim_hil.benchmark.policies import robot_config
@@ -27,7 +28,8 @@ from tools.train.rollout import EpisodeEnd, EpisodeSteps
 from tools.train.scenarios import FIRST_SEED
 from tools.train.vector_env import split
 
-ORDER = RolloutOrder("", "", {}, 0, "", "out", 9003, (0, 1, 0, 1, 0), {}, (1.0, 2.0, 3.0), True, "none", 10.0, 7)
+TIMES = LatencyProfile("some", "drawn", (1.0, 2.0, 3.0))
+ORDER = RolloutOrder("", "", {}, 0, "", "out", 9003, (0, 1, 0, 1, 0), {}, TIMES, True, "none", 10.0, 7)
 SOME = replace(ORDER, numbers=(3, 4, 5, 4))
 
 

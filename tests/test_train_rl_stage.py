@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
 
+from edge.latency_profile import LatencyProfile
 from export.model.network import TicVla
 from export.model.weights import WeightsInfo, save_weights
 from tests.test_train_rl_tail import LIMITS, _config, _episode, _network
@@ -175,6 +179,38 @@ def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> No
         )
 
 
+def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Path) -> None:
+    profile = LatencyProfile("orin", "measured there", (2.0, 3.0), (0.5, 0.7))
+    (tmp_path / "orin.json").write_text(json.dumps(profile.as_json()))
+    config = RlConfig(iterations=1, warmup_iterations=0, ppo=PPO, delay_profile=str(tmp_path / "orin.json"))
+    heard: list[LatencyProfile] = []
+    driver = _driver(_network(), lambda _: True)
+
+    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
+        heard.append(RolloutOrder.of_json(json.loads(json.dumps(order.to_json()))).delays)
+        return driver(order, **told)
+
+    _improved(tmp_path / "run", config, drive)
+    assert heard and set(heard) == {profile}
+
+
+def test_every_episode_is_told_as_it_ends(tmp_path: Path) -> None:
+    config = RlConfig(iterations=1, episodes=4, evaluate_episodes=2, warmup_iterations=0, ppo=PPO)
+    driver = _driver(_network(), lambda _: True)
+    progress = Mock()
+
+    def drive(order: RolloutOrder, *, told: Callable[[bool], None], **others: Any) -> rollout.Rollout:
+        for _ in order.numbers:
+            told(True)
+        return driver(order, **others)
+
+    job = replace(_job(tmp_path, config), progress=progress)
+    learner = TailLearner(_network(), LIMITS, config.log_std)
+    improve(job, learner, _imitated(job), tmp_path / "artifacts", drive)
+    said = [call.args for call in progress.update.call_args_list]
+    assert [(done, of) for done, of in said if of == 4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
 def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
     with pytest.raises(RlError, match="run imitate first"):
         run(_job(tmp_path, RlConfig()))
@@ -201,5 +237,5 @@ def test_kinds_of_scenes_take_turns() -> None:
 
 
 def test_delays_have_the_mean_that_was_asked_for() -> None:
-    times = RlConfig(mean_delay_s=5.0).generation_s()
+    times = RlConfig(mean_delay_s=5.0).delays().generation_s
     assert sum(times) / len(times) == pytest.approx(5.0) and (min(times), max(times)) == (0.0, 10.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import signal
 import sys
@@ -23,6 +25,7 @@ from edge.cli import (
     EXIT_REFUSED,
     check_result_target,
     write_result,
+    write_whole,
 )
 from export.progress import duration, peak_rss_bytes
 from tools.benchmark_runs import RunsError
@@ -31,7 +34,7 @@ from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.curves import draw_curves
 from tools.train.distributed import SINGLE, Ranks, leave, ranks_of_environment
 from tools.train.exported import ExportError
-from tools.train.job import StageJob, StopFlag
+from tools.train.job import StageFailedError, StageJob, StopFlag
 from tools.train.model_card import ship, write_card
 from tools.train.network_file import START, import_start
 from tools.train.optim import computes_bf16
@@ -61,7 +64,8 @@ EXAMPLES: Final = """examples:
 stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
 under delay), dagger (the policy drives, the expert relabels, imitation again), rl (PPO), evaluate (in scenes like
 training's that no stage has seen)
-exit codes: 0 done, 1 an export or an episode failed, 2 bad arguments or input, 3 refused (artifacts), 130 interrupted
+exit codes: 0 done, 1 an export, a drive or an episode failed, 2 bad arguments or input, 3 refused (artifacts),
+            130 interrupted
 """
 
 
@@ -127,7 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         again = "; go on with --resume" if args.out is not None else ""
         return _fail(EXIT_INTERRUPTED, f"interrupted, what is finished stays{again}")
-    except (ExportError, RunsError) as error:
+    except (ExportError, RunsError, StageFailedError) as error:
         return _fail(EXIT_CHECK_FAILED, str(error))
     except ArtifactError as error:
         return _fail(EXIT_REFUSED, str(error))
@@ -185,10 +189,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     implied = ["dagger.rounds=0"] if args.base is not None else []
     settings = [*implied, *VARIANTS[args.variant or "full"], *args.settings]
     if args.delay_profile is not None:
-        from edge.latency_profile import load_profile
-
-        load_profile(args.delay_profile)
-        path = args.delay_profile.absolute()
+        path, _ = _own_profile(args)
         # What imitation was begun with stays where only reinforcement learning is asked for, and the other way round.
         settings += [f"imitate.delays.profile={path}"] if args.command != "rl" else []
         settings += [f"rl.delay_profile={path}"] if args.command != "imitate" else []
@@ -201,6 +202,19 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     if args.command == "card" and found is None:
         raise UsageError("card: expected --out to be the folder of a run")
     return load_recipe(str(args.preset or args.recipe or found or "nano"), settings)
+
+
+def _own_profile(args: argparse.Namespace) -> tuple[Path, str]:
+    """(path, content) of the run's own copy of --delay-profile, named by what is in it.
+
+    A run that goes on after the file was measured again would otherwise learn under other delays without a word.
+    """
+    from edge.latency_profile import load_profile
+
+    content = json.dumps(load_profile(args.delay_profile).as_json()) + "\n"
+    if args.out is None:
+        return args.delay_profile.absolute(), content
+    return args.out.absolute() / f"delays-{hashlib.sha256(content.encode()).hexdigest()[:12]}.json", content
 
 
 def _check_device(device: str) -> None:
@@ -261,6 +275,8 @@ def _train(
 def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
     """What a run has before its first step: its recipe, and the drives and weights that it is given."""
     run_dir = RunDir.open(args.out, recipe)
+    if args.delay_profile is not None:
+        write_whole(*_own_profile(args))
     if args.base is not None:
         run_dir.borrow(RunDir(args.base), BORROWED, recipe)
     if args.drives is not None:

@@ -18,7 +18,8 @@ from tools.train.collect_worker import MODULE, Order
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Entry
-from tools.train.scenarios import MAX_SEED
+from tools.train.job import StageFailedError
+from tools.train.scenarios import KEPT_SEEDS, MAX_SEED
 from tools.train.tour_config import TourConfig
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
@@ -28,7 +29,11 @@ _MOST_DROPPED: Final = 0.5  # of the drives: with more, something is wrong that 
 
 
 class CollectError(Exception):
-    """A collection that cannot go on; one line: what, and what to do."""
+    """A collection that cannot begin; one line: what, and what to do."""
+
+
+class CollectFailedError(StageFailedError):
+    """A collection that cannot go on; one line: what."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class Collection:
         """One order a layout, of those that lack a drive."""
         rng = np.random.default_rng((self.seed, self.turn, _TAG))
         scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
+        if scenario_seed in KEPT_SEEDS:
+            scenario_seed -= len(KEPT_SEEDS)
         # Jobs are no part of an order: it must not matter how many there are.
         config = replace(self.config, jobs=0)
         orders, size = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
@@ -71,7 +78,7 @@ def fill(
     stopped: Callable[[], bool] = lambda: False,
     command: Sequence[str] = WORKER,
 ) -> None:
-    """Record what the data set lacks. Raises CollectError, OSError, and KeyboardInterrupt when `stopped`."""
+    """Record what the data set lacks. Raises CollectFailedError, OSError, and KeyboardInterrupt when `stopped`."""
     waiting = deque(collection.orders(writer.folder, writer.has))
     under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
     logs = writer.folder / "logs"
@@ -92,7 +99,9 @@ def fill(
             update(done + dropped, collection.count)
             if dropped > max(16, _MOST_DROPPED * (done + dropped)):
                 last = writer.dropped(collection.prefix)[-1].why
-                raise CollectError(f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}")
+                raise CollectFailedError(
+                    f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}"
+                )
     finally:
         workers.close()
 
@@ -112,13 +121,13 @@ def _take(told: Told, writer: DatasetWriter, under_way: dict[str, tuple[Order, s
         if message["dropped"] not in order.skip:
             writer.drop(str(message["dropped"]), str(message["why"]))
     else:
-        raise CollectError(str(message.get("refused", f"a worker said {message}")))
+        raise CollectFailedError(str(message.get("refused", f"a worker said {message}")))
 
 
 def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: deque[Order]) -> None:
     """A process has died: the drive that it had begun is given up, and the rest of its layout is tried again."""
     if not begun:
-        raise CollectError(f"the process of drive {order.id(order.start)} and those after it {why}")
+        raise CollectFailedError(f"the process of drive {order.id(order.start)} and those after it {why}")
     if not writer.has(begun):
         writer.drop(begun, f"its process {why.split(':')[0]}")
     ids = [order.id(number) for number in range(order.start, order.start + order.count)]

@@ -53,6 +53,8 @@ class SampleConfig:
     """Share of states whose prompt is hidden: of a turn it tells the side, and only the text tells when."""
     standing_start: float = 0.5
     """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
+    longest_told_s: float = 10.0
+    """Δt beyond this is told as this, as the robot tells it (the targets' `runtime.max_delay_s`)."""
     offset_noise_m_per_m: float = 0.02
     """Of the motion offset, in m for each metre driven since the state, one standard deviation (paper, Table 14)."""
     offset_noise_deg_per_m: float = 1.0
@@ -69,6 +71,8 @@ class SampleConfig:
             raise ValueError("expected cut_text, prompt_only and text_only from 0 on, together 1 at most")
         if not (0 <= self.standing_start <= 1 and 0 <= self.blind <= 1):
             raise ValueError("expected standing_start and blind from 0 to 1")
+        if not 0 < self.longest_told_s <= 600:
+            raise ValueError(f"longest_told_s: expected above 0 and up to 600 s, found {self.longest_told_s:g}")
         if not (0 <= self.offset_noise_m_per_m <= 1 and 0 <= self.offset_noise_deg_per_m <= 90):
             raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
 
@@ -208,7 +212,8 @@ class Samples:
         state = self._states.at(drive.id, chosen.anchor, int(which * self._states.draws))
         ks = list(chosen.ks)
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
-        latency = [(age / RATE_HZ, *offset.as_tuple()) for age, offset in zip(chosen.ages, offsets, strict=True)]
+        told_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
+        latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(told_s, offsets, strict=True)]
         if self._by_waypoints:
             guidance = self._waypoints(state, offsets)
             keep = np.ones(guidance.shape[:2], bool)

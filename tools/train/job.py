@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from tools.train.run_dir import RunDir
 
 
+class StageFailedError(Exception):
+    """Work of a stage that went wrong, though what was asked for is sound; one line: what, and what to do."""
+
+
 class StageProgress(Protocol):
     """Where a stage tells how far it is; called on every step, shown now and then."""
 

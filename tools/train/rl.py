@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from export.model.network import initialise
-from sim_hil.benchmark.latency import load_profile
+from sim_hil.benchmark.latency import LatencyProfile, load_profile
 from sim_hil.benchmark.policies import robot_config
 from tools.train.action_tail import check_tail
 from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
@@ -30,7 +30,7 @@ from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
 from tools.train.rl_state import STAGE, RlError, Score, State
 from tools.train.rl_worker import RolloutOrder
 from tools.train.rollout import Rollout
-from tools.train.scenarios import SHARES, TASKS_PER_SCENE
+from tools.train.scenarios import KEPT_SEEDS, SHARES, TASKS_PER_SCENE
 from tools.train.vector_env import drive
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 POLICIES: Final = ("action", "point-goal")
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 # Seeds of scenarios that no other stage draws: to learn from, to choose the best by, to say whether it is better.
-_SCENES, _EVALUATION_SCENES, _FINAL_SCENES = 9003, 9002, 9004
+_EVALUATION_SCENES, _SCENES, _FINAL_SCENES = KEPT_SEEDS[1:]
 _EVALUATION_TASKS: Final = 2  # of one layout: more layouts tell more than more tasks in one
 _DELAYS: Final = 41
 STEPS_PER_EPISODE: Final = 300
@@ -117,11 +117,12 @@ class RlConfig:
         first = iteration * self.episodes
         return tuple(n % self.tasks if self.tasks else n for n in range(first, first + self.episodes))
 
-    def generation_s(self) -> tuple[float, ...]:
-        """Reasoning times to draw from, s. Raises LatencyError."""
+    def delays(self) -> LatencyProfile:
+        """Reasoning times to draw from, with how late each captures its newest frame. Raises LatencyError."""
         if self.delay_profile:
-            return load_profile(Path(self.delay_profile)).generation_s
-        return tuple(round(float(v), 4) for v in np.linspace(0.0, 2 * self.mean_delay_s, _DELAYS))
+            return load_profile(Path(self.delay_profile))
+        times = tuple(round(float(v), 4) for v in np.linspace(0.0, 2 * self.mean_delay_s, _DELAYS))
+        return LatencyProfile("training", "drawn", times)
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
@@ -150,10 +151,11 @@ def run(job: StageJob) -> dict[str, Any]:
     imitated = before.parent.name == "imitate" or (before.parent.name == START and is_trained(before))
     if config.policy == "action" and not imitated:
         raise RlError(f"{before}: its action expert has learned nothing yet; run imitate first")
-    network = read_network(before, job.recipe.model, job.recipe.seed).to(job.device)
+    network = read_network(before, job.recipe.model, job.recipe.seed)
+    initialise(network, job.seed, ("value",))
+    network.to(job.device)
     bounds = robot_config().limits
     limits = CommandLimits(bounds.vx_max_mps, bounds.wz_max_radps)
-    initialise(network, job.seed, ("value",))
     folder = job.run_dir.stage(STAGE)
     if config.policy == "point-goal":
         net = build_point_goal(job.recipe.model, job.generator("point-goal")).to(job.device)
@@ -183,7 +185,7 @@ def improve(
     while state.iteration < config.iterations:
         iteration = state.iteration
         order = orders.training(iteration, state.write_policy())
-        rollout = drive(order, jobs=config.jobs, per_job=config.episodes_per_job, stopped=job.should_stop)
+        rollout = _driven(job, config, order, drive)
         numbers = _learn(job, config, learner, state, rollout)
         shutil.rmtree(order.out, ignore_errors=True)
         state.iteration += 1
@@ -242,8 +244,19 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
     return {**numbers, **{key: float(value) for key, value in asdict(stats).items()}}
 
 
+def _driven(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Rollout:
+    """An order's episodes, each told as it ends: an iteration takes minutes."""
+    ended: list[bool] = []
+
+    def told(success: bool) -> None:
+        ended.append(success)
+        job.progress.update(len(ended), len(order.numbers), success=sum(ended) / len(ended))
+
+    return drive(order, jobs=config.jobs, per_job=config.episodes_per_job, told=told, stopped=job.should_stop)
+
+
 def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Score:
-    ends = drive(order, jobs=config.jobs, per_job=config.episodes_per_job, stopped=job.should_stop).ends
+    ends = _driven(job, config, order, drive).ends
     shutil.rmtree(order.out, ignore_errors=True)
     return Score(
         *(
@@ -297,7 +310,7 @@ class _Orders:
             scenario_seed=scenes,
             numbers=numbers,
             kinds=kinds,
-            generation_s=self.config.generation_s(),
+            delays=self.config.delays(),
             explore=explore,
             drift=self.config.drift,
             max_s=self.config.max_s,

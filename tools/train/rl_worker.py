@@ -42,7 +42,7 @@ class RolloutOrder:
 
     `network` are the weights before reinforcement learning, `model` their configuration, `policy` what is trained on
     top of them with its `log_std`, `artifacts` the exported encoder and language model (empty: a point-goal network is
-    trained), `kinds` shares of scenes. `explore` False drives the mean. `generation_s`: reasoning times to draw from.
+    trained), `kinds` shares of scenes. `explore` False drives the mean. `delays`: reasoning times to draw from.
     `first`: place of the first of `numbers` among all that are driven with this `seed`; all that is random is of seed
     and place, so that a scenario that comes again is not the same episode again.
     """
@@ -56,7 +56,7 @@ class RolloutOrder:
     scenario_seed: int
     numbers: tuple[int, ...]
     kinds: dict[str, float]
-    generation_s: tuple[float, ...]
+    delays: LatencyProfile
     explore: bool
     drift: str
     max_s: float
@@ -66,13 +66,13 @@ class RolloutOrder:
 
     def to_json(self) -> dict[str, Any]:
         """What `of_json` reads."""
-        return asdict(self)
+        return {**asdict(self), "delays": self.delays.as_json()}
 
     @staticmethod
     def of_json(content: dict[str, Any]) -> RolloutOrder:
-        """An order that `to_json` has written; raises TypeError."""
-        tuples = {key: tuple(content[key]) for key in ("numbers", "generation_s")}
-        return RolloutOrder(**{**content, **tuples})
+        """An order that `to_json` has written; raises TypeError, LatencyError."""
+        made = {"numbers": tuple(content["numbers"]), "delays": LatencyProfile.of_json(content["delays"])}
+        return RolloutOrder(**{**content, **made})
 
 
 def messages(content: Message) -> Iterator[Message]:
@@ -120,9 +120,8 @@ def crowded(scenario: Scenario, seed: int, place: int) -> Scenario:
 
 def delays(order: RolloutOrder, scenario: Scenario, place: int) -> LatencySampler:
     """Reasoning times of one episode."""
-    profile = LatencyProfile("training", "drawn", order.generation_s)
     seed = int(np.random.default_rng((order.seed, place, _DELAYS)).integers(2**40))
-    return LatencySampler(profile, seed, scenario.episode.id)
+    return LatencySampler(order.delays, seed, scenario.episode.id)
 
 
 PilotFor = Callable[[str], Pilot]

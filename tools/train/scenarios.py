@@ -33,6 +33,8 @@ SHARES: Final[Mapping[str, float]] = MappingProxyType(
 )
 FIRST_SEED: Final = 1_000_000  # of episodes: far above the suite's
 MAX_SEED: Final = 9_999
+KEPT_SEEDS: Final = range(9_001, 9_005)
+"""Evaluation's and reinforcement learning's: nothing is collected from these."""
 _GROUPS: Final = 100_000  # layouts of one seed
 _LAYOUT_TRIES: Final = 4
 _DRAWS: Final = 60  # for one task

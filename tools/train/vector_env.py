@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from sim_hil.benchmark.worker_pool import Workers
+from tools.train.job import StageFailedError
 from tools.train.rl_worker import MODULE, RolloutOrder
 from tools.train.rollout import Rollout, read
 
@@ -17,7 +18,7 @@ COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
 
 
-class RolloutFailedError(RuntimeError):
+class RolloutFailedError(StageFailedError):
     """A worker that ended without a rollout; one line."""
 
 
