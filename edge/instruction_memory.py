@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from edge.geometry import SE2
 from edge.path_memory import PERIOD_NS, PathMemory, Way
+from edge.progress_guide import EITHER_WAY, FREE, ONWARD
 from edge.reasoning_text import Progress, parse_progress
 from edge.ring import EncodedFrame, TokenRing
 
@@ -26,11 +27,19 @@ class InstructionMemory:
         self._from_ns = from_ns
         self._path = PathMemory()
         self._before: Progress | None = None
+        self._overruled = False
 
     @property
     def before(self) -> Progress | None:
         """What the last generation said that said any progress."""
         return self._before
+
+    @property
+    def follow(self) -> str:
+        """What the next generation may say after that: who has been held back says it again before it counts."""
+        if self._before is None:
+            return FREE
+        return EITHER_WAY if self._overruled else ONWARD
 
     def watch(self, ring: TokenRing) -> None:
         """Take what has come into the ring, at most about once a second: call it more often than the ring is long."""
@@ -45,9 +54,12 @@ class InstructionMemory:
         self._put(anchor.stamp_ns, anchor.T_odom_base)
         return self._path.way(anchor.T_odom_base)
 
-    def heard(self, text: str) -> None:
-        """Remember the progress that a published generation's text says; one that says none changes nothing."""
-        self._before = parse_progress(text) or self._before
+    def heard(self, text: str, *, overruled: bool = False) -> None:
+        """Remember the progress that a published generation's text says; one that says none changes nothing.
+
+        `overruled`: it would have said another one.
+        """
+        self._before, self._overruled = parse_progress(text) or self._before, overruled
 
     def _take(self, ring: TokenRing, until_ns: int) -> None:
         for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):

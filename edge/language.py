@@ -15,8 +15,9 @@ from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
 from edge.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.manifest import Artifacts
+from edge.progress_guide import LineGuide, guide_after
 from edge.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
-from edge.reasoning_text import MAX_TEXT_CHARS
+from edge.reasoning_text import MAX_TEXT_CHARS, Progress
 from edge.ring import EncodedFrame
 from edge.scheduling import Schedule, run_as
 
@@ -39,6 +40,8 @@ class Generation:
     prompt_tokens: int
     prefill_ms: float
     decode_ms: float
+    overruled: bool = False
+    """Whether the model would have said another progress than it was held to."""
 
     @property
     def new_tokens(self) -> int:
@@ -171,11 +174,20 @@ class LanguageModel:
                 f"instruction makes a prompt of {needed} tokens, the model has room for {room}: shorten it"
             )
 
+    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
+        """What a generation may say of its progress after `before` (`edge.progress_guide`); None: anything."""
+        return guide_after(before, follow, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
+
     def generate(
-        self, segments: Sequence[Segment], *, max_new_tokens: int, cancelled: Callable[[], bool]
+        self,
+        segments: Sequence[Segment],
+        *,
+        max_new_tokens: int,
+        cancelled: Callable[[], bool],
+        guide: LineGuide | None = None,
     ) -> Generation:
         """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt."""
-        return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens)
+        return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens, guide=guide)
 
     def begin(
         self,
@@ -239,8 +251,8 @@ class GenerationRun:
             self._run(self._model.prefill_call, chunk)
         self._prefill_ns += time.monotonic_ns() - started_ns
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int) -> Generation:
-        """Prefill the rest of the prompt, whose last token is text, and decode greedily."""
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: LineGuide | None = None) -> Generation:
+        """Prefill the rest of the prompt, whose last token is text, and decode greedily what `guide` allows."""
         model, runtime = self._model, self._model.runtime
         started_ns = time.monotonic_ns()
         *head, last = self._cut(segments)
@@ -254,7 +266,10 @@ class GenerationRun:
         prefilled_ns = time.monotonic_ns()
         new_ids: list[int] = []
         room = runtime.max_context - prompt_tokens
-        while len(new_ids) < min(max_new_tokens, room) and next_id != runtime.im_end_id:
+        while len(new_ids) < min(max_new_tokens, room):
+            next_id = next_id if guide is None else guide.choose(next_id)
+            if next_id == runtime.im_end_id:
+                break
             new_ids.append(next_id)
             next_id = self._run(model.decode_call, Chunk((next_id,), None, 0))
         return Generation(
@@ -264,6 +279,7 @@ class GenerationRun:
             prompt_tokens=prompt_tokens,
             prefill_ms=(self._prefill_ns + prefilled_ns - started_ns) / 1e6,
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
+            overruled=guide is not None and guide.overruled,
         )
 
     def _cut(self, segments: Sequence[Segment]) -> list[Chunk]:

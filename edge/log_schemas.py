@@ -85,7 +85,7 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/semantic": _record(
         "tic_vla.Semantic",
-        ("instruction", "frame_poses", "way", "before", "max_new_tokens"),
+        ("instruction", "frame_poses", "way", "before", "follow", "max_new_tokens"),
         generation=_INT,
         instruction=_TEXT,  # the run's, or another that was given later
         anchor_ns=_INT,
@@ -98,6 +98,7 @@ SCHEMAS: Mapping[str, Schema] = {
         frame_poses=_ROWS,  # (x m, y m, θ rad) at those
         way=_ROWS,  # (x m, y m) in the robot frame at the anchor: the prompt's past motion
         before=_TEXT,  # the progress that the prompt told, "none." without one
+        follow=_TEXT,  # what might be said after it: free, onward, either way
         prompt_tokens=_INT,
         max_new_tokens=_INT,
         new_tokens=_INT,

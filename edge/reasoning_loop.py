@@ -257,9 +257,9 @@ class ReasoningLoop:
         self._last_anchor_ns = anchor.stamp_ns
         cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
         most = min(self._max_new_tokens, cap)
-        way, before = job.memory.way(self._ring, anchor), job.memory.before
+        way, before, follow = job.memory.way(self._ring, anchor), job.memory.before, job.memory.follow
         rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, before)]
-        generation = run.finish(rest, max_new_tokens=most)
+        generation = run.finish(rest, max_new_tokens=most, guide=self._language.guide(before, follow))
         if not np.isfinite(generation.last_layer_kv).all():
             raise NotFiniteError("keys and values of the last layer are not finite")
         before_call(self._context_ns)
@@ -272,7 +272,7 @@ class ReasoningLoop:
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
-        job.memory.heard(generation.text)
+        job.memory.heard(generation.text, overruled=generation.overruled)
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -289,6 +289,7 @@ class ReasoningLoop:
                 "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
                 "way": way,
                 "before": told_before(before),
+                "follow": follow,
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,

@@ -159,6 +159,7 @@ class Replayer:
             ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
+            guide=self._language.guide(record.before, record.follow),
         )
         found.generations += 1
         found.poses_interpolated += record.poses is None

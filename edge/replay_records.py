@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from edge.geometry import SE2
 from edge.path_memory import Way
+from edge.progress_guide import FOLLOWS, FREE
 from edge.prompt import told_before
 from edge.reasoning_text import PROGRESS_HEAD, Progress, parse_progress
 from edge.recording import RecordingError, jpeg_bytes, read_messages
@@ -61,6 +62,8 @@ class RecordedGeneration:
     way: Way | None
     """As the prompt told it; None: a log from before ways were told."""
     before: Progress | None
+    follow: str
+    """What it might say after that (`edge.progress_guide`)."""
     max_new_tokens: int
     text: str
 
@@ -153,6 +156,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
         anchor_pose=_pose(payload["anchor_pose"]),
         way=None if "way" not in payload else tuple(_point(point) for point in payload["way"]),
         before=_before(payload.get("before", told_before(None))),
+        follow=_follow(payload.get("follow", FREE)),
         # Without the cap that was in force: as many as there were, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
         text=_text(payload["text"]),
@@ -195,6 +199,12 @@ def _before(value: Any) -> Progress | None:
     if told_before(progress) != text:
         raise ValueError(f"{text[:60]!r} is no progress")
     return progress
+
+
+def _follow(value: Any) -> str:
+    if value not in FOLLOWS:
+        raise ValueError(f"follow is {str(value)[:60]!r}")
+    return str(value)
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

@@ -48,7 +48,7 @@ class FakeRun:
         if self.cancelled():
             raise CancelledError
 
-    def finish(self, segments: list[object], *, max_new_tokens: int) -> Generation:
+    def finish(self, segments: list[object], *, max_new_tokens: int, guide: object = None) -> Generation:
         if self.cancelled():
             raise CancelledError
         if self.language.broken:
@@ -62,7 +62,9 @@ class FakeRun:
         self.language.instructions.append(segments[0][1])
         self.language.caps.append(max_new_tokens)
         new = min(max_new_tokens, self.language.new_tokens)
-        return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0)
+        return Generation(
+            self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0, overruled=self.language.overruled
+        )
 
 
 class FakeLanguage:
@@ -73,9 +75,14 @@ class FakeLanguage:
         self.prompts: list[list[float]] = []
         self.instructions: list[str] = []
         self.caps: list[int] = []
+        self.guided: list[tuple[Progress | None, str]] = []
+        self.overruled = False
         self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
         self.during_feed: Callable[[], None] = lambda: None
         self.during_finish: Callable[[FakeRun], None] = lambda run: None
+
+    def guide(self, before: Progress | None, follow: str) -> None:
+        self.guided.append((before, follow))
 
     def begin(
         self, cancelled: Callable[[], bool], *, interrupt: Interrupt, before_call: Callable[[int], None]

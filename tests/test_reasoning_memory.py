@@ -9,6 +9,7 @@ import pytest
 from edge.geometry import SE2
 from edge.instruction_memory import InstructionMemory
 from edge.path_memory import PathMemory, Way, way_of
+from edge.progress_guide import EITHER_WAY, FREE, ONWARD
 from edge.reasoning_budget import ReasoningBudget
 from edge.reasoning_loop import Mode, SemanticSlot
 from edge.reasoning_text import Progress
@@ -20,7 +21,6 @@ from tests.reasoning_bench import KV, Bench, Clock, FakeLanguage, FakePolicy
 TICK_NS = 100_000_000
 LINE = "\nwaypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)"
 FIRST = "Progress: turn 1 of 3, passed 2." + LINE
-Told = list[tuple[Way, Progress | None]]
 
 
 def pose_at(tick: int) -> SE2:
@@ -37,9 +37,10 @@ def frame_at(tick: int) -> EncodedFrame:
 
 
 def counting(language: FakeLanguage) -> FakeLanguage:
-    """A model that says one turn more each time."""
+    """A model that says one turn more each time, and means to say another number of them every third time."""
 
     def think(_run: object) -> None:
+        language.overruled = len(language.prompts) % 3 == 2
         language.text = f"Progress: turn {len(language.prompts) + 1} of 99, passed 0.{LINE}"
 
     language.during_finish = think
@@ -61,7 +62,7 @@ def think_at(bench: Bench, second: float) -> tuple[Way, Progress | None]:
 # Both loops
 
 
-def lockstep(ticks: int, latency_s: float) -> Told:
+def lockstep(ticks: int, latency_s: float) -> FakeLanguage:
     """Ticks of the benchmark's reasoner."""
     language, ring, slot = counting(FakeLanguage()), TokenRing(160), SemanticSlot()
     begin = language.begin
@@ -88,10 +89,10 @@ def lockstep(ticks: int, latency_s: float) -> Told:
         reasoner.release(now_ns)
         ring.put(frame_at(tick))
         reasoner.start(now_ns)
-    return language.prompt.told
+    return language
 
 
-def threaded(ticks: int, every: int) -> Told:
+def threaded(ticks: int, every: int) -> FakeLanguage:
     """The runner's loop, a generation after every so many ticks."""
     bench = Bench(clock=Clock(), late_anchor=False)
     counting(bench.language)
@@ -99,25 +100,33 @@ def threaded(ticks: int, every: int) -> Told:
         bench.ring.put(frame_at(tick))
         if tick % every == 0:
             assert bench.loop.step()
-    return bench.language.prompt.told
+    return bench.language
 
 
 def test_both_loops_tell_the_same_way_and_progress() -> None:
     """Here the runner's text is there at once, the benchmark's after 2 s: both before the next generation begins."""
-    of_lockstep, of_runner = lockstep(801, 2.0), threaded(800, 20)
+    of_lockstep, of_runner = lockstep(801, 2.0).prompt.told, threaded(800, 20).prompt.told
     assert len(of_runner) == 40
     assert of_lockstep[:40] == of_runner
     assert [before for _, before in of_runner[:3]] == [None, Progress(1, 99, 0), Progress(2, 99, 0)]
 
 
+def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None:
+    of_lockstep, of_runner = lockstep(801, 2.0).guided, threaded(800, 20).guided
+    assert of_lockstep[:40] == of_runner
+    assert of_runner[:4] == [
+        (None, FREE), (Progress(1, 99, 0), ONWARD), (Progress(2, 99, 0), ONWARD), (Progress(3, 99, 0), EITHER_WAY),
+    ]  # fmt: skip
+
+
 def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:
-    for number, (way, _) in enumerate(threaded(400, 20)):
+    for number, (way, _) in enumerate(threaded(400, 20).prompt.told):
         poses = [(frame_at(tick).stamp_ns, pose_at(tick)) for tick in range(20 * number + 1)]
         assert way == way_of(poses)
 
 
 def test_the_way_does_not_depend_on_how_often_generations_run() -> None:
-    often, seldom = threaded(701, 5), threaded(701, 100)
+    often, seldom = threaded(701, 5).prompt.told, threaded(701, 100).prompt.told
     assert [way for way, _ in often][::20] == [way for way, _ in seldom]
 
 

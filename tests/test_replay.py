@@ -19,6 +19,7 @@ from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.path_memory import way_of
 from edge.policy import Policy
+from edge.progress_guide import EITHER_WAY, FREE, LineGuide
 from edge.prompt import told_before
 from edge.reasoning_text import Progress
 from edge.recorder import Recorder
@@ -250,6 +251,21 @@ def test_what_the_prompt_told_of_the_way_and_progress_is_told_again(log: Log, to
     assert code == 1 and result["ticks"]["equal"] < result["ticks"]["compared"]
 
 
+def test_a_generation_is_held_to_what_it_was_held_to(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Progress | None, str]] = []
+    guide = LanguageModel.guide
+
+    def watched(self: LanguageModel, before: Progress | None, follow: str) -> LineGuide | None:
+        asked.append((before, follow))
+        return guide(self, before, follow)
+
+    monkeypatch.setattr(LanguageModel, "guide", watched)
+    log.payload("/semantic", 1).update(follow=EITHER_WAY)
+    assert log.replay()[0] == 0
+    # A log from before generations were held to anything says nothing of it.
+    assert asked[:3] == [(None, FREE), (Progress(1, 3, 1), EITHER_WAY), (Progress(1, 3, 2), FREE)]
+
+
 def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
     lost_ns = log.payload("/tick", 20)["frame_ns"]
     log.drop(lambda topic, stamp_ns, _: topic == "/camera" and stamp_ns == lost_ns)
@@ -344,6 +360,7 @@ def test_the_table_says_the_same_as_the_json(log: Log, capsys: pytest.CaptureFix
         (lambda log: log.payload("/semantic", 0).update(frames_ns=[]), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(way=[[1.0]]), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(before="turn 9 of 3, passed 0."), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(follow="backwards"), "a /semantic record lacks"),
         (lambda log: log.payload("/run", 0).update(limits={"vx_max_mps": 1}), "a /run record lacks"),
         (lambda log: log.path.write_bytes(b"notes"), "not an MCAP file"),
     ],

@@ -63,6 +63,9 @@ class Listener:
         self.heard: list[tuple[int, ...]] = []
         self.says: list[str] = []
 
+    def guide(self, before: Progress | None, follow: str) -> None:
+        """It says what is true."""
+
     def begin(self, cancelled: object) -> Listener:
         self.heard.append(())
         return self
@@ -70,7 +73,7 @@ class Listener:
     def feed(self, segments: Sequence[Segment]) -> None:
         self.heard[-1] += tuple(i for segment in segments for i in segment.ids)
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int) -> Generation:
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: None) -> Generation:
         self.feed(segments)
         text = self.says[len(self.heard) - 1]
         return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0)

@@ -175,7 +175,7 @@ def adopted(run_dir: RunDir, tmp_path: Path, after: str) -> list[str]:
     """The names of what is still to be done after adopting somebody's weights there."""
     save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
     import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
-    adopt(run_dir, steps_until(after, NEWEST))
+    adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
     return [step.name for step in steps_of("all", NEWEST) if not is_done(run_dir, step)]
 
 
@@ -200,7 +200,7 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: Run
 )
 def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
     with pytest.raises(RunDirError, match=says):
-        steps_until(after, recipe)
+        steps_until(after, recipe, steps_of("all", recipe))
 
 
 # Export in between
@@ -298,6 +298,12 @@ def test_what_makes_no_sense_is_one_line(
     assert run(*arguments) == EXIT_BAD_INPUT
     told = capsys.readouterr().err
     assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_reinforcement_learning_needs_no_drives_before_it() -> None:
+    assert steps_until("imitate", TINY, steps_of("rl", TINY))[-1] == Step("imitate")
+    with pytest.raises(RunDirError, match="newest_only"):
+        steps_until("imitate", TINY, steps_of("dagger", TINY))
 
 
 def test_a_devices_delays_are_those_of_every_stage_that_injects_any(tmp_path: Path) -> None:
@@ -430,7 +436,7 @@ def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: P
     for number, after in enumerate(("imitate", "imitate-1")):
         run_dir = RunDir.open(tmp_path / f"more{number}", NEWEST)
         import_start(run_dir.out, TINY.model, [first], 1)
-        adopt(run_dir, steps_until(after, NEWEST))
+        adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
         run_dir.finish("rl", {"iterations": 20 + number})
         text = card(run_dir, NEWEST, run_dir.model_path)
         first = ship(run_dir, NEWEST, tmp_path / f"weights{number}")

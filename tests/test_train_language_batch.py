@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from edge.progress_guide import LineGuide
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
@@ -126,6 +127,18 @@ def test_greedy_answers_of_a_batch_are_those_of_every_row_alone(language: Langua
         torch.testing.assert_close(
             row_said.last_layer_kv, alone(language, spoken, len(spoken.fed))[1], atol=1e-5, rtol=0
         )
+
+
+def test_a_row_is_held_to_its_guide_and_hears_what_it_was_made_to_say(language: LanguageModel) -> None:
+    silent = [dataclasses.replace(one, answer=()) for one in ROWS[:2]]
+    batch = collate(silent, img_context_id=IMAGE, device=DEVICE)
+    free = decode(language, batch, 6)
+    head, *_ = free[0].ids
+    other = next(i for i in range(20, 40) if i not in free[0].ids)
+    said = decode(language, batch, 6, [LineGuide([(head, other, head)]), None])
+    assert said[0].ids[:3] == (head, other, head) and said[1].ids == free[1].ids
+    spoken = Row((*silent[0].prompt, *said[0].ids), (), silent[0].frames)
+    torch.testing.assert_close(said[0].last_layer_kv, alone(language, spoken, len(spoken.fed))[1], atol=1e-5, rtol=0)
 
 
 def test_greedy_decoding_ends_at_the_end_token_and_at_the_models_context(language: LanguageModel) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from edge.progress_guide import EITHER_WAY, FREE, ONWARD
 from edge.reasoning_text import Progress, format_progress
 from tests.train_drives import WORDINGS, made_up_drive
 from tools.train.anchors import Anchor, Drawn, anchors_of
@@ -88,8 +90,15 @@ class Parrot:
     def __init__(self, texts: Sequence[str]) -> None:
         self.texts = list(texts)
         self.told: list[tuple[str, int, Progress | None]] = []
+        self.guided: list[tuple[Progress | None, str]] = []
 
-    def say(self, questions: Sequence[tuple[Anchor, Drawn]]) -> list[str]:
+    def guide(self, before: Progress | None, follow: str) -> SimpleNamespace:
+        """One that overrules the first answer and no other."""
+        self.guided.append((before, follow))
+        return SimpleNamespace(overruled=len(self.guided) == 1)
+
+    def say(self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[object]) -> list[str]:
+        assert len(guides) == len(questions)
         self.told += [(anchor.drive_id, anchor.k, drawn.before) for anchor, drawn in questions]
         assert all(drawn.wording in WORDINGS and not drawn.waypoints_only for _, drawn in questions)
         return [self.texts.pop(0) for _ in questions]
@@ -113,6 +122,9 @@ def test_along_a_drive_the_model_hears_what_it_said_itself_last() -> None:
         ("a", 40, Progress(1, 1, 4)),
     ]
     assert numbers["answers"] == 5 and numbers["progress_parsable"] == 0.6
+    assert parrot.guided == [
+        (None, FREE), (None, FREE), (Progress(1, 1, 4), EITHER_WAY), (None, FREE), (Progress(1, 1, 4), ONWARD),
+    ]  # fmt: skip
 
 
 def test_a_gap_that_is_no_whole_second_is_refused() -> None:

@@ -18,6 +18,7 @@ from edge.instruction_memory import InstructionMemory
 from edge.language import ContextOverflowError, Generation, LanguageModel
 from edge.path_memory import Way
 from edge.policy import Policy
+from edge.progress_guide import FREE
 from edge.prompt import told_before
 from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_S, Mode, SemanticSlot
 from edge.reasoning_text import Progress, parse_waypoints
@@ -36,6 +37,7 @@ class _UnderWay:
     frames: list[EncodedFrame] | None = None
     way: Way = ()
     before: Progress | None = None
+    follow: str = FREE
 
     @property
     def release_ns(self) -> int:
@@ -109,7 +111,8 @@ class LockstepReasoner:
         if job is not None and job.frames is None and now_ns >= job.capture_ns:
             job.frames = self._frames()
             if job.frames is not None:
-                job.way, job.before = self._memory.way(self._ring, job.frames[-1]), self._memory.before
+                job.way = self._memory.way(self._ring, job.frames[-1])
+                job.before, job.follow = self._memory.before, self._memory.follow
         self._memory.watch(self._ring)
 
     def _may_start(self, now_ns: int) -> bool:
@@ -141,7 +144,8 @@ class LockstepReasoner:
         for number, frame in enumerate(frames[:-1], 1):
             run.feed([prompt.frame(number, frame, self._instruction)])
         rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.before)]
-        generation = run.finish(rest, max_new_tokens=self._max_new_tokens)
+        guide = self._language.guide(job.before, job.follow)
+        generation = run.finish(rest, max_new_tokens=self._max_new_tokens, guide=guide)
         if not np.isfinite(generation.last_layer_kv).all():
             raise _NotFiniteError("keys and values of the last layer are not finite")
         return generation
@@ -164,6 +168,8 @@ class LockstepReasoner:
                 "frames": len(frames),
                 "way": [list(point) for point in job.way],
                 "before": told_before(job.before),
+                "follow": job.follow,
+                "overruled": generation.overruled,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
@@ -173,7 +179,7 @@ class LockstepReasoner:
         )
         if not guided:
             return  # the state before goes on growing old; the supervisor slows down by its age
-        self._memory.heard(generation.text)
+        self._memory.heard(generation.text, overruled=generation.overruled)
         self._slot.state = SemanticState(
             generation=number,
             anchor_ns=anchor.stamp_ns,

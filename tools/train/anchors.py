@@ -22,6 +22,7 @@ from tokenizers import Tokenizer
 
 from edge.geometry import SE2
 from edge.path_memory import FARTHEST_M, MAX_POINTS, PathMemory, Way
+from edge.progress_guide import LineGuide, guide_after
 from edge.prompt import PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
@@ -292,6 +293,10 @@ class Prompts:
                 f"tokens, the model reads {self._most}"
             )
         return prompt, answer
+
+    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
+        """What the runner holds an answer to."""
+        return guide_after(before, follow, self._encode)
 
     def text(self, ids: Iterable[int]) -> str:
         """The text of answer tokens, as the runner reads it."""

@@ -84,14 +84,17 @@ def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
         raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
 
 
-def steps_until(name: str, recipe: Recipe) -> list[Step]:
-    """The steps up to that one; raises RunDirError for one that the recipe does not have, or that leaves no policy."""
+def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]:
+    """The steps up to that one; raises RunDirError for one that the recipe does not have, or that leaves no policy.
+
+    `wanted`: what is to be done after them.
+    """
     steps = steps_of("all", recipe)
     policies = [step.name for step in steps if step.stage in ("imitate", "rl")]
     if name not in policies:
         raise RunDirError(f"--after {name}: expected one of {', '.join(policies)}")
     before = steps[: [step.name for step in steps].index(name) + 1]
-    if len(before) < len(steps) and not recipe.dagger.newest_only and steps[len(before)].stage == "dagger":
+    if not recipe.dagger.newest_only and any(step.stage == "dagger" and step not in before for step in wanted):
         raise RunDirError(f"--after {name}: the drives before it are not here; set dagger.newest_only=true")
     return before
 

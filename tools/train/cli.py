@@ -177,7 +177,7 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
         raise UsageError("--after and --drives: expected one of them, --after goes on without drives")
     if args.after is not None and not args.checkpoint:
         raise UsageError("--after: expected --checkpoint with it, the weights that the step has left")
-    before = chain.steps_until(args.after, recipe) if args.after is not None else []
+    before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
         return _train(args, recipe, steps, before, ranks)

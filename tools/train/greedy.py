@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from edge.progress_guide import LineGuide
 from export.model.language import LanguageModel
 from tools.train.language_batch import LanguageBatch, angles, finish_layer, keys_values, run
 
@@ -23,8 +25,10 @@ class Said:
 
 
 @torch.no_grad()
-def decode(language: LanguageModel, batch: LanguageBatch, max_new_tokens: int) -> list[Said]:
-    """What the model says after each row of a batch whose rows have no answer yet.
+def decode(
+    language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, guides: Sequence[LineGuide | None] = ()
+) -> list[Said]:
+    """What the model says after each row of a batch whose rows have no answer yet; a row's guide holds it to its lines.
 
     Each step feeds one token a row at that row's own position; a row that has ended feeds on, unread, until all have.
     """
@@ -42,7 +46,12 @@ def decode(language: LanguageModel, batch: LanguageBatch, max_new_tokens: int) -
     ids: list[list[int]] = [[] for _ in range(rows)]
     open_rows = [max_new_tokens > 0] * rows
     for step in range(room):
-        for i, chosen in enumerate(token.tolist()):
+        told = [
+            chosen if guide is None else guide.choose(chosen)
+            for chosen, guide in zip(token.tolist(), guides or [None] * rows, strict=True)
+        ]
+        token = torch.tensor(told, device=token.device)
+        for i, chosen in enumerate(told):
             if chosen == c.im_end_id or fed[i] + step >= c.max_context:
                 open_rows[i] = False
             elif open_rows[i]:

@@ -15,6 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from edge.instruction_memory import InstructionMemory
+from edge.progress_guide import LineGuide
 from edge.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, Progress, parse_progress, parse_waypoints
 from export.model.language import LanguageModel
 from tools.train import trace_words
@@ -186,8 +188,15 @@ class Speaker:
         self._tokens = tokens
         self._config = config
 
-    def say(self, questions: Sequence[tuple[Anchor, Drawn]]) -> list[str]:
-        """The text after each prompt, the start that it was given included."""
+    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
+        """What the runner holds an answer to."""
+        return self._prompts.guide(before, follow)
+
+    def say(
+        self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[LineGuide | None] | None = None
+    ) -> list[str]:
+        """The text after each prompt, the start that it was given included; `guides`: one a question."""
+        guides = guides or [None] * len(questions)
         rows = [
             Row(self._prompts.prompt(anchor, drawn), (), frames_of(self._tokens, anchor.drive_id, anchor.frames))
             for anchor, drawn in questions
@@ -202,26 +211,34 @@ class Speaker:
                 img_context_id=language.config.img_context_id,
                 device=language.embed.weight.device,
             )
-            for i, said in zip(chosen, decode(language, batch, self._config.max_new_tokens), strict=True):
+            answers = decode(language, batch, self._config.max_new_tokens, [guides[i] for i in chosen])
+            for i, said in zip(chosen, answers, strict=True):
                 texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
         return texts
 
 
 def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
-    """Scores along drives where `before` is what the model itself said last, as the runner remembers it."""
+    """Scores along drives where `before` is what the model itself said last, as the runner remembers it.
+
+    Answers are held to what may follow that, as the runner holds them.
+    """
     drives: dict[str, list[Anchor]] = {}
     for anchor in anchors:
         if anchor.k % round(gap_s * RATE_HZ) == 0:
             drives.setdefault(anchor.drive_id, []).append(anchor)
     wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
-    before: dict[str, Progress | None] = dict.fromkeys(drives)
+    memories = {drive: InstructionMemory(None) for drive in drives}
     score = Score(gap_s)
     for step in range(max((len(each) for each in drives.values()), default=0)):
         now = [each[step] for each in drives.values() if step < len(each)]
-        drawn = [Drawn(wording[anchor.drive_id], before[anchor.drive_id]) for anchor in now]
-        for anchor, text in zip(now, speaker.say(list(zip(now, drawn, strict=True))), strict=True):
+        heard = [memories[anchor.drive_id] for anchor in now]
+        drawn = [
+            (anchor, Drawn(wording[anchor.drive_id], memory.before)) for anchor, memory in zip(now, heard, strict=True)
+        ]
+        guides = [speaker.guide(memory.before, memory.follow) for memory in heard]
+        for anchor, memory, guide, text in zip(now, heard, guides, speaker.say(drawn, guides), strict=True):
             score.add(text, anchor)
-            before[anchor.drive_id] = parse_progress(text) or before[anchor.drive_id]
+            memory.heard(text, overruled=guide is not None and guide.overruled)
     return score.numbers()
 
 

@@ -22,7 +22,7 @@ from sim_hil.benchmark.policies import robot_config
 from tools.train.action_tail import check_tail
 from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
 from tools.train.exported import export_artifacts
-from tools.train.job import StageJob
+from tools.train.job import StageFailedError, StageJob
 from tools.train.network_file import START, finish_network, is_trained, read_network, weights_before
 from tools.train.point_goal_net import build_point_goal, save_point_goal
 from tools.train.ppo import PpoConfig
@@ -160,6 +160,11 @@ def run(job: StageJob) -> dict[str, Any]:
     if config.policy == "point-goal":
         net = build_point_goal(job.recipe.model, job.generator("point-goal")).to(job.device)
         result = improve(job, PointGoalLearner(network, net, limits, config.log_std), before, None)
+        if result["kept"] == "start":
+            raise StageFailedError(
+                f"rl: {config.iterations} iterations made nothing that drives better than chance; give it more "
+                "(rl.iterations), other steps (rl.ppo.action_lr) or more to explore (rl.log_std), in a new --out"
+            )
         save_point_goal(net, folder / POINT_GOAL_FILE, f"edge-train {job.recipe.name}, seed {job.recipe.seed}, rl")
         return result
     check_tail(network.action)

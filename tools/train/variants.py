@@ -24,7 +24,14 @@ VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "diffusion": ("model.action.head=diffusion",),
         "flow": ("model.action.head=flow",),
         "point-goal-bc": ("imitate.policy=point-goal",),
-        "point-goal-rl": ("rl.policy=point-goal",),
+        # From nothing, where the recipe's numbers are for a policy that drives already.
+        "point-goal-rl": (
+            "rl.policy=point-goal",
+            "rl.ppo.action_lr=3e-4",
+            "rl.log_std=-1.2,-0.7",
+            "rl.warmup_iterations=0",
+            "rl.imitation=0.0",
+        ),
     }
 )
 """Settings by name; where the benchmark checks a variant (`sim_hil.benchmark.variants`), the names are the same."""
