@@ -7,13 +7,14 @@ a generation runs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edge.geometry import SE2
 from edge.path_memory import PERIOD_NS, PathMemory, Way
-from edge.progress_guide import EITHER_WAY, FREE, ONWARD
-from edge.reasoning_text import Progress, parse_progress
+from edge.reasoning_text import parse_progress
 from edge.ring import EncodedFrame, TokenRing
+from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
+from edge.turn_memory import TurnMemory
 
 MOST_FRAMES = 1 << 16
 """More than a ring holds."""
@@ -26,20 +27,13 @@ class InstructionMemory:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: it counts from the first frame."""
         self._from_ns = from_ns
         self._path = PathMemory()
-        self._before: Progress | None = None
-        self._overruled = False
+        self._known = NOTHING_KNOWN
+        self._turn = TurnMemory()
 
-    @property
-    def before(self) -> Progress | None:
-        """What the last generation said that said any progress."""
-        return self._before
-
-    @property
-    def follow(self) -> str:
-        """What the next generation may say after that: who has been held back says it again before it counts."""
-        if self._before is None:
-            return FREE
-        return EITHER_WAY if self._overruled else ONWARD
+    def known(self, anchor: EncodedFrame) -> Known:
+        """What is known before a generation with this newest frame."""
+        turn = self._turn
+        return replace(self._known, turn=turn.left(anchor.T_odom_base), may_be_done=turn.may_be_done)
 
     def watch(self, ring: TokenRing) -> None:
         """Take what has come into the ring, at most about once a second: call it more often than the ring is long."""
@@ -54,12 +48,12 @@ class InstructionMemory:
         self._put(anchor.stamp_ns, anchor.T_odom_base)
         return self._path.way(anchor.T_odom_base)
 
-    def heard(self, text: str, *, overruled: bool = False) -> None:
-        """Remember the progress that a published generation's text says; one that says none changes nothing.
-
-        `overruled`: it would have said another one.
-        """
-        self._before, self._overruled = parse_progress(text) or self._before, overruled
+    def heard(self, text: str, guide: TextGuide, anchor: EncodedFrame) -> None:
+        """Remember what a published generation says of its progress, and of its turn before it was held to it."""
+        self._known = self._known.after(text, guide)
+        self._turn.heard(
+            parse_progress(text), guide.look, anchor.T_odom_base, anchor.stamp_ns, overruled=guide.overruled
+        )
 
     def _take(self, ring: TokenRing, until_ns: int) -> None:
         for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):
@@ -69,6 +63,7 @@ class InstructionMemory:
     def _put(self, stamp_ns: int, T_odom_base: SE2) -> None:
         if self._from_ns is None or stamp_ns >= self._from_ns:
             self._path.put(stamp_ns, T_odom_base)
+            self._turn.put(stamp_ns, T_odom_base)
 
 
 @dataclass(frozen=True)

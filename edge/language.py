@@ -15,11 +15,11 @@ from edge.artifact_files import ArtifactError
 from edge.geometry import SE2
 from edge.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.manifest import Artifacts
-from edge.progress_guide import LineGuide, guide_after
 from edge.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
-from edge.reasoning_text import MAX_TEXT_CHARS, Progress
+from edge.reasoning_text import MAX_TEXT_CHARS
 from edge.ring import EncodedFrame
 from edge.scheduling import Schedule, run_as
+from edge.text_guide import Known, TextGuide
 
 Floats = npt.NDArray[np.float32]
 
@@ -40,8 +40,6 @@ class Generation:
     prompt_tokens: int
     prefill_ms: float
     decode_ms: float
-    overruled: bool = False
-    """Whether the model would have said another progress than it was held to."""
 
     @property
     def new_tokens(self) -> int:
@@ -174,9 +172,9 @@ class LanguageModel:
                 f"instruction makes a prompt of {needed} tokens, the model has room for {room}: shorten it"
             )
 
-    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
-        """What a generation may say of its progress after `before` (`edge.progress_guide`); None: anything."""
-        return guide_after(before, follow, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
+    def guide(self, known: Known) -> TextGuide:
+        """What holds one generation to what is known before it."""
+        return TextGuide(known, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def generate(
         self,
@@ -184,7 +182,7 @@ class LanguageModel:
         *,
         max_new_tokens: int,
         cancelled: Callable[[], bool],
-        guide: LineGuide | None = None,
+        guide: TextGuide | None = None,
     ) -> Generation:
         """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt."""
         return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens, guide=guide)
@@ -251,7 +249,7 @@ class GenerationRun:
             self._run(self._model.prefill_call, chunk)
         self._prefill_ns += time.monotonic_ns() - started_ns
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: LineGuide | None = None) -> Generation:
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: TextGuide | None = None) -> Generation:
         """Prefill the rest of the prompt, whose last token is text, and decode greedily what `guide` allows."""
         model, runtime = self._model, self._model.runtime
         started_ns = time.monotonic_ns()
@@ -265,13 +263,17 @@ class GenerationRun:
         prompt_tokens = self._fed
         prefilled_ns = time.monotonic_ns()
         new_ids: list[int] = []
+        line_at = 0
         room = runtime.max_context - prompt_tokens
         while len(new_ids) < min(max_new_tokens, room):
             next_id = next_id if guide is None else guide.choose(next_id)
             if next_id == runtime.im_end_id:
                 break
             new_ids.append(next_id)
-            next_id = self._run(model.decode_call, Chunk((next_id,), None, 0))
+            if guide is not None and model.text_of([next_id]).endswith("\n"):
+                self._hold_line(guide, new_ids, line_at)
+                line_at = len(new_ids)
+            next_id = self._run(model.decode_call, Chunk((new_ids[-1],), None, 0))
         return Generation(
             text=model.text_of(new_ids),
             last_layer_kv=model.last_layer_kv(self._fed),
@@ -279,8 +281,19 @@ class GenerationRun:
             prompt_tokens=prompt_tokens,
             prefill_ms=(self._prefill_ns + prefilled_ns - started_ns) / 1e6,
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
-            overruled=guide is not None and guide.overruled,
         )
+
+    def _hold_line(self, guide: TextGuide, new_ids: list[int], line_at: int) -> None:
+        """Take a line back that is to be another one, and feed that up to its last token."""
+        ids = new_ids[line_at:]
+        others = guide.line(self._model.text_of(ids).rstrip("\n"))
+        if others is None:
+            return
+        same = next(i for i, (token, other) in enumerate(zip(ids, others, strict=False)) if token != other)
+        new_ids[line_at:] = others
+        self._fed -= len(ids) - 1 - same
+        for token in others[same:-1]:
+            self._run(self._model.decode_call, Chunk((token,), None, 0))
 
     def _cut(self, segments: Sequence[Segment]) -> list[Chunk]:
         runtime = self._model.runtime

@@ -15,6 +15,8 @@ _ANY: Schema = {}
 _INT: Schema = {"type": "integer"}
 _NUMBER: Schema = {"type": "number"}
 _TEXT: Schema = {"type": "string"}
+_TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
+_BOOL: Schema = {"type": "boolean"}
 _INT_OR_NULL: Schema = {"type": ["integer", "null"]}
 _NUMBER_OR_NULL: Schema = {"type": ["number", "null"]}
 _TEXTS: Schema = {"type": "array", "items": _TEXT}
@@ -85,7 +87,17 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/semantic": _record(
         "tic_vla.Semantic",
-        ("instruction", "frame_poses", "way", "before", "follow", "max_new_tokens"),
+        (
+            "instruction",
+            "frame_poses",
+            "way",
+            "before",
+            "follow",
+            "turn",
+            "turn_left_m",
+            "turn_may_be_done",
+            "max_new_tokens",
+        ),
         generation=_INT,
         instruction=_TEXT,  # the run's, or another that was given later
         anchor_ns=_INT,
@@ -99,6 +111,9 @@ SCHEMAS: Mapping[str, Schema] = {
         way=_ROWS,  # (x m, y m) in the robot frame at the anchor: the prompt's past motion
         before=_TEXT,  # the progress that the prompt told, "none." without one
         follow=_TEXT,  # what might be said after it: free, onward, either way
+        turn=_TEXT_OR_NULL,  # left or right: the turn that was next then
+        turn_left_m=_VECTOR_OR_NULL,  # how far it is by each earlier look
+        turn_may_be_done=_BOOL,  # whether the robot can have made it, by odometry
         prompt_tokens=_INT,
         max_new_tokens=_INT,
         new_tokens=_INT,

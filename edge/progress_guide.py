@@ -7,10 +7,10 @@ that mistake. The grammar of what may follow is known, so decoding is held to it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
-from edge.reasoning_text import MAX_COUNT, PROGRESS_HEAD, Progress, format_progress
+from edge.reasoning_text import MAX_COUNT, Progress
 
 FREE: Final = "free"
 """Whatever the model says: nothing has been said before, or nothing is known of it."""
@@ -44,8 +44,8 @@ def followers(before: Progress, follow: str) -> tuple[Progress, ...]:
 class LineGuide:
     """Holds one line of a text that is being decoded to some lines of tokens, the first of them preferred.
 
-    The line begins where the model chooses their common first token. A token that none of the lines that are left has
-    there is replaced by the preferred one's; a text without such a line is left as it is.
+    The line begins where the model chooses their common first token. Where it chooses a token that none of the lines
+    that are left has there, the line becomes the preferred one of them; a text without such a line is left as it is.
     """
 
     def __init__(self, lines: Sequence[tuple[int, ...]]) -> None:
@@ -63,15 +63,10 @@ class LineGuide:
             return token
         allowed = [line for line in self._lines if line[self._at] == token]
         if not allowed:
+            # What it says next belongs to what it meant, which is none of them.
             self.overruled = True
-            token = self._lines[0][self._at]
-            allowed = [line for line in self._lines if line[self._at] == token]
+            allowed = self._lines[:1]
+            token = allowed[0][self._at]
         self._at += 1
         self._lines = [line for line in allowed if len(line) > self._at]
         return token
-
-
-def guide_after(before: Progress | None, follow: str, encode: Callable[[str], Sequence[int]]) -> LineGuide | None:
-    """What holds a text to `followers`; None: nothing. `encode`: the model's tokens of a text."""
-    lines = () if before is None else followers(before, follow)
-    return LineGuide([tuple(encode(f"{PROGRESS_HEAD}{format_progress(each)}\n")) for each in lines]) if lines else None

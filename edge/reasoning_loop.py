@@ -257,9 +257,10 @@ class ReasoningLoop:
         self._last_anchor_ns = anchor.stamp_ns
         cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
         most = min(self._max_new_tokens, cap)
-        way, before, follow = job.memory.way(self._ring, anchor), job.memory.before, job.memory.follow
-        rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, before)]
-        generation = run.finish(rest, max_new_tokens=most, guide=self._language.guide(before, follow))
+        way, known = job.memory.way(self._ring, anchor), job.memory.known(anchor)
+        rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, known.before)]
+        guide = self._language.guide(known)
+        generation = run.finish(rest, max_new_tokens=most, guide=guide)
         if not np.isfinite(generation.last_layer_kv).all():
             raise NotFiniteError("keys and values of the last layer are not finite")
         before_call(self._context_ns)
@@ -272,7 +273,7 @@ class ReasoningLoop:
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
         state = self._publish(anchor, generation, context, complete)
-        job.memory.heard(generation.text, overruled=generation.overruled)
+        job.memory.heard(generation.text, guide, anchor)
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -288,8 +289,8 @@ class ReasoningLoop:
                 "frames_ns": [frame.stamp_ns for frame in frames],
                 "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
                 "way": way,
-                "before": told_before(before),
-                "follow": follow,
+                "before": told_before(known.before),
+                **known.record(),
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,

@@ -155,11 +155,11 @@ class Replayer:
         ]
         generation = self._language.generate(
             self._language.prompt.build(
-                frames, record.instruction or self._run.instruction, self._way(record, frames), record.before
+                frames, record.instruction or self._run.instruction, self._way(record, frames), record.known.before
             ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
-            guide=self._language.guide(record.before, record.follow),
+            guide=self._language.guide(record.known),
         )
         found.generations += 1
         found.poses_interpolated += record.poses is None

@@ -18,6 +18,8 @@ from edge.progress_guide import FOLLOWS, FREE
 from edge.prompt import told_before
 from edge.reasoning_text import PROGRESS_HEAD, Progress, parse_progress
 from edge.recording import RecordingError, jpeg_bytes, read_messages
+from edge.text_guide import Known
+from edge.turn_memory import TurnLeft
 from firmware_bridge.config import ConfigError, LimitsConfig
 
 _ORDER_WINDOW_NS = 5_000_000_000
@@ -61,9 +63,7 @@ class RecordedGeneration:
     anchor_pose: SE2
     way: Way | None
     """As the prompt told it; None: a log from before ways were told."""
-    before: Progress | None
-    follow: str
-    """What it might say after that (`edge.progress_guide`)."""
+    known: Known
     max_new_tokens: int
     text: str
 
@@ -155,8 +155,12 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
         poses=None if poses is None else tuple(_pose(pose) for pose in poses),
         anchor_pose=_pose(payload["anchor_pose"]),
         way=None if "way" not in payload else tuple(_point(point) for point in payload["way"]),
-        before=_before(payload.get("before", told_before(None))),
-        follow=_follow(payload.get("follow", FREE)),
+        known=Known(
+            _before(payload.get("before", told_before(None))),
+            _follow(payload.get("follow", FREE)),
+            _turn(payload.get("turn"), payload.get("turn_left_m")),
+            bool(payload.get("turn_may_be_done", True)),
+        ),
         # Without the cap that was in force: as many as there were, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
         text=_text(payload["text"]),
@@ -205,6 +209,14 @@ def _follow(value: Any) -> str:
     if value not in FOLLOWS:
         raise ValueError(f"follow is {str(value)[:60]!r}")
     return str(value)
+
+
+def _turn(side: Any, left_m: Any) -> TurnLeft | None:
+    if side is None:
+        return None
+    if side not in ("left", "right") or not left_m:
+        raise ValueError(f"turn is {str(side)[:60]!r} by {left_m}")
+    return TurnLeft(str(side), tuple(float(metres) for metres in left_m))
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

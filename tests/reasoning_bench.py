@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from edge.reasoning_loop import ReasoningLoop, SemanticSlot
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import Role
+from edge.text_guide import Known
+from edge.turn_memory import Look
 
 KV = np.zeros((1, 5, 8), dtype=np.float32)
 TEXT = "Clear.\nwaypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)"
@@ -62,9 +65,22 @@ class FakeRun:
         self.language.instructions.append(segments[0][1])
         self.language.caps.append(max_new_tokens)
         new = min(max_new_tokens, self.language.new_tokens)
-        return Generation(
-            self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0, overruled=self.language.overruled
-        )
+        return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0)
+
+
+class FakeGuide:
+    """Finds in a text what its language says that is in it."""
+
+    def __init__(self, language: FakeLanguage) -> None:
+        self._language = language
+
+    @property
+    def overruled(self) -> bool:
+        return self._language.overruled
+
+    @property
+    def look(self) -> Look | None:
+        return self._language.look
 
 
 class FakeLanguage:
@@ -75,14 +91,15 @@ class FakeLanguage:
         self.prompts: list[list[float]] = []
         self.instructions: list[str] = []
         self.caps: list[int] = []
-        self.guided: list[tuple[Progress | None, str]] = []
-        self.overruled = False
+        self.guided: list[Known] = []
+        self.overruled, self.look = False, cast("Look | None", None)
         self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
         self.during_feed: Callable[[], None] = lambda: None
         self.during_finish: Callable[[FakeRun], None] = lambda run: None
 
-    def guide(self, before: Progress | None, follow: str) -> None:
-        self.guided.append((before, follow))
+    def guide(self, known: Known) -> FakeGuide:
+        self.guided.append(known)
+        return FakeGuide(self)
 
     def begin(
         self, cancelled: Callable[[], bool], *, interrupt: Interrupt, before_call: Callable[[int], None]

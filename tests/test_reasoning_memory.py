@@ -14,6 +14,7 @@ from edge.reasoning_budget import ReasoningBudget
 from edge.reasoning_loop import Mode, SemanticSlot
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
+from edge.turn_memory import Look
 from sim_hil.benchmark.latency import Timing
 from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner
 from tests.reasoning_bench import KV, Bench, Clock, FakeLanguage, FakePolicy
@@ -41,6 +42,7 @@ def counting(language: FakeLanguage) -> FakeLanguage:
 
     def think(_run: object) -> None:
         language.overruled = len(language.prompts) % 3 == 2
+        language.look = Look("left", 9.0)
         language.text = f"Progress: turn {len(language.prompts) + 1} of 99, passed 0.{LINE}"
 
     language.during_finish = think
@@ -114,9 +116,16 @@ def test_both_loops_tell_the_same_way_and_progress() -> None:
 def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None:
     of_lockstep, of_runner = lockstep(801, 2.0).guided, threaded(800, 20).guided
     assert of_lockstep[:40] == of_runner
-    assert of_runner[:4] == [
+    assert [(known.before, known.follow) for known in of_runner[:4]] == [
         (None, FREE), (Progress(1, 99, 0), ONWARD), (Progress(2, 99, 0), ONWARD), (Progress(3, 99, 0), EITHER_WAY),
     ]  # fmt: skip
+
+
+def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_frames() -> None:
+    """2 s at 0.8 m/s; a generation's own picture is the newest of its frames."""
+    known = threaded(800, 20).guided[1]
+    assert known.turn is not None and known.turn.side == "left"
+    assert known.turn.left_m == pytest.approx([9.0 - 1.6])
 
 
 def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:

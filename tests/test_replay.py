@@ -19,7 +19,7 @@ from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.path_memory import way_of
 from edge.policy import Policy
-from edge.progress_guide import EITHER_WAY, FREE, LineGuide
+from edge.progress_guide import EITHER_WAY
 from edge.prompt import told_before
 from edge.reasoning_text import Progress
 from edge.recorder import Recorder
@@ -27,6 +27,8 @@ from edge.replay import main
 from edge.ring import EncodedFrame
 from edge.semantic import SemanticState
 from edge.stalemate import TURNING
+from edge.text_guide import Known, TextGuide
+from edge.turn_memory import TurnLeft
 from firmware_bridge.config import LimitsConfig
 from tests import synthetic_run
 
@@ -252,18 +254,19 @@ def test_what_the_prompt_told_of_the_way_and_progress_is_told_again(log: Log, to
 
 
 def test_a_generation_is_held_to_what_it_was_held_to(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Progress | None, str]] = []
+    asked: list[Known] = []
     guide = LanguageModel.guide
 
-    def watched(self: LanguageModel, before: Progress | None, follow: str) -> LineGuide | None:
-        asked.append((before, follow))
-        return guide(self, before, follow)
+    def watched(self: LanguageModel, known: Known) -> TextGuide:
+        asked.append(known)
+        return guide(self, known)
 
     monkeypatch.setattr(LanguageModel, "guide", watched)
-    log.payload("/semantic", 1).update(follow=EITHER_WAY)
+    log.payload("/semantic", 1).update(follow=EITHER_WAY, turn="left", turn_left_m=[2.5, 3.0])
     assert log.replay()[0] == 0
+    assert asked[1] == Known(Progress(1, 3, 1), EITHER_WAY, TurnLeft("left", (2.5, 3.0)))
     # A log from before generations were held to anything says nothing of it.
-    assert asked[:3] == [(None, FREE), (Progress(1, 3, 1), EITHER_WAY), (Progress(1, 3, 2), FREE)]
+    assert asked[2] == Known(Progress(1, 3, 2))
 
 
 def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
@@ -361,6 +364,8 @@ def test_the_table_says_the_same_as_the_json(log: Log, capsys: pytest.CaptureFix
         (lambda log: log.payload("/semantic", 0).update(way=[[1.0]]), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(before="turn 9 of 3, passed 0."), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(follow="backwards"), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(turn="up", turn_left_m=[1.0]), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(turn="left", turn_left_m=[]), "a /semantic record lacks"),
         (lambda log: log.payload("/run", 0).update(limits={"vx_max_mps": 1}), "a /run record lacks"),
         (lambda log: log.path.write_bytes(b"notes"), "not an MCAP file"),
     ],

@@ -14,6 +14,7 @@ from edge.prompt import PromptBuilder, PromptIds, Segment
 from edge.reasoning_loop import Mode, SemanticSlot
 from edge.reasoning_text import Progress, parse_progress, parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
+from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from export.model.config import PRESETS
 from export.model.tokenizer import NANO_TOKENIZER
 from sim_hil.benchmark.latency import Timing
@@ -63,8 +64,9 @@ class Listener:
         self.heard: list[tuple[int, ...]] = []
         self.says: list[str] = []
 
-    def guide(self, before: Progress | None, follow: str) -> None:
-        """It says what is true."""
+    def guide(self, known: Known) -> TextGuide:
+        """It holds nothing: what is said is true."""
+        return TextGuide(NOTHING_KNOWN, lambda text: ())
 
     def begin(self, cancelled: object) -> Listener:
         self.heard.append(())
@@ -73,7 +75,7 @@ class Listener:
     def feed(self, segments: Sequence[Segment]) -> None:
         self.heard[-1] += tuple(i for segment in segments for i in segment.ids)
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: None) -> Generation:
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: TextGuide) -> Generation:
         self.feed(segments)
         text = self.says[len(self.heard) - 1]
         return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0)

@@ -18,13 +18,13 @@ from edge.instruction_memory import InstructionMemory
 from edge.language import ContextOverflowError, Generation, LanguageModel
 from edge.path_memory import Way
 from edge.policy import Policy
-from edge.progress_guide import FREE
 from edge.prompt import told_before
 from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_S, Mode, SemanticSlot
-from edge.reasoning_text import Progress, parse_waypoints
+from edge.reasoning_text import parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
 from edge.semantic import SemanticState
 from edge.sync_halt import seen_standing
+from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from sim_hil.benchmark.latency import Timing
 
 
@@ -36,8 +36,7 @@ class _UnderWay:
     timing: Timing
     frames: list[EncodedFrame] | None = None
     way: Way = ()
-    before: Progress | None = None
-    follow: str = FREE
+    known: Known = NOTHING_KNOWN
 
     @property
     def release_ns(self) -> int:
@@ -112,7 +111,7 @@ class LockstepReasoner:
             job.frames = self._frames()
             if job.frames is not None:
                 job.way = self._memory.way(self._ring, job.frames[-1])
-                job.before, job.follow = self._memory.before, self._memory.follow
+                job.known = self._memory.known(job.frames[-1])
         self._memory.watch(self._ring)
 
     def _may_start(self, now_ns: int) -> bool:
@@ -138,20 +137,20 @@ class LockstepReasoner:
                 frames.append(frame)
         return [*frames, anchor]
 
-    def _generate(self, job: _UnderWay, frames: list[EncodedFrame]) -> Generation:
+    def _generate(self, job: _UnderWay, frames: list[EncodedFrame], guide: TextGuide) -> Generation:
         prompt = self._language.prompt
         run = self._language.begin(lambda: False)
         for number, frame in enumerate(frames[:-1], 1):
             run.feed([prompt.frame(number, frame, self._instruction)])
-        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.before)]
-        guide = self._language.guide(job.before, job.follow)
+        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.known.before)]
         generation = run.finish(rest, max_new_tokens=self._max_new_tokens, guide=guide)
         if not np.isfinite(generation.last_layer_kv).all():
             raise _NotFiniteError("keys and values of the last layer are not finite")
         return generation
 
     def _publish(self, job: _UnderWay, frames: list[EncodedFrame], now_ns: int) -> None:
-        generation, anchor = self._generate(job, frames), frames[-1]
+        guide, anchor = self._language.guide(job.known), frames[-1]
+        generation = self._generate(job, frames, guide)
         context = self._policy.semantic_context(generation.last_layer_kv)
         waypoints = parse_waypoints(generation.text)
         complete = self._max_new_tokens > 0
@@ -167,9 +166,10 @@ class LockstepReasoner:
                 "released_s": now_ns / 1e9,
                 "frames": len(frames),
                 "way": [list(point) for point in job.way],
-                "before": told_before(job.before),
-                "follow": job.follow,
-                "overruled": generation.overruled,
+                "before": told_before(job.known.before),
+                **job.known.record(),
+                "overruled": guide.overruled,
+                "planned": None if guide.look is None else [guide.look.side, guide.look.distance_m],
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
@@ -179,7 +179,7 @@ class LockstepReasoner:
         )
         if not guided:
             return  # the state before goes on growing old; the supervisor slows down by its age
-        self._memory.heard(generation.text, overruled=generation.overruled)
+        self._memory.heard(generation.text, guide, anchor)
         self._slot.state = SemanticState(
             generation=number,
             anchor_ns=anchor.stamp_ns,

@@ -22,10 +22,10 @@ from tokenizers import Tokenizer
 
 from edge.geometry import SE2
 from edge.path_memory import FARTHEST_M, MAX_POINTS, PathMemory, Way
-from edge.progress_guide import LineGuide, guide_after
 from edge.prompt import PromptBuilder, PromptIds, Segment
 from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
+from edge.text_guide import Known, TextGuide
 from export.model.config import TicVlaConfig
 from tools.train.drive import RATE_HZ, TRACE_EVERY, Drive
 from tools.train.trace_words import TURN_BACK, Trace
@@ -294,9 +294,9 @@ class Prompts:
             )
         return prompt, answer
 
-    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
+    def guide(self, known: Known) -> TextGuide:
         """What the runner holds an answer to."""
-        return guide_after(before, follow, self._encode)
+        return TextGuide(known, self._encode)
 
     def text(self, ids: Iterable[int]) -> str:
         """The text of answer tokens, as the runner reads it."""

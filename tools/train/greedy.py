@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
 from edge.progress_guide import LineGuide
+from edge.text_guide import TextGuide
 from export.model.language import LanguageModel
 from tools.train.language_batch import LanguageBatch, angles, finish_layer, keys_values, run
+
+Guide: TypeAlias = LineGuide | TextGuide
 
 
 @dataclass(frozen=True)
@@ -26,9 +30,9 @@ class Said:
 
 @torch.no_grad()
 def decode(
-    language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, guides: Sequence[LineGuide | None] = ()
+    language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, guides: Sequence[Guide | None] = ()
 ) -> list[Said]:
-    """What the model says after each row of a batch whose rows have no answer yet; a row's guide holds it to its lines.
+    """What the model says after each row of a batch whose rows have no answer yet; a row's guide holds its progress.
 
     Each step feeds one token a row at that row's own position; a row that has ended feeds on, unread, until all have.
     """

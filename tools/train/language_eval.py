@@ -15,9 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.instruction_memory import InstructionMemory
-from edge.progress_guide import LineGuide
-from edge.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, Progress, parse_progress, parse_waypoints
+from edge.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, parse_progress, parse_waypoints
+from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from export.model.language import LanguageModel
 from tools.train import trace_words
 from tools.train.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
@@ -188,12 +187,12 @@ class Speaker:
         self._tokens = tokens
         self._config = config
 
-    def guide(self, before: Progress | None, follow: str) -> LineGuide | None:
+    def guide(self, known: Known) -> TextGuide:
         """What the runner holds an answer to."""
-        return self._prompts.guide(before, follow)
+        return self._prompts.guide(known)
 
     def say(
-        self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[LineGuide | None] | None = None
+        self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[TextGuide | None] | None = None
     ) -> list[str]:
         """The text after each prompt, the start that it was given included; `guides`: one a question."""
         guides = guides or [None] * len(questions)
@@ -220,25 +219,22 @@ class Speaker:
 def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
     """Scores along drives where `before` is what the model itself said last, as the runner remembers it.
 
-    Answers are held to what may follow that, as the runner holds them.
+    Their progress is held to what may follow that, as the runner holds it; how far a turn is, is not.
     """
     drives: dict[str, list[Anchor]] = {}
     for anchor in anchors:
         if anchor.k % round(gap_s * RATE_HZ) == 0:
             drives.setdefault(anchor.drive_id, []).append(anchor)
     wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
-    memories = {drive: InstructionMemory(None) for drive in drives}
+    known = dict.fromkeys(drives, NOTHING_KNOWN)
     score = Score(gap_s)
     for step in range(max((len(each) for each in drives.values()), default=0)):
         now = [each[step] for each in drives.values() if step < len(each)]
-        heard = [memories[anchor.drive_id] for anchor in now]
-        drawn = [
-            (anchor, Drawn(wording[anchor.drive_id], memory.before)) for anchor, memory in zip(now, heard, strict=True)
-        ]
-        guides = [speaker.guide(memory.before, memory.follow) for memory in heard]
-        for anchor, memory, guide, text in zip(now, heard, guides, speaker.say(drawn, guides), strict=True):
+        drawn = [(anchor, Drawn(wording[anchor.drive_id], known[anchor.drive_id].before)) for anchor in now]
+        guides = [speaker.guide(known[anchor.drive_id]) for anchor in now]
+        for anchor, guide, text in zip(now, guides, speaker.say(drawn, guides), strict=True):
             score.add(text, anchor)
-            memory.heard(text, overruled=guide is not None and guide.overruled)
+            known[anchor.drive_id] = known[anchor.drive_id].after(text, guide)
     return score.numbers()
 
 

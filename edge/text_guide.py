@@ -1,0 +1,87 @@
+"""What a text is held to while it is decoded, by what the texts before it said: its progress, and its next turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from edge.progress_guide import EITHER_WAY, FREE, ONWARD, LineGuide, followers
+from edge.reasoning_text import PLAN_HEAD, PROGRESS_HEAD, Progress, format_progress, parse_progress
+from edge.turn_memory import Look, TurnLeft, look_of, nearer
+
+Encode = Callable[[str], Sequence[int]]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a generation."""
+
+    before: Progress | None = None
+    """The progress said last."""
+    follow: str = FREE
+    """What may be said after it (`edge.progress_guide`)."""
+    turn: TurnLeft | None = None
+    """How far the turn that is next after it is by earlier looks."""
+    may_be_done: bool = True
+    """Whether the robot can have made that turn."""
+
+    def after(self, text: str, guide: TextGuide) -> Known:
+        """What is known after a text that was held to this, but for the turn: who was held back may say it next time.
+
+        A text that says no progress leaves the one that was said before.
+        """
+        before = parse_progress(text) or self.before
+        return Known() if before is None else Known(before, EITHER_WAY if guide.overruled else ONWARD)
+
+    def record(self) -> dict[str, Any]:
+        """What the flight log says of it, beside `before`."""
+        turn = self.turn
+        return {
+            "follow": self.follow,
+            "turn": None if turn is None else turn.side,
+            "turn_left_m": None if turn is None else turn.left_m,
+            "turn_may_be_done": self.may_be_done,
+        }
+
+
+NOTHING_KNOWN: Final = Known()
+
+
+class TextGuide:
+    """Holds one text to what is known; to be asked for every token that the model chooses, and for every line."""
+
+    def __init__(self, known: Known, encode: Encode) -> None:
+        """`encode`: the model's tokens of a text."""
+        before = known.before
+        lines = () if before is None else followers(before, known.follow)
+        if before is not None and not known.may_be_done:
+            lines = tuple(progress for progress in lines if progress.step <= before.step)
+        texts = [f"{PROGRESS_HEAD}{format_progress(progress)}\n" for progress in lines]
+        self._progress = LineGuide([tuple(encode(text)) for text in texts]) if texts else None
+        self._known = known
+        self._encode = encode
+        self._said: Progress | None = None
+        self.look: Look | None = None
+        """The turn that the model planned by itself."""
+
+    @property
+    def overruled(self) -> bool:
+        """Whether the model would have said another progress."""
+        return self._progress is not None and self._progress.overruled
+
+    def choose(self, token: int) -> int:
+        """The token to take where the model has chosen `token`."""
+        return token if self._progress is None else self._progress.choose(token)
+
+    def line(self, line: str) -> tuple[int, ...] | None:
+        """The tokens to take for a line that is complete, its end included; None: those that it has."""
+        if line.startswith(PROGRESS_HEAD):
+            self._said = parse_progress(line)
+        if not line.startswith(PLAN_HEAD):
+            return None
+        self.look = look_of(line)
+        turn = self._known.turn
+        if turn is None or self._said != self._known.before or (told := nearer(line, turn)) == line:
+            return None
+        return tuple(self._encode(f"{told}\n"))

@@ -1,0 +1,305 @@
+"""What a text is held to while it is decoded: progress that follows what was said, a turn that comes nearer."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.geometry import SE2, wrap_angle
+from edge.language import Call, Chunk, LanguageModel
+from edge.manifest import Artifacts
+from edge.progress_guide import EITHER_WAY, FREE, ONWARD, followers
+from edge.reasoning_text import Progress, format_progress, parse_progress
+from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
+from edge.turn_memory import MOST_LOOKS, MOST_REFUSED, Look, TurnLeft, TurnMemory, look_of, nearer
+from tools.train.trace_words import turn
+
+HERE = SE2(0.0, 0.0, 0.0)
+SIDES = st.sampled_from(["left", "right"])
+KINDS = st.sampled_from(["room", "corridor", "crossing"])
+
+
+# A plan's line
+
+
+@given(SIDES, KINDS, st.floats(0.0, 30.0))
+def test_a_turn_is_read_as_training_writes_it(side: str, kind: str, metres: float) -> None:
+    look = look_of(f"Plan: {turn(side, kind, metres)}.")
+    assert look == Look(side, 0.0 if metres < 1.0 else float(round(metres)))
+
+
+@pytest.mark.parametrize(
+    "plan", ["stop in 3 m.", "turn back.", "go straight to the lobby in 4 m.", "turn left soon.", "turn left in 4 m"]
+)
+def test_other_plans_are_no_look_at_a_turn(plan: str) -> None:
+    assert look_of(f"Plan: {plan}") is None
+
+
+@given(SIDES, KINDS, st.floats(0.0, 30.0), st.lists(st.floats(-5.0, 30.0), min_size=1, max_size=4))
+def test_a_turn_only_ever_comes_nearer(side: str, kind: str, metres: float, left_m: list[float]) -> None:
+    line = f"Plan: {turn(side, kind, metres)}."
+    before, after = look_of(line), look_of(nearer(line, TurnLeft(side, tuple(left_m))))
+    assert before is not None and after is not None
+    assert after.side == side and after.distance_m <= before.distance_m
+
+
+@pytest.mark.parametrize(
+    ("said_m", "left_m", "told"),
+    [
+        (6, (3.0, 3.2, 2.9, 3.1), "in 3 m"),
+        (6, (0.4, 0.2, 0.9, 7.0), "now"),
+        (6, (5.9, 6.3, 6.1), "in 6 m"),
+        (2, (6.0, 6.0, 6.0, 6.0), "in 2 m"),
+        (5, (3.0,), "in 4 m"),
+        (0, (3.0, 3.0), "now"),
+    ],
+)
+def test_the_median_of_the_looks_counts_where_it_is_nearer(said_m: int, left_m: tuple[float, ...], told: str) -> None:
+    line = f"Plan: {turn('left', 'corridor', said_m)}."
+    assert nearer(line, TurnLeft("left", left_m)) == f"Plan: turn left into the corridor {told}."
+
+
+def test_looks_to_the_other_side_say_nothing() -> None:
+    line = "Plan: cross left in 6 m."
+    assert nearer(line, TurnLeft("right", (1.0, 1.0, 1.0))) == line
+
+
+# What is remembered of turns
+
+PROGRESS = Progress(1, 2, 0)
+NEXT = Progress(2, 2, 0)
+SECOND_NS = 1_000_000_000
+
+
+def heard(
+    memory: TurnMemory, progress: Progress | None, look: Look | None, pose: SE2 = HERE, second: float = 0.0,
+    overruled: bool = False,
+) -> None:  # fmt: skip
+    memory.heard(progress, look, pose, round(second * SECOND_NS), overruled=overruled)
+
+
+def turning(memory: TurnMemory, degrees: list[float], second: float = 0.0) -> None:
+    """Headings 0.1 s apart."""
+    for number, heading in enumerate(degrees):
+        memory.put(round((second + number / 10) * SECOND_NS), SE2(0.0, 0.0, wrap_angle(math.radians(heading))))
+
+
+def test_what_is_left_of_a_turn_is_less_what_the_robot_has_come() -> None:
+    memory = TurnMemory()
+    assert memory.left(HERE) is None
+    heard(memory, PROGRESS, Look("left", 6.0), SE2(1.0, 2.0, math.pi / 2))
+    left = memory.left(SE2(1.0, 4.5, math.pi / 2))
+    assert left == TurnLeft("left", (3.5,))
+
+
+def test_who_has_gone_back_has_further_to_go() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 6.0))
+    assert memory.left(SE2(-2.0, 0.0, math.pi)) == TurnLeft("left", (8.0,))
+
+
+def test_the_last_looks_count() -> None:
+    memory = TurnMemory()
+    for metres in range(9):
+        heard(memory, PROGRESS, Look("left", float(metres)))
+    assert memory.left(HERE) == TurnLeft("left", (5.0, 6.0, 7.0, 8.0)) and MOST_LOOKS == 4
+
+
+@pytest.mark.parametrize(("progress", "look"), [(PROGRESS, Look("right", 3.0)), (Progress(1, 2, 1), Look("left", 3.0))])
+def test_another_turn_begins_anew(progress: Progress, look: Look) -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 6.0))
+    heard(memory, progress, look)
+    assert memory.left(HERE) == TurnLeft(look.side, (3.0,))
+
+
+@pytest.mark.parametrize(("progress", "look"), [(PROGRESS, None), (None, Look("left", 3.0))])
+def test_an_answer_without_a_turn_or_progress_forgets_it(progress: Progress | None, look: Look | None) -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 6.0))
+    heard(memory, progress, look)
+    assert memory.left(HERE) is None
+
+
+@pytest.mark.parametrize(
+    ("side", "degrees", "done"),
+    [
+        ("left", [0, 10, 20, 26], True),
+        ("left", [0, 10, 20, 24], False),
+        ("left", [0, -10, -20, -30], False),
+        ("right", [0, -10, -20, -30], True),
+        ("left", [0, -40, -20, 0], True),
+        ("left", [170, 185, 200], True),
+        ("right", [-170, -185, -200], True),
+    ],
+)
+def test_a_turn_may_be_done_once_the_robot_has_turned_that_way(side: str, degrees: list[float], done: bool) -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look(side, 3.0))
+    turning(memory, degrees)
+    assert memory.may_be_done == done
+
+
+def test_without_a_side_a_turn_may_always_be_done() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, None)
+    assert memory.may_be_done
+
+
+def test_the_next_turn_is_another_one() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 3.0))
+    turning(memory, [9.0 * n for n in range(11)])
+    heard(memory, NEXT, Look("left", 6.0), second=9.0)
+    assert not memory.may_be_done
+    turning(memory, [90.0, 110.0, 130.0], second=10.0)
+    assert memory.may_be_done
+
+
+def test_a_turn_may_begin_a_little_before_it_is_said_to_be_next() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 3.0))
+    turning(memory, [0.0, 15.0, 30.0], second=7.0)
+    heard(memory, NEXT, Look("left", 1.0), second=9.0)
+    assert memory.may_be_done
+    heard(memory, PROGRESS, Look("left", 1.0), second=10.5)
+    assert not memory.may_be_done
+
+
+def test_poses_that_come_again_change_nothing() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 3.0))
+    for _ in range(3):
+        turning(memory, [0.0, -20.0, 0.0])
+    assert not memory.may_be_done
+
+
+def test_a_turn_that_is_claimed_again_and_again_counts_as_done() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 3.0))
+    for _ in range(MOST_REFUSED - 1):
+        heard(memory, PROGRESS, Look("left", 3.0), overruled=True)
+    heard(memory, PROGRESS, Look("left", 3.0))
+    for _ in range(MOST_REFUSED):
+        assert not memory.may_be_done
+        heard(memory, PROGRESS, Look("left", 3.0), overruled=True)
+    assert memory.may_be_done
+
+
+# What is remembered of progress
+
+
+def test_before_anything_was_said_anything_may_be() -> None:
+    assert NOTHING_KNOWN.follow == FREE and NOTHING_KNOWN.before is None
+
+
+def test_going_back_counts_when_it_is_said_twice_in_a_row() -> None:
+    text = "Progress: turn 2 of 3, passed 0."
+    guide = TextGuide(NOTHING_KNOWN, lambda text: [ord(letter) for letter in text])
+    known = NOTHING_KNOWN.after(text, guide)
+    assert known == Known(Progress(2, 3, 0), ONWARD)
+    held_back = TextGuide(known, lambda text: [ord(letter) for letter in text])
+    for letter in "Progress: turn 1":
+        held_back.choose(ord(letter))
+    assert held_back.overruled and known.after(text, held_back).follow == EITHER_WAY
+    assert known.after("no such line", guide).before == Progress(2, 3, 0)
+
+
+# In the decoding loop
+
+
+class Script:
+    """A decode call that says the lines of a text, whatever the ones before have become; it keeps what it was fed."""
+
+    def __init__(self, lines: list[list[int]], prompt: int) -> None:
+        self._lines, self._prompt = lines, prompt
+        self._fed: list[int] = []
+
+    def __call__(self, chunk: Chunk, past: int, kv: object, interrupt: object) -> int:
+        self._fed = [*self._fed[:past], *chunk.ids]
+        ends = {line[-1] for line in self._lines[:-1]}
+        number, place = 0, 0
+        for token in self.heard():
+            number, place = (number + 1, 0) if token in ends else (number, place + 1)
+        line = self._lines[number]
+        return line[min(place, len(line) - 1)]
+
+    def heard(self) -> list[int]:
+        """What it was fed behind the prompt."""
+        return self._fed[self._prompt :]
+
+
+def said(artifacts: Artifacts, text: str, known: Known) -> tuple[str, TextGuide, bool]:
+    """(text, its guide, whether what was fed is what was said) of a model that would say `text`."""
+    language = LanguageModel(artifacts, threads=1)
+    tail = language.prompt.tail((), known.before)
+    lines = [language._tokenizer.encode(line, add_special_tokens=False).ids for line in text.splitlines(keepends=True)]
+    script = Script([*lines[:-1], [*lines[-1], language.runtime.im_end_id]], len(tail.ids))
+    language.prefill_call = language.decode_call = cast("Call", script)
+    guide = language.guide(known)
+    made = language.generate([tail], max_new_tokens=60, cancelled=lambda: False, guide=guide)
+    assert made.last_layer_kv.shape[1] == made.prompt_tokens + made.new_tokens
+    return made.text, guide, script.heard() == list(made.token_ids)
+
+
+TEXT = "Situation: in a corridor.\nMotion: nobody near.\nProgress: {}\nPlan: {}.\nwaypoints: (2.0, 0.1)"
+BEFORE = Progress(2, 3, 1)
+
+
+@pytest.mark.parametrize("follow", [ONWARD, EITHER_WAY])
+@pytest.mark.parametrize("progress", [BEFORE, Progress(2, 3, 2), Progress(3, 3, 0)])
+def test_a_text_that_goes_onward_is_left_as_the_model_says_it(
+    artifacts: Artifacts, progress: Progress, follow: str
+) -> None:
+    text = TEXT.format(format_progress(progress), "turn left into the room in 3 m")
+    made, guide, heard = said(artifacts, text, Known(BEFORE, follow))
+    assert (made, guide.overruled, heard, guide.look) == (text, False, True, Look("left", 3.0))
+
+
+@pytest.mark.parametrize("wrong", [Progress(1, 3, 0), Progress(2, 2, 1), Progress(4, 3, 0), Progress(2, 3, 7)])
+def test_a_text_that_does_not_is_held_to_the_grammar_and_the_model_hears_it(
+    artifacts: Artifacts, wrong: Progress
+) -> None:
+    text = TEXT.format(format_progress(wrong), "turn back")
+    made, guide, heard = said(artifacts, text, Known(BEFORE, ONWARD))
+    assert guide.overruled and heard and parse_progress(made) in followers(BEFORE, ONWARD)
+    assert made.startswith("Situation: in a corridor.\n") and made.endswith("Plan: turn back.\nwaypoints: (2.0, 0.1)")
+
+
+def test_a_turn_is_undone_where_either_way_may_be_said(artifacts: Artifacts) -> None:
+    text = TEXT.format("turn 1 of 1, passed 0.", "turn back")
+    last_leg = Progress(2, 1, 0)
+    assert said(artifacts, text, Known(last_leg, ONWARD))[0] == TEXT.format("last leg of 1, passed 0.", "turn back")
+    assert said(artifacts, text, Known(last_leg, EITHER_WAY))[0] == text
+
+
+def test_with_nothing_known_the_model_says_what_it_will(artifacts: Artifacts) -> None:
+    text = TEXT.format("turn 9 of 9, passed 9.", "turn left into the room in 9 m")
+    made, guide, heard = said(artifacts, text, NOTHING_KNOWN)
+    assert (made, guide.overruled, heard) == (text, False, True)
+
+
+@pytest.mark.parametrize(("left_m", "told"), [((3.0, 3.0, 2.9), "in 3 m"), ((0.5, 0.2), "now"), ((11.0,), "in 12 m")])
+def test_a_turn_that_looks_nearer_is_said_nearer_and_the_model_hears_that_alone(
+    artifacts: Artifacts, left_m: tuple[float, ...], told: str
+) -> None:
+    text = TEXT.format(format_progress(BEFORE), "turn left into the corridor {}")
+    known = Known(BEFORE, ONWARD, TurnLeft("left", left_m))
+    made, guide, heard = said(artifacts, text.format("in 12 m"), known)
+    assert made == text.format(told) and heard
+    assert guide.look == Look("left", 12.0)
+
+
+def test_a_turn_that_was_not_made_is_still_to_come(artifacts: Artifacts) -> None:
+    text = TEXT.format(format_progress(Progress(3, 3, 0)), "turn back")
+    made, guide, heard = said(artifacts, text, Known(BEFORE, ONWARD, None, may_be_done=False))
+    assert parse_progress(made) == BEFORE and guide.overruled and heard
+
+
+def test_another_turn_is_as_far_as_the_model_says(artifacts: Artifacts) -> None:
+    text = TEXT.format(format_progress(Progress(3, 3, 0)), "turn left into the corridor in 12 m")
+    assert said(artifacts, text, Known(BEFORE, ONWARD, TurnLeft("left", (1.0, 1.0, 1.0))))[0] == text
