@@ -13,7 +13,7 @@ from edge.geometry import SE2
 from edge.path_memory import PERIOD_NS, PathMemory, Way
 from edge.reasoning_text import parse_progress
 from edge.ring import EncodedFrame, TokenRing
-from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
+from edge.text_guide import DONE, NOTHING_KNOWN, Known, TextGuide
 from edge.turn_memory import TurnMemory
 
 MOST_FRAMES = 1 << 16
@@ -51,9 +51,8 @@ class InstructionMemory:
     def heard(self, text: str, guide: TextGuide, anchor: EncodedFrame) -> None:
         """Remember what a published generation says of its progress, and of its turn before it was held to it."""
         self._known = self._known.after(text, guide)
-        self._turn.heard(
-            parse_progress(text), guide.look, anchor.T_odom_base, anchor.stamp_ns, overruled=guide.overruled
-        )
+        claimed = guide.wanted == DONE
+        self._turn.heard(parse_progress(text), guide.look, anchor, overruled=guide.overruled, claimed=claimed)
 
     def _take(self, ring: TokenRing, until_ns: int) -> None:
         for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):

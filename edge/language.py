@@ -289,7 +289,8 @@ class GenerationRun:
         others = guide.line(self._model.text_of(ids).rstrip("\n"))
         if others is None:
             return
-        same = next(i for i, (token, other) in enumerate(zip(ids, others, strict=False)) if token != other)
+        differ = (i for i, (token, other) in enumerate(zip(ids, others, strict=False)) if token != other)
+        same = next(differ, min(len(ids), len(others)) - 1)
         new_ids[line_at:] = others
         self._fed -= len(ids) - 1 - same
         for token in others[same:-1]:

@@ -96,6 +96,8 @@ SCHEMAS: Mapping[str, Schema] = {
             "turn",
             "turn_left_m",
             "turn_may_be_done",
+            "overruled",
+            "planned",
             "max_new_tokens",
         ),
         generation=_INT,
@@ -114,6 +116,8 @@ SCHEMAS: Mapping[str, Schema] = {
         turn=_TEXT_OR_NULL,  # left or right: the turn that was next then
         turn_left_m=_VECTOR_OR_NULL,  # how far it is by each earlier look
         turn_may_be_done=_BOOL,  # whether the robot can have made it, by odometry
+        overruled=_BOOL,  # whether the model would have said another progress
+        planned=_TEXT,  # the plan's line as the model said it, where it was held to another distance
         prompt_tokens=_INT,
         max_new_tokens=_INT,
         new_tokens=_INT,

@@ -7,10 +7,14 @@ that mistake. The grammar of what may follow is known, so decoding is held to it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, TypeAlias
 
 from edge.reasoning_text import MAX_COUNT, Progress
+
+Line: TypeAlias = tuple[int, ...]
+EMPTY: Final[Mapping[str, Sequence[Line]]] = MappingProxyType({})
 
 FREE: Final = "free"
 """Whatever the model says: nothing has been said before, or nothing is known of it."""
@@ -48,21 +52,30 @@ class LineGuide:
     that are left has there, the line becomes the preferred one of them; a text without such a line is left as it is.
     """
 
-    def __init__(self, lines: Sequence[tuple[int, ...]]) -> None:
-        """`lines`: of one token or more, none the start of another. Raises ValueError unless all begin alike."""
+    def __init__(self, lines: Sequence[Line], refused: Mapping[str, Sequence[Line]] = EMPTY) -> None:
+        """`lines`: of one token or more, none the start of another. Raises ValueError unless all begin alike.
+
+        `refused`: kinds of lines that are not allowed, by name.
+        """
         if len({line[:1] for line in lines}) != 1 or not lines[0]:
             raise ValueError("expected lines that begin with the same token")
         self._lines = list(lines)
+        self._refused = {name: list(kind) for name, kind in refused.items()}
         self._at = 0
         self.overruled = False
         """Whether the model would have gone on in another way."""
+        self.wanted: str | None = None
+        """Of which refused kind; None: of none."""
 
     def choose(self, token: int) -> int:
         """The token to take where the model has chosen `token`; to be asked for every new token, in order."""
         if not self._lines or (self._at == 0 and token != self._lines[0][0]):
             return token
         allowed = [line for line in self._lines if line[self._at] == token]
+        for name, kind in self._refused.items():
+            self._refused[name] = [line for line in kind if line[self._at : self._at + 1] == (token,)]
         if not allowed:
+            self.wanted = next((name for name, kind in self._refused.items() if kind), None)
             # What it says next belongs to what it meant, which is none of them.
             self.overruled = True
             allowed = self._lines[:1]

@@ -291,6 +291,8 @@ class ReasoningLoop:
                 "way": way,
                 "before": told_before(known.before),
                 **known.record(),
+                "overruled": guide.overruled,
+                "planned": guide.planned,
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,

@@ -32,7 +32,7 @@ class Known:
         A text that says no progress leaves the one that was said before.
         """
         before = parse_progress(text) or self.before
-        return Known() if before is None else Known(before, EITHER_WAY if guide.overruled else ONWARD)
+        return Known() if before is None else Known(before, EITHER_WAY if guide.wanted == BACK else ONWARD)
 
     def record(self) -> dict[str, Any]:
         """What the flight log says of it, beside `before`."""
@@ -46,6 +46,7 @@ class Known:
 
 
 NOTHING_KNOWN: Final = Known()
+BACK, DONE = "back", "done"
 
 
 class TextGuide:
@@ -53,22 +54,24 @@ class TextGuide:
 
     def __init__(self, known: Known, encode: Encode) -> None:
         """`encode`: the model's tokens of a text."""
-        before = known.before
-        lines = () if before is None else followers(before, known.follow)
-        if before is not None and not known.may_be_done:
-            lines = tuple(progress for progress in lines if progress.step <= before.step)
-        texts = [f"{PROGRESS_HEAD}{format_progress(progress)}\n" for progress in lines]
-        self._progress = LineGuide([tuple(encode(text)) for text in texts]) if texts else None
+        self._progress = None if known.before is None else _progress_guide(known.before, known, encode)
         self._known = known
         self._encode = encode
         self._said: Progress | None = None
         self.look: Look | None = None
         """The turn that the model planned by itself."""
+        self.planned = ""
+        """Its line as the model said it; empty: it was not held."""
 
     @property
     def overruled(self) -> bool:
         """Whether the model would have said another progress."""
         return self._progress is not None and self._progress.overruled
+
+    @property
+    def wanted(self) -> str | None:
+        """Whether that was to undo a turn, BACK, or to have made one that the robot cannot have made, DONE."""
+        return None if self._progress is None else self._progress.wanted
 
     def choose(self, token: int) -> int:
         """The token to take where the model has chosen `token`."""
@@ -84,4 +87,17 @@ class TextGuide:
         turn = self._known.turn
         if turn is None or self._said != self._known.before or (told := nearer(line, turn)) == line:
             return None
+        self.planned = line
         return tuple(self._encode(f"{told}\n"))
+
+
+def _progress_guide(before: Progress, known: Known, encode: Encode) -> LineGuide | None:
+    if known.follow == FREE:
+        return None
+    kinds: dict[str, list[tuple[int, ...]]] = {"": [], DONE: [], BACK: []}
+    for progress in followers(before, EITHER_WAY):
+        kind = DONE if progress.step > before.step else BACK if progress.step < before.step else ""
+        kinds[kind].append(tuple(encode(f"{PROGRESS_HEAD}{format_progress(progress)}\n")))
+    allowed = {"": True, DONE: known.may_be_done, BACK: known.follow == EITHER_WAY}
+    lines = [line for kind, found in kinds.items() if allowed[kind] for line in found]
+    return LineGuide(lines, {kind: found for kind, found in kinds.items() if not allowed[kind]})

@@ -10,29 +10,39 @@ left or right is done by who has turned that way.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import deque
 from dataclasses import dataclass
-from math import copysign, hypot
 from statistics import median
 from typing import Final
 
 from edge.geometry import SE2, wrap_angle
 from edge.reasoning_text import PLAN_HEAD, Progress
+from edge.ring import EncodedFrame
 
 MOST_LOOKS: Final = 4
 """Beside the newest."""
-TURNED_RAD: Final = 0.44
-"""Who has turned less, 25°, has not made a turn: they are of 90° as a rule."""
-EARLIER_NS: Final = 3_000_000_000
-"""A turn may begin so long before the words say that it is the next one."""
-MOST_REFUSED: Final = 4
-"""Claimed so often in a row, a turn counts as made: some need no turning."""
-MOST_HEADINGS: Final = 600
-"""A minute of the ring's poses."""
 NOW_M: Final = 1.0
 """Nearer than this is "now", as in the texts that are learned from."""
-_TURN: Final = re.compile(rf"({PLAN_HEAD}.*\b(left|right)\b.*) (?:now|in (\d{{1,2}}) m)\.", re.ASCII)
+TURNED_RAD: Final = 0.44
+"""Who heads less far to that side than he has at any time since it was to be made, 25°, has not made a turn: they are
+of 90° as a rule."""
+ONCE_TURNED_RAD: Final = 0.79
+"""Who has once done so by 45° has made it, wherever he heads now: words may be late."""
+EARLIER_NS: Final = 3_000_000_000
+"""A turn may begin so long before the words say that it is the next one."""
+SETTLED_RAD: Final = 0.09
+"""Who turns by less in a second, 5°, has ended a turn; what comes before belongs to that, and not to another one to the
+same side."""
+SECOND_NS: Final = 1_000_000_000
+MOST_REFUSED: Final = 6
+"""Claimed so often in a row, a turn counts as made."""
+MOST_HEADINGS: Final = 600
+"""A minute of the ring's poses."""
+LEFT, RIGHT, AHEAD = "left", "right", "ahead"
+_PLAN: Final = re.compile(rf"({PLAN_HEAD}(?!stop ).*) (?:now|in (\d{{1,2}}) m)\.", re.ASCII)
+_SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -40,13 +50,13 @@ class Look:
     """A turn as one answer said it."""
 
     side: str
-    """"left" or "right"."""
+    """LEFT, RIGHT; AHEAD: an opening to go through without turning."""
     distance_m: float
 
 
 @dataclass(frozen=True)
 class TurnLeft:
-    """What earlier looks say of the turn that is next: its side, and how far it is by each, m."""
+    """What earlier looks say of the turn that is next: its side, LEFT or RIGHT, and how far it is by each, m."""
 
     side: str
     left_m: tuple[float, ...]
@@ -54,13 +64,16 @@ class TurnLeft:
 
 def look_of(line: str) -> Look | None:
     """What a plan's line says of a turn; None where it plans none, or says not how far it is."""
-    found = _TURN.fullmatch(line)
-    return None if found is None else Look(found.group(2), float(found.group(3) or 0.0))
+    found = _PLAN.fullmatch(line)
+    if found is None:
+        return None
+    side = _SIDE.search(found.group(1))
+    return Look(AHEAD if side is None else side.group(), float(found.group(2) or 0.0))
 
 
 def nearer(line: str, turn: TurnLeft) -> str:
     """The plan's line with its turn no further away than the looks have it; the same line where they say nothing."""
-    look, found = look_of(line), _TURN.fullmatch(line)
+    look, found = look_of(line), _PLAN.fullmatch(line)
     if look is None or found is None or look.side != turn.side:
         return line
     distance_m = median((*turn.left_m, look.distance_m))
@@ -80,21 +93,20 @@ class TurnMemory:
         self._of: tuple[Progress, str] | None = None
         self._looks: list[tuple[SE2, float]] = []
         self._headings: deque[tuple[int, float]] = deque(maxlen=MOST_HEADINGS)
+        self._turned = _Turned(None, 0)
         self._step: tuple[int, int] | None = None
-        self._since_ns = 0
+        self._farthest = 0
         self._side: str | None = None
-        self._most_rad = {"left": 0.0, "right": 0.0}
-        self._low_rad = self._high_rad = 0.0
-        self._refused = 0
+        self._claims = 0
+        self._granted = False
 
     def put(self, stamp_ns: int, T_odom_base: SE2) -> None:
         """See a pose; one that is not newer than the newest changes nothing."""
         if self._headings and stamp_ns <= self._headings[-1][0]:
             return
         last_rad = self._headings[-1][1] if self._headings else T_odom_base.theta_rad
-        heading_rad = last_rad + wrap_angle(T_odom_base.theta_rad - last_rad)
-        self._headings.append((stamp_ns, heading_rad))
-        self._turn_to(heading_rad)
+        self._headings.append((stamp_ns, last_rad + wrap_angle(T_odom_base.theta_rad - last_rad)))
+        self._turned.put(*self._headings[-1])
 
     def left(self, T_odom_base: SE2) -> TurnLeft | None:
         """How far the turn is from a pose, by each look; None without any."""
@@ -104,42 +116,75 @@ class TurnMemory:
 
     @property
     def may_be_done(self) -> bool:
-        """Whether the robot has turned to the side that was said; also where no side was, or it is claimed for long."""
-        return self._side is None or self._refused >= MOST_REFUSED or self._most_rad[self._side] >= TURNED_RAD
+        """Whether the robot can have made the turn that is next: who has to turn to a side has turned that way.
+
+        Also a turn that was made before, and one that is claimed on and on.
+        """
+        if self._side is None or self._granted or (self._step is not None and self._step[0] < self._farthest):
+            return True
+        return self._turned.to(self._side)
 
     def heard(
-        self, progress: Progress | None, look: Look | None, T_odom_base: SE2, stamp_ns: int, *, overruled: bool
+        self, progress: Progress | None, look: Look | None, anchor: EncodedFrame, *, overruled: bool, claimed: bool
     ) -> None:
-        """Remember what an answer to that pose's picture said itself: who says no turn looks for none.
+        """Remember what an answer to that frame said itself: who says no turn looks for none.
 
-        `overruled`: it would have said another progress.
+        `overruled`: it would have said another progress, and nothing of its plan is known; `claimed`: that a turn is
+        done which cannot be.
         """
-        self._refused = self._refused + 1 if overruled and not self.may_be_done else 0
+        self._claims = self._claims + 1 if claimed else 0
+        self._granted = self._granted or self._claims >= MOST_REFUSED
         if progress is not None and (step := (progress.step, progress.steps)) != self._step:
-            self._step, self._side, self._refused = step, None, 0
-            self._begin(stamp_ns - EARLIER_NS)
-        of = None if progress is None or look is None else (progress, look.side)
+            onward = self._step is not None and step[0] > self._step[0]
+            self._turned = _Turned(self._side if onward else None, anchor.stamp_ns)
+            for stamp_ns, heading_rad in self._headings:
+                if stamp_ns >= anchor.stamp_ns - EARLIER_NS:
+                    self._turned.put(stamp_ns, heading_rad)
+            self._step, self._farthest = step, max(step[0], self._farthest)
+            self._side, self._claims, self._granted = None, 0, False
+        if overruled:
+            return
+        aside = look is not None and look.side != AHEAD
+        of = (progress, look.side) if progress is not None and look is not None and aside else None
         if of is None or of != self._of:
             self._of, self._looks = of, []
-        if look is not None and of is not None:
-            self._looks = [*self._looks[1 - MOST_LOOKS :], (T_odom_base, look.distance_m)]
-            self._side = look.side
+        if of is not None and look is not None:
+            self._looks = [*self._looks[1 - MOST_LOOKS :], (anchor.T_odom_base, look.distance_m)]
+        if look is not None:
+            self._side = look.side if aside else None
 
-    def _begin(self, since_ns: int) -> None:
-        """Count turns from then on."""
-        self._most_rad = {"left": 0.0, "right": 0.0}
-        headings = [heading_rad for stamp_ns, heading_rad in self._headings if stamp_ns >= since_ns]
-        self._low_rad = self._high_rad = headings[0] if headings else 0.0
-        for heading_rad in headings:
-            self._turn_to(heading_rad)
 
-    def _turn_to(self, heading_rad: float) -> None:
-        self._low_rad, self._high_rad = min(self._low_rad, heading_rad), max(self._high_rad, heading_rad)
-        self._most_rad["left"] = max(self._most_rad["left"], heading_rad - self._low_rad)
-        self._most_rad["right"] = max(self._most_rad["right"], self._high_rad - heading_rad)
+class _Turned:
+    """How a robot has turned since some instant: furthest from where it headed, to each side."""
+
+    def __init__(self, settling: str | None, from_ns: int) -> None:
+        """`settling`: to this side it may still be making the turn before, from then on."""
+        self._settling, self._from_ns = settling, from_ns
+        self._before: deque[tuple[int, float]] = deque()
+        self._from_rad = {LEFT: math.inf, RIGHT: math.inf}
+        self._now_rad = {LEFT: 0.0, RIGHT: 0.0}
+        self._most_rad = {LEFT: 0.0, RIGHT: 0.0}
+
+    def put(self, stamp_ns: int, heading_rad: float) -> None:
+        """See a heading, counted on beyond half a turn."""
+        self._before.append((stamp_ns, heading_rad))
+        while len(self._before) > 1 and self._before[1][0] <= stamp_ns - SECOND_NS:
+            self._before.popleft()
+        then_ns, then_rad = self._before[0]
+        if self._from_ns <= then_ns <= stamp_ns - SECOND_NS and abs(heading_rad - then_rad) < SETTLED_RAD:
+            self._settling = None
+        for side, aside_rad in ((LEFT, heading_rad), (RIGHT, -heading_rad)):
+            # Once it is still settling, it begins where it is.
+            start_rad = aside_rad if side == self._settling else min(self._from_rad[side], aside_rad)
+            self._from_rad[side], self._now_rad[side] = start_rad, aside_rad - start_rad
+            self._most_rad[side] = max(self._most_rad[side], aside_rad - start_rad)
+
+    def to(self, side: str) -> bool:
+        """Whether that is a turn to that side."""
+        return self._now_rad[side] >= TURNED_RAD or self._most_rad[side] >= ONCE_TURNED_RAD
 
 
 def _come_m(T_odom_then: SE2, T_odom_now: SE2) -> float:
     """How far the robot has come: back counts as less."""
     moved = T_odom_then.inverse() @ T_odom_now
-    return copysign(hypot(moved.x_m, moved.y_m), moved.x_m)
+    return math.copysign(math.hypot(moved.x_m, moved.y_m), moved.x_m)

@@ -19,7 +19,7 @@ from edge.reasoning_loop import ReasoningLoop, SemanticSlot
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import Role
-from edge.text_guide import Known
+from edge.text_guide import BACK, Known
 from edge.turn_memory import Look
 
 KV = np.zeros((1, 5, 8), dtype=np.float32)
@@ -81,6 +81,12 @@ class FakeGuide:
     @property
     def look(self) -> Look | None:
         return self._language.look
+
+    @property
+    def wanted(self) -> str | None:
+        return BACK if self.overruled else None
+
+    planned = ""
 
 
 class FakeLanguage:

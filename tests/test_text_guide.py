@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import cast
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,8 +16,9 @@ from edge.language import Call, Chunk, LanguageModel
 from edge.manifest import Artifacts
 from edge.progress_guide import EITHER_WAY, FREE, ONWARD, followers
 from edge.reasoning_text import Progress, format_progress, parse_progress
-from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
-from edge.turn_memory import MOST_LOOKS, MOST_REFUSED, Look, TurnLeft, TurnMemory, look_of, nearer
+from edge.ring import EncodedFrame
+from edge.text_guide import BACK, DONE, NOTHING_KNOWN, Known, TextGuide
+from edge.turn_memory import AHEAD, MOST_LOOKS, MOST_REFUSED, SECOND_NS, Look, TurnLeft, TurnMemory, look_of, nearer
 from tools.train.trace_words import turn
 
 HERE = SE2(0.0, 0.0, 0.0)
@@ -32,11 +35,14 @@ def test_a_turn_is_read_as_training_writes_it(side: str, kind: str, metres: floa
     assert look == Look(side, 0.0 if metres < 1.0 else float(round(metres)))
 
 
-@pytest.mark.parametrize(
-    "plan", ["stop in 3 m.", "turn back.", "go straight to the lobby in 4 m.", "turn left soon.", "turn left in 4 m"]
-)
+@pytest.mark.parametrize("plan", ["stop in 3 m.", "stop now.", "turn back.", "turn left soon.", "turn left in 4 m"])
 def test_other_plans_are_no_look_at_a_turn(plan: str) -> None:
     assert look_of(f"Plan: {plan}") is None
+
+
+@pytest.mark.parametrize(("side", "kind"), [("straight", "corridor"), ("straight", "crossing")])
+def test_an_opening_straight_ahead_is_a_turn_to_no_side(side: str, kind: str) -> None:
+    assert look_of(f"Plan: {turn(side, kind, 4.0)}.") == Look(AHEAD, 4.0)
 
 
 @given(SIDES, KINDS, st.floats(0.0, 30.0), st.lists(st.floats(-5.0, 30.0), min_size=1, max_size=4))
@@ -72,20 +78,29 @@ def test_looks_to_the_other_side_say_nothing() -> None:
 
 PROGRESS = Progress(1, 2, 0)
 NEXT = Progress(2, 2, 0)
-SECOND_NS = 1_000_000_000
 
 
 def heard(
-    memory: TurnMemory, progress: Progress | None, look: Look | None, pose: SE2 = HERE, second: float = 0.0,
-    overruled: bool = False,
+    memory: TurnMemory, progress: Progress | None, look: Look | None, pose: SE2 = HERE, *, second: float = 0.0,
+    overruled: bool = False, claimed: bool = False,
 ) -> None:  # fmt: skip
-    memory.heard(progress, look, pose, round(second * SECOND_NS), overruled=overruled)
+    frame = EncodedFrame(round(second * SECOND_NS), pose, np.zeros(1, np.float32))
+    memory.heard(progress, look, frame, overruled=overruled, claimed=claimed)
 
 
-def turning(memory: TurnMemory, degrees: list[float], second: float = 0.0) -> None:
-    """Headings 0.1 s apart."""
+def turning(memory: TurnMemory, degrees: Sequence[float], second: float = 0.0) -> float:
+    """See headings 0.1 s apart; gives the time after them."""
     for number, heading in enumerate(degrees):
         memory.put(round((second + number / 10) * SECOND_NS), SE2(0.0, 0.0, wrap_angle(math.radians(heading))))
+    return second + len(degrees) / 10
+
+
+def to_turn(side: str = "left", heading: float = 0.0) -> TurnMemory:
+    """Of a robot that has driven straight on for 2 s and has just said a turn."""
+    memory = TurnMemory()
+    turning(memory, [heading] * 20)
+    heard(memory, PROGRESS, Look(side, 6.0), second=1.9)
+    return memory
 
 
 def test_what_is_left_of_a_turn_is_less_what_the_robot_has_come() -> None:
@@ -97,9 +112,7 @@ def test_what_is_left_of_a_turn_is_less_what_the_robot_has_come() -> None:
 
 
 def test_who_has_gone_back_has_further_to_go() -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 6.0))
-    assert memory.left(SE2(-2.0, 0.0, math.pi)) == TurnLeft("left", (8.0,))
+    assert to_turn().left(SE2(-2.0, 0.0, math.pi)) == TurnLeft("left", (8.0,))
 
 
 def test_the_last_looks_count() -> None:
@@ -111,83 +124,127 @@ def test_the_last_looks_count() -> None:
 
 @pytest.mark.parametrize(("progress", "look"), [(PROGRESS, Look("right", 3.0)), (Progress(1, 2, 1), Look("left", 3.0))])
 def test_another_turn_begins_anew(progress: Progress, look: Look) -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 6.0))
+    memory = to_turn()
     heard(memory, progress, look)
     assert memory.left(HERE) == TurnLeft(look.side, (3.0,))
 
 
-@pytest.mark.parametrize(("progress", "look"), [(PROGRESS, None), (None, Look("left", 3.0))])
+@pytest.mark.parametrize(
+    ("progress", "look"), [(PROGRESS, None), (None, Look("left", 3.0)), (PROGRESS, Look(AHEAD, 3.0))]
+)
 def test_an_answer_without_a_turn_or_progress_forgets_it(progress: Progress | None, look: Look | None) -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 6.0))
+    memory = to_turn()
     heard(memory, progress, look)
     assert memory.left(HERE) is None
 
 
+def test_an_answer_that_was_overruled_says_nothing_of_the_turn() -> None:
+    memory = to_turn()
+    heard(memory, PROGRESS, Look("right", 2.0), overruled=True)
+    assert memory.left(HERE) == TurnLeft("left", (6.0,)) and not memory.may_be_done
+
+
+STRAIGHT, SWAY = [0.0] * 30, [-13.0, -13.0, 0.0, 13.0, 13.0, 0.0, 0.0]
+SLOWLY = [3.0 * n for n in range(31)]
+
+
+@pytest.mark.parametrize("from_degrees", [0.0, 170.0, -100.0])
 @pytest.mark.parametrize(
     ("side", "degrees", "done"),
     [
-        ("left", [0, 10, 20, 26], True),
-        ("left", [0, 10, 20, 24], False),
-        ("left", [0, -10, -20, -30], False),
-        ("right", [0, -10, -20, -30], True),
-        ("left", [0, -40, -20, 0], True),
-        ("left", [170, 185, 200], True),
-        ("right", [-170, -185, -200], True),
+        ("left", SLOWLY[:10], True),
+        ("left", SLOWLY[:8], False),
+        ("right", SLOWLY, False),
+        ("left", STRAIGHT, False),
+        ("left", [*SWAY, *SWAY], False),
+        ("left", [*SLOWLY[:12], *SLOWLY[11::-1]], False),
+        ("left", [*SLOWLY[:20], *SLOWLY[19::-1]], True),
     ],
+    ids=["turns", "begins to", "turns the other way", "goes straight", "sways", "makes way", "turned, and back"],
 )
-def test_a_turn_may_be_done_once_the_robot_has_turned_that_way(side: str, degrees: list[float], done: bool) -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look(side, 3.0))
-    turning(memory, degrees)
+def test_a_turn_may_be_done_once_the_robot_has_turned_that_way(
+    side: str, degrees: list[float], done: bool, from_degrees: float
+) -> None:
+    memory = to_turn(side, from_degrees)
+    turning(memory, [from_degrees + heading for heading in degrees], second=2.0)
     assert memory.may_be_done == done
+    mirrored = to_turn({"left": "right", "right": "left"}[side], from_degrees)
+    turning(mirrored, [from_degrees - heading for heading in degrees], second=2.0)
+    assert mirrored.may_be_done == done
 
 
-def test_without_a_side_a_turn_may_always_be_done() -> None:
+@pytest.mark.parametrize("look", [None, Look(AHEAD, 4.0)])
+def test_without_a_side_a_turn_may_always_be_done(look: Look | None) -> None:
     memory = TurnMemory()
-    heard(memory, PROGRESS, None)
+    heard(memory, PROGRESS, look)
     assert memory.may_be_done
 
 
-def test_the_next_turn_is_another_one() -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 3.0))
-    turning(memory, [9.0 * n for n in range(11)])
-    heard(memory, NEXT, Look("left", 6.0), second=9.0)
+def test_a_side_that_was_misread_is_forgotten() -> None:
+    memory = to_turn()
+    heard(memory, PROGRESS, Look(AHEAD, 4.0))
+    assert memory.may_be_done
+
+
+def test_the_rest_of_a_turn_is_not_the_next_one_to_the_same_side() -> None:
+    memory = to_turn()
+    second = turning(memory, SLOWLY[:12], second=2.0)
+    heard(memory, NEXT, Look("left", 6.0), second=second - 0.1)
+    second = turning(memory, [*SLOWLY[12:], *[90.0] * 20], second=second)
     assert not memory.may_be_done
-    turning(memory, [90.0, 110.0, 130.0], second=10.0)
+    turning(memory, [90.0 + heading for heading in SLOWLY[:10]], second=second)
+    assert memory.may_be_done
+
+
+def test_the_next_turn_to_the_other_side_may_follow_at_once() -> None:
+    memory = to_turn()
+    second = turning(memory, SLOWLY, second=2.0)
+    heard(memory, NEXT, Look("right", 1.0), second=second - 0.1)
+    assert not memory.may_be_done
+    turning(memory, [90.0 - heading for heading in SLOWLY[:10]], second=second)
     assert memory.may_be_done
 
 
 def test_a_turn_may_begin_a_little_before_it_is_said_to_be_next() -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 3.0))
-    turning(memory, [0.0, 15.0, 30.0], second=7.0)
-    heard(memory, NEXT, Look("left", 1.0), second=9.0)
+    memory = to_turn("right")
+    second = turning(memory, SLOWLY[:10], second=7.0)
+    heard(memory, NEXT, Look("left", 1.0), second=second + 1.0)
     assert memory.may_be_done
-    heard(memory, PROGRESS, Look("left", 1.0), second=10.5)
-    assert not memory.may_be_done
+
+
+def test_a_turn_that_was_made_need_not_be_made_again() -> None:
+    memory = to_turn()
+    turning(memory, SLOWLY, second=2.0)
+    heard(memory, NEXT, Look("right", 6.0), second=6.0)
+    heard(memory, PROGRESS, Look("left", 1.0), second=12.0)
+    assert memory.may_be_done
 
 
 def test_poses_that_come_again_change_nothing() -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 3.0))
+    memory = to_turn()
     for _ in range(3):
-        turning(memory, [0.0, -20.0, 0.0])
+        turning(memory, [-90.0] * 20)
     assert not memory.may_be_done
 
 
 def test_a_turn_that_is_claimed_again_and_again_counts_as_done() -> None:
-    memory = TurnMemory()
-    heard(memory, PROGRESS, Look("left", 3.0))
+    memory = to_turn()
     for _ in range(MOST_REFUSED - 1):
-        heard(memory, PROGRESS, Look("left", 3.0), overruled=True)
+        heard(memory, PROGRESS, None, overruled=True, claimed=True)
     heard(memory, PROGRESS, Look("left", 3.0))
     for _ in range(MOST_REFUSED):
         assert not memory.may_be_done
-        heard(memory, PROGRESS, Look("left", 3.0), overruled=True)
+        heard(memory, PROGRESS, None, overruled=True, claimed=True)
     assert memory.may_be_done
+    heard(memory, PROGRESS, Look("left", 3.0))
+    assert memory.may_be_done
+
+
+def test_another_progress_that_is_overruled_claims_no_turn() -> None:
+    memory = to_turn()
+    for _ in range(2 * MOST_REFUSED):
+        heard(memory, PROGRESS, None, overruled=True)
+    assert not memory.may_be_done
 
 
 # What is remembered of progress
@@ -197,16 +254,43 @@ def test_before_anything_was_said_anything_may_be() -> None:
     assert NOTHING_KNOWN.follow == FREE and NOTHING_KNOWN.before is None
 
 
+def letters(text: str) -> list[int]:
+    return [ord(letter) for letter in text]
+
+
+def wanting(known: Known, words: str) -> TextGuide:
+    """The guide of a text that would begin its line so."""
+    guide = TextGuide(known, letters)
+    for letter in f"Progress: {words}":
+        guide.choose(ord(letter))
+    return guide
+
+
 def test_going_back_counts_when_it_is_said_twice_in_a_row() -> None:
-    text = "Progress: turn 2 of 3, passed 0."
-    guide = TextGuide(NOTHING_KNOWN, lambda text: [ord(letter) for letter in text])
-    known = NOTHING_KNOWN.after(text, guide)
-    assert known == Known(Progress(2, 3, 0), ONWARD)
-    held_back = TextGuide(known, lambda text: [ord(letter) for letter in text])
-    for letter in "Progress: turn 1":
-        held_back.choose(ord(letter))
-    assert held_back.overruled and known.after(text, held_back).follow == EITHER_WAY
-    assert known.after("no such line", guide).before == Progress(2, 3, 0)
+    text, before = "Progress: turn 2 of 3, passed 0.", Progress(2, 3, 0)
+    known = NOTHING_KNOWN.after(text, TextGuide(NOTHING_KNOWN, letters))
+    assert known == Known(before, ONWARD)
+    once = wanting(known, "turn 1")
+    assert once.overruled and once.wanted == BACK
+    again = known.after(text, once)
+    assert again == Known(before, EITHER_WAY) and not wanting(again, "turn 1").overruled
+    assert again.after(text, TextGuide(again, letters)) == Known(before, ONWARD)
+    assert known.after("no such line", TextGuide(known, letters)).before == before
+
+
+@pytest.mark.parametrize("words", ["turn 2 of 4", "last", "turn 2 of 3, passed 9"])
+def test_another_progress_that_is_overruled_is_no_step_back(words: str) -> None:
+    known = Known(Progress(2, 3, 0), ONWARD, may_be_done=False)
+    guide = wanting(known, words)
+    assert guide.overruled and guide.wanted is None
+    assert known.after("Progress: turn 2 of 3, passed 0.", guide).follow == ONWARD
+
+
+def test_a_turn_that_is_claimed_and_cannot_be_done_is_known_as_that() -> None:
+    known = Known(Progress(2, 3, 0), ONWARD, may_be_done=False)
+    assert wanting(known, "turn 3").wanted == DONE
+    assert wanting(Known(Progress(2, 2, 0), ONWARD, may_be_done=False), "last").wanted == DONE
+    assert not wanting(Known(Progress(2, 3, 0), ONWARD), "turn 3").overruled
 
 
 # In the decoding loop

@@ -169,7 +169,7 @@ class LockstepReasoner:
                 "before": told_before(job.known.before),
                 **job.known.record(),
                 "overruled": guide.overruled,
-                "planned": None if guide.look is None else [guide.look.side, guide.look.distance_m],
+                "planned": guide.planned,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
