@@ -21,7 +21,7 @@ from edge.geometry import SE2, wrap_angle
 from edge.reasoning_text import PLAN_HEAD, Progress
 from edge.ring import EncodedFrame
 
-MOST_LOOKS: Final = 4
+MOST_LOOKS: Final = 8
 """Beside the newest."""
 NOW_M: Final = 1.0
 """Nearer than this is "now", as in the texts that are learned from."""

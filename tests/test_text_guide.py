@@ -117,9 +117,9 @@ def test_who_has_gone_back_has_further_to_go() -> None:
 
 def test_the_last_looks_count() -> None:
     memory = TurnMemory()
-    for metres in range(9):
+    for metres in range(20):
         heard(memory, PROGRESS, Look("left", float(metres)))
-    assert memory.left(HERE) == TurnLeft("left", (5.0, 6.0, 7.0, 8.0)) and MOST_LOOKS == 4
+    assert memory.left(HERE) == TurnLeft("left", tuple(float(metres) for metres in range(20 - MOST_LOOKS, 20)))
 
 
 @pytest.mark.parametrize(("progress", "look"), [(PROGRESS, Look("right", 3.0)), (Progress(1, 2, 1), Look("left", 3.0))])
