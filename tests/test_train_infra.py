@@ -42,6 +42,19 @@ def test_a_run_says_what_it_was_made_with(tmp_path: Path) -> None:
     assert versions["packages"]["numpy"] == np.__version__ and versions["python"]
 
 
+def test_a_run_that_goes_on_with_other_code_says_so_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run_dir(tmp_path)
+    first = json.loads((made.out / "versions.json").read_text())
+    run_dir(tmp_path)
+    assert json.loads((made.out / "versions.json").read_text()) == first
+    monkeypatch.setattr("tools.train.run_dir.code_sha256", lambda: "of tomorrow")
+    for _ in range(2):
+        run_dir(tmp_path)
+    versions = json.loads((made.out / "versions.json").read_text())
+    later = versions.pop("later")
+    assert versions == first and [each["code_sha256"]["simulation"] for each in later] == ["of tomorrow"]
+
+
 def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> None:
     made = run_dir(tmp_path)
     (made.stage("collect") / "drive").touch()

@@ -431,6 +431,14 @@ def test_what_is_given_away_has_every_number_beside_it(trained: RunDir, tmp_path
     assert load_recipe(str(path.with_suffix(".recipe.toml"))) == TINY
 
 
+def test_the_card_of_an_ablation_says_that_it_is_one_of_another_run(trained: RunDir, tmp_path: Path) -> None:
+    ablation = RunDir.open(tmp_path / "ablation", TINY)
+    trained.finish("collect", {})
+    ablation.borrow(trained, ("collect",), TINY)
+    assert "--recipe recipe.toml --from RUN`" in card(ablation, TINY, trained.model_path)
+    assert "--from" not in card(trained, TINY, trained.model_path)
+
+
 def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
     first = ship(trained, TINY, tmp_path / "weights")
     for number, after in enumerate(("imitate", "imitate-1")):

@@ -210,10 +210,14 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
     went_on += "" if after is None else f" --after {after}"
     if results.get("collect", {}).get(IMPORTED) is True:
         went_on += " --drives DATASET"
+    if run_dir.borrowed("collect"):
+        went_on += " --from RUN"
     lines = [
         f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
         f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
     ]
+    if later := versions.get("later"):
+        lines.append(f"It went on with other code, versions or machines {len(later)} times: `{VERSIONS}`.")
     if timings := run_dir.timings():
         each = ", ".join(f"{step} {duration(seconds)}" for step, seconds in timings.items())
         lines.append(

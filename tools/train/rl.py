@@ -52,7 +52,7 @@ class RlConfig:
 
     policy: str = "action"
     """What is trained: the action expert's last layer and head, or the paper's `point-goal` baseline from nothing."""
-    iterations: int = 50
+    iterations: int = 300
     episodes: int = 16
     """Whole episodes of one iteration; with some 250 steps each, 4,000 steps (the paper: 1,024)."""
     episodes_per_job: int = TASKS_PER_SCENE
@@ -69,7 +69,7 @@ class RlConfig:
     rotate_every: int = 100
     """Iterations in one kind of scene before the next; 0: all kinds in every iteration."""
     tasks: int = 3
-    """Tasks (layouts with a start and a goal) of each kind, each time with another crowd; 0: always another one."""
+    """Tasks of each kind, all of one layout, each time with another crowd; 0: always another one."""
     drift: str = "typical"
     max_s: float = 90.0
     warmup_iterations: int = 3

@@ -50,10 +50,22 @@ class RunDir:
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise RunDirError(f"{out}: expected a new or empty directory, or one that edge-train has made")
         out.mkdir(parents=True, exist_ok=True)
-        if not (out / VERSIONS).exists():
-            write_whole(out / VERSIONS, json.dumps(versions(), indent=1) + "\n")
+        run_dir._note_versions()
         write_whole(run_dir.recipe_path, recipe.to_toml())
         return run_dir
+
+    def _note_versions(self) -> None:
+        """What the run began with, and below `later` whatever else it went on with."""
+        path, now = self.out / VERSIONS, versions()
+        first = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        later = [] if first is None else first.get("later", [])
+        if first is None:
+            first = now
+        elif now not in ({key: value for key, value in first.items() if key != "later"}, *later):
+            first["later"] = [*later, now]
+        else:
+            return
+        write_whole(path, json.dumps(first, indent=1) + "\n")
 
     def _changed(self, recipe: Recipe) -> str:
         """The first number of what has begun that differs from the recipe's; empty: none."""
