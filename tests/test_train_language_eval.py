@@ -11,7 +11,7 @@ import pytest
 
 from edge.progress_guide import EITHER_WAY, FREE, ONWARD
 from edge.reasoning_text import Progress, format_progress
-from edge.text_guide import Known
+from edge.text_guide import BACK, Known
 from tests.train_drives import WORDINGS, made_up_drive
 from tools.train.anchors import Anchor, Drawn, anchors_of
 from tools.train.language_eval import EvalConfig, Score, closed_loop, landmarks_of, side_of
@@ -94,9 +94,9 @@ class Parrot:
         self.guided: list[tuple[Progress | None, str]] = []
 
     def guide(self, known: Known) -> SimpleNamespace:
-        """One that overrules the first answer and no other."""
+        """One whose first answer would go back."""
         self.guided.append((known.before, known.follow))
-        return SimpleNamespace(overruled=len(self.guided) == 1)
+        return SimpleNamespace(wanted=BACK if len(self.guided) == 1 else None)
 
     def say(self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[object]) -> list[str]:
         assert len(guides) == len(questions)
