@@ -19,7 +19,7 @@ from edge.prompt import told_before
 from edge.reasoning_text import PROGRESS_HEAD, Progress, parse_progress
 from edge.recording import RecordingError, jpeg_bytes, read_messages
 from edge.text_guide import Known
-from edge.turn_memory import TurnLeft
+from edge.turn_memory import LEFT, RIGHT, TurnLeft
 from firmware_bridge.config import ConfigError, LimitsConfig
 
 _ORDER_WINDOW_NS = 5_000_000_000
@@ -214,7 +214,7 @@ def _follow(value: Any) -> str:
 def _turn(side: Any, left_m: Any) -> TurnLeft | None:
     if side is None:
         return None
-    if side not in ("left", "right") or not left_m:
+    if side not in (LEFT, RIGHT) or not left_m:
         raise ValueError(f"turn is {str(side)[:60]!r} by {left_m}")
     return TurnLeft(str(side), tuple(float(metres) for metres in left_m))
 
