@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from statistics import median
 from typing import Final
@@ -23,6 +23,10 @@ from edge.ring import EncodedFrame
 
 MOST_LOOKS: Final = 8
 """Beside the newest."""
+ALONG_RAD: Final = 0.7
+"""A look of who heads 40° elsewhere now is of another leg: what he has come since says nothing of the turn."""
+OVERDUE_M: Final = 1.0
+"""Who has come so much further than a look had it, and not turned, has looked wrongly."""
 NOW_M: Final = 1.0
 """Nearer than this is "now", as in the texts that are learned from."""
 TURNED_RAD: Final = 0.44
@@ -96,7 +100,7 @@ class TurnMemory:
         self._turned = _Turned(None, 0)
         self._step: tuple[int, int] | None = None
         self._farthest = 0
-        self._side: str | None = None
+        self._sides: Counter[str] = Counter()
         self._claims = 0
         self._granted = False
 
@@ -109,10 +113,14 @@ class TurnMemory:
         self._turned.put(*self._headings[-1])
 
     def left(self, T_odom_base: SE2) -> TurnLeft | None:
-        """How far the turn is from a pose, by each look; None without any."""
-        if self._of is None:
-            return None
-        return TurnLeft(self._of[1], tuple(distance_m - _come_m(pose, T_odom_base) for pose, distance_m in self._looks))
+        """How far the turn is from a pose, by each look that still can be right; None without any."""
+        left_m = tuple(
+            left_m
+            for pose, distance_m in self._looks
+            if abs(wrap_angle(T_odom_base.theta_rad - pose.theta_rad)) <= ALONG_RAD
+            and (left_m := distance_m - _come_m(pose, T_odom_base)) >= -OVERDUE_M
+        )
+        return TurnLeft(self._of[1], left_m) if self._of is not None and left_m else None
 
     @property
     def may_be_done(self) -> bool:
@@ -120,9 +128,10 @@ class TurnMemory:
 
         Also a turn that was made before, and one that is claimed on and on.
         """
-        if self._side is None or self._granted or (self._step is not None and self._step[0] < self._farthest):
+        if self._granted or (self._step is not None and self._step[0] < self._farthest):
             return True
-        return self._turned.to(self._side)
+        side = self._side()
+        return side is None or self._turned.to(side)
 
     def heard(
         self, progress: Progress | None, look: Look | None, anchor: EncodedFrame, *, overruled: bool, claimed: bool
@@ -136,12 +145,12 @@ class TurnMemory:
         self._granted = self._granted or self._claims >= MOST_REFUSED
         if progress is not None and (step := (progress.step, progress.steps)) != self._step:
             onward = self._step is not None and step[0] > self._step[0]
-            self._turned = _Turned(self._side if onward else None, anchor.stamp_ns)
+            self._turned = _Turned(self._side() if onward else None, anchor.stamp_ns)
             for stamp_ns, heading_rad in self._headings:
                 if stamp_ns >= anchor.stamp_ns - EARLIER_NS:
                     self._turned.put(stamp_ns, heading_rad)
             self._step, self._farthest = step, max(step[0], self._farthest)
-            self._side, self._claims, self._granted = None, 0, False
+            self._sides, self._claims, self._granted = Counter(), 0, False
         if overruled:
             return
         aside = look is not None and look.side != AHEAD
@@ -151,7 +160,14 @@ class TurnMemory:
         if of is not None and look is not None:
             self._looks = [*self._looks[1 - MOST_LOOKS :], (anchor.T_odom_base, look.distance_m)]
         if look is not None:
-            self._side = look.side if aside else None
+            self._sides[look.side] += 1
+
+    def _side(self) -> str | None:
+        """The side that was said most often of this turn; None: none, or not more often than another."""
+        found = self._sides.most_common(2)
+        if not found or found[0][0] == AHEAD or (len(found) > 1 and found[0][1] == found[1][1]):
+            return None
+        return found[0][0]
 
 
 class _Turned:

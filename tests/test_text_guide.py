@@ -112,7 +112,23 @@ def test_what_is_left_of_a_turn_is_less_what_the_robot_has_come() -> None:
 
 
 def test_who_has_gone_back_has_further_to_go() -> None:
-    assert to_turn().left(SE2(-2.0, 0.0, math.pi)) == TurnLeft("left", (8.0,))
+    assert to_turn().left(SE2(-2.0, 0.0, 0.0)) == TurnLeft("left", (8.0,))
+
+
+@pytest.mark.parametrize(
+    "here", [SE2(2.0, 0.0, math.radians(50)), SE2(2.0, 0.0, -math.radians(50)), SE2(7.1, 0.0, 0.0)]
+)
+def test_a_look_from_another_leg_or_one_that_was_passed_says_nothing(here: SE2) -> None:
+    memory = to_turn()
+    assert memory.left(here) is None
+    heard(memory, PROGRESS, Look("left", 3.0), here)
+    left = memory.left(here)
+    assert left is not None and left.left_m == pytest.approx([3.0])
+
+
+@pytest.mark.parametrize("here", [SE2(2.0, 0.0, math.radians(30)), SE2(6.9, 0.0, 0.0)])
+def test_a_look_from_about_here_still_counts(here: SE2) -> None:
+    assert to_turn().left(here) is not None
 
 
 def test_the_last_looks_count() -> None:
@@ -180,9 +196,17 @@ def test_without_a_side_a_turn_may_always_be_done(look: Look | None) -> None:
     assert memory.may_be_done
 
 
-def test_a_side_that_was_misread_is_forgotten() -> None:
-    memory = to_turn()
-    heard(memory, PROGRESS, Look(AHEAD, 4.0))
+@pytest.mark.parametrize("said", ["right", AHEAD])
+def test_the_side_is_what_most_answers_said(said: str) -> None:
+    memory = to_turn("left")
+    heard(memory, PROGRESS, Look(said, 4.0))
+    assert memory.may_be_done
+    heard(memory, PROGRESS, Look("left", 4.0))
+    assert not memory.may_be_done
+    turning(memory, [-heading for heading in SLOWLY], second=2.0)
+    assert not memory.may_be_done
+    for _ in range(2):
+        heard(memory, PROGRESS, Look(said, 4.0))
     assert memory.may_be_done
 
 
