@@ -159,7 +159,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
             _before(payload.get("before", told_before(None))),
             _follow(payload.get("follow", FREE)),
             _turn(payload.get("turn"), payload.get("turn_left_m")),
-            bool(payload.get("turn_may_be_done", True)),
+            _flag(payload.get("turn_may_be_done", True)),
         ),
         # Without the cap that was in force: as many as there were, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
@@ -214,9 +214,16 @@ def _follow(value: Any) -> str:
 def _turn(side: Any, left_m: Any) -> TurnLeft | None:
     if side is None:
         return None
-    if side not in (LEFT, RIGHT) or not left_m:
-        raise ValueError(f"turn is {str(side)[:60]!r} by {left_m}")
-    return TurnLeft(str(side), tuple(float(metres) for metres in left_m))
+    known_m = tuple(float(metres) for metres in left_m) if isinstance(left_m, list) else ()
+    if side not in (LEFT, RIGHT) or not known_m or not all(map(math.isfinite, known_m)):
+        raise ValueError(f"turn is {str(side)[:60]!r} by {str(left_m)[:60]}")
+    return TurnLeft(str(side), known_m)
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f"expected true or false, found {type(value).__name__}")
+    return value
 
 
 def _triple(values: Any) -> tuple[float, float, float]:

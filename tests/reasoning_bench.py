@@ -19,7 +19,7 @@ from edge.reasoning_loop import ReasoningLoop, SemanticSlot
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import Role
-from edge.text_guide import BACK, Known
+from edge.text_guide import Known
 from edge.turn_memory import Look
 
 KV = np.zeros((1, 5, 8), dtype=np.float32)
@@ -84,7 +84,7 @@ class FakeGuide:
 
     @property
     def wanted(self) -> str | None:
-        return BACK if self.overruled else None
+        return self._language.wanted
 
     planned = ""
 
@@ -99,6 +99,7 @@ class FakeLanguage:
         self.caps: list[int] = []
         self.guided: list[Known] = []
         self.overruled, self.look = False, cast("Look | None", None)
+        self.wanted = cast("str | None", None)
         self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
         self.during_feed: Callable[[], None] = lambda: None
         self.during_finish: Callable[[FakeRun], None] = lambda run: None

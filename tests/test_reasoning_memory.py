@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 
@@ -14,7 +16,8 @@ from edge.reasoning_budget import ReasoningBudget
 from edge.reasoning_loop import Mode, SemanticSlot
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
-from edge.turn_memory import Look
+from edge.text_guide import BACK, DONE
+from edge.turn_memory import LEFT, MOST_REFUSED, RIGHT, Look
 from sim_hil.benchmark.latency import Timing
 from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner
 from tests.reasoning_bench import KV, Bench, Clock, FakeLanguage, FakePolicy
@@ -42,6 +45,7 @@ def counting(language: FakeLanguage) -> FakeLanguage:
 
     def think(_run: object) -> None:
         language.overruled = len(language.prompts) % 3 == 2
+        language.wanted = BACK if language.overruled else None
         language.look = Look("left", 9.0)
         language.text = f"Progress: turn {len(language.prompts) + 1} of 99, passed 0.{LINE}"
 
@@ -64,9 +68,22 @@ def think_at(bench: Bench, second: float) -> tuple[Way, Progress | None]:
 # Both loops
 
 
-def lockstep(ticks: int, latency_s: float) -> FakeLanguage:
+def claiming(side: str, language: FakeLanguage) -> FakeLanguage:
+    """A model that has seen a turn to that side, says nothing else of it, and each time would have it done."""
+    language.text = FIRST
+
+    def think(_run: object) -> None:
+        language.look = None if language.prompts else Look(side, 9.0)
+        language.overruled = bool(language.prompts)
+        language.wanted = DONE if language.overruled else None
+
+    language.during_finish = think
+    return language
+
+
+def lockstep(ticks: int, latency_s: float, of: Callable[[FakeLanguage], FakeLanguage] = counting) -> FakeLanguage:
     """Ticks of the benchmark's reasoner."""
-    language, ring, slot = counting(FakeLanguage()), TokenRing(160), SemanticSlot()
+    language, ring, slot = of(FakeLanguage()), TokenRing(160), SemanticSlot()
     begin = language.begin
     language.begin = lambda cancelled: begin(  # type: ignore[method-assign, assignment, misc]
         cancelled,
@@ -94,10 +111,10 @@ def lockstep(ticks: int, latency_s: float) -> FakeLanguage:
     return language
 
 
-def threaded(ticks: int, every: int) -> FakeLanguage:
+def threaded(ticks: int, every: int, of: Callable[[FakeLanguage], FakeLanguage] = counting) -> FakeLanguage:
     """The runner's loop, a generation after every so many ticks."""
     bench = Bench(clock=Clock(), late_anchor=False)
-    counting(bench.language)
+    of(bench.language)
     for tick in range(ticks):
         bench.ring.put(frame_at(tick))
         if tick % every == 0:
@@ -119,6 +136,23 @@ def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None
     assert [(known.before, known.follow) for known in of_runner[:4]] == [
         (None, FREE), (Progress(1, 99, 0), ONWARD), (Progress(2, 99, 0), ONWARD), (Progress(3, 99, 0), EITHER_WAY),
     ]  # fmt: skip
+
+
+def test_both_loops_refuse_a_turn_that_the_robot_has_not_made_as_often() -> None:
+    """It drives round to the left, and is to turn right."""
+    right = partial(claiming, RIGHT)
+    of_lockstep, of_runner = lockstep(401, 2.0, right).guided, threaded(400, 20, right).guided
+    assert of_lockstep[:20] == of_runner
+    may_be_done = [known.may_be_done for known in of_runner]
+    assert may_be_done == [True, *[False] * MOST_REFUSED, *[True] * (19 - MOST_REFUSED)]
+
+
+def test_both_loops_see_the_robot_turn() -> None:
+    """It is to turn left, and does so after 10 s."""
+    left = partial(claiming, LEFT)
+    of_lockstep, of_runner = lockstep(401, 2.0, left).guided, threaded(400, 20, left).guided
+    assert of_lockstep[:20] == of_runner
+    assert [known.may_be_done for known in of_runner] == [True, *[False] * 4, *[True] * 15]
 
 
 def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_frames() -> None:

@@ -262,9 +262,9 @@ def test_a_generation_is_held_to_what_it_was_held_to(log: Log, monkeypatch: pyte
         return guide(self, known)
 
     monkeypatch.setattr(LanguageModel, "guide", watched)
-    log.payload("/semantic", 1).update(follow=EITHER_WAY, turn="left", turn_left_m=[2.5, 3.0])
+    log.payload("/semantic", 1).update(follow=EITHER_WAY, turn="left", turn_left_m=[2.5, 3.0], turn_may_be_done=False)
     assert log.replay()[0] == 0
-    assert asked[1] == Known(Progress(1, 3, 1), EITHER_WAY, TurnLeft("left", (2.5, 3.0)))
+    assert asked[1] == Known(Progress(1, 3, 1), EITHER_WAY, TurnLeft("left", (2.5, 3.0)), may_be_done=False)
     # A log from before generations were held to anything says nothing of it.
     assert asked[2] == Known(Progress(1, 3, 2))
 
@@ -366,6 +366,12 @@ def test_the_table_says_the_same_as_the_json(log: Log, capsys: pytest.CaptureFix
         (lambda log: log.payload("/semantic", 0).update(follow="backwards"), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(turn="up", turn_left_m=[1.0]), "a /semantic record lacks"),
         (lambda log: log.payload("/semantic", 0).update(turn="left", turn_left_m=[]), "a /semantic record lacks"),
+        (
+            lambda log: log.payload("/semantic", 0).update(turn="left", turn_left_m=[math.inf]),
+            "a /semantic record lacks",
+        ),
+        (lambda log: log.payload("/semantic", 0).update(turn="left", turn_left_m="35"), "a /semantic record lacks"),
+        (lambda log: log.payload("/semantic", 0).update(turn_may_be_done="false"), "a /semantic record lacks"),
         (lambda log: log.payload("/run", 0).update(limits={"vx_max_mps": 1}), "a /run record lacks"),
         (lambda log: log.path.write_bytes(b"notes"), "not an MCAP file"),
     ],

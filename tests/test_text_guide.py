@@ -131,6 +131,12 @@ def test_a_look_from_about_here_still_counts(here: SE2) -> None:
     assert to_turn().left(here) is not None
 
 
+def test_headings_beside_the_cut_of_angles_are_alike() -> None:
+    memory = TurnMemory()
+    heard(memory, PROGRESS, Look("left", 4.0), SE2(0.0, 0.0, math.pi - 0.1))
+    assert memory.left(SE2(0.0, 0.0, 0.1 - math.pi)) == TurnLeft("left", (4.0,))
+
+
 def test_the_last_looks_count() -> None:
     memory = TurnMemory()
     for metres in range(20):
