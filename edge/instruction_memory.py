@@ -51,8 +51,11 @@ class InstructionMemory:
     def heard(self, text: str, guide: TextGuide, anchor: EncodedFrame) -> None:
         """Remember what a published generation says of its progress, and of its turn before it was held to it."""
         self._known = self._known.after(text, guide)
-        claimed = guide.wanted == DONE
-        self._turn.heard(parse_progress(text), guide.look, anchor, overruled=guide.overruled, claimed=claimed)
+        progress = parse_progress(text)
+        if progress is None and not guide.plan_said:
+            return  # cut short before it came to that
+        overruled = guide.overruled or not guide.plan_said
+        self._turn.heard(progress, guide.look, anchor, overruled=overruled, claimed=guide.wanted == DONE)
 
     def _take(self, ring: TokenRing, until_ns: int) -> None:
         for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):

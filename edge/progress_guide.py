@@ -75,8 +75,9 @@ class LineGuide:
         for name, kind in self._refused.items():
             self._refused[name] = [line for line in kind if line[self._at : self._at + 1] == (token,)]
         if not allowed:
-            self.wanted = next((name for name, kind in self._refused.items() if kind), None)
-            # What it says next belongs to what it meant, which is none of them.
+            if not self.overruled:
+                # What it says next belongs to what it meant, which is none of them.
+                self.wanted = next((name for name, kind in self._refused.items() if kind), None)
             self.overruled = True
             allowed = self._lines[:1]
             token = allowed[0][self._at]

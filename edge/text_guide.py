@@ -62,6 +62,8 @@ class TextGuide:
         """The turn that the model planned by itself."""
         self.planned = ""
         """Its line as the model said it; empty: it was not held."""
+        self.plan_said = False
+        """Whether a plan was said to its end."""
 
     @property
     def overruled(self) -> bool:
@@ -83,7 +85,7 @@ class TextGuide:
             self._said = parse_progress(line)
         if not line.startswith(PLAN_HEAD):
             return None
-        self.look = look_of(line)
+        self.look, self.plan_said = look_of(line), True
         turn = self._known.turn
         if turn is None or self._said != self._known.before or (told := nearer(line, turn)) == line:
             return None

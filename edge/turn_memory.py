@@ -18,7 +18,7 @@ from statistics import median
 from typing import Final
 
 from edge.geometry import SE2, wrap_angle
-from edge.reasoning_text import PLAN_HEAD, Progress
+from edge.reasoning_text import PLAN_HEAD, WAIT, Progress
 from edge.ring import EncodedFrame
 
 MOST_LOOKS: Final = 8
@@ -45,7 +45,7 @@ MOST_REFUSED: Final = 6
 MOST_HEADINGS: Final = 600
 """A minute of the ring's poses."""
 LEFT, RIGHT, AHEAD = "left", "right", "ahead"
-_PLAN: Final = re.compile(rf"({PLAN_HEAD}(?!stop ).*) (?:now|in (\d{{1,2}}) m)\.", re.ASCII)
+_PLAN: Final = re.compile(rf"({PLAN_HEAD}(?!(?:{WAIT})?stop ).*) (?:now|in (\d{{1,2}}) m)\.", re.ASCII)
 _SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
 
 
@@ -100,7 +100,7 @@ class TurnMemory:
         self._turned = _Turned(None, 0)
         self._step: tuple[int, int] | None = None
         self._farthest = 0
-        self._sides: Counter[str] = Counter()
+        self._sides: deque[str] = deque(maxlen=MOST_LOOKS + 1)
         self._claims = 0
         self._granted = False
 
@@ -138,19 +138,24 @@ class TurnMemory:
     ) -> None:
         """Remember what an answer to that frame said itself: who says no turn looks for none.
 
-        `overruled`: it would have said another progress, and nothing of its plan is known; `claimed`: that a turn is
-        done which cannot be.
+        `overruled`: it would have said another progress, or was cut short: nothing of its plan is known; `claimed`:
+        that a turn is done which cannot be.
         """
         self._claims = self._claims + 1 if claimed else 0
         self._granted = self._granted or self._claims >= MOST_REFUSED
         if progress is not None and (step := (progress.step, progress.steps)) != self._step:
             onward = self._step is not None and step[0] > self._step[0]
-            self._turned = _Turned(self._side() if onward else None, anchor.stamp_ns)
+            settling, from_ns = self._turned.made(self._side()) if onward else (None, None)
+            since_ns = anchor.stamp_ns if from_ns is None else min(from_ns, anchor.stamp_ns)
+            self._turned = _Turned(settling, since_ns)
             for stamp_ns, heading_rad in self._headings:
                 if stamp_ns >= anchor.stamp_ns - EARLIER_NS:
                     self._turned.put(stamp_ns, heading_rad)
             self._step, self._farthest = step, max(step[0], self._farthest)
-            self._sides, self._claims, self._granted = Counter(), 0, False
+            self._sides.clear()
+            self._claims, self._granted = 0, False
+        if progress is not None and self._of is not None and progress != self._of[0]:
+            self._of, self._looks = None, []
         if overruled:
             return
         aside = look is not None and look.side != AHEAD
@@ -160,11 +165,11 @@ class TurnMemory:
         if of is not None and look is not None:
             self._looks = [*self._looks[1 - MOST_LOOKS :], (anchor.T_odom_base, look.distance_m)]
         if look is not None:
-            self._sides[look.side] += 1
+            self._sides.append(look.side)
 
     def _side(self) -> str | None:
-        """The side that was said most often of this turn; None: none, or not more often than another."""
-        found = self._sides.most_common(2)
+        """The side that the last answers said most often of this turn; None: none, or not more often than another."""
+        found = Counter(self._sides).most_common(2)
         if not found or found[0][0] == AHEAD or (len(found) > 1 and found[0][1] == found[1][1]):
             return None
         return found[0][0]
@@ -180,6 +185,7 @@ class _Turned:
         self._from_rad = {LEFT: math.inf, RIGHT: math.inf}
         self._now_rad = {LEFT: 0.0, RIGHT: 0.0}
         self._most_rad = {LEFT: 0.0, RIGHT: 0.0}
+        self._made_ns: dict[str, int] = {}
 
     def put(self, stamp_ns: int, heading_rad: float) -> None:
         """See a heading, counted on beyond half a turn."""
@@ -194,6 +200,18 @@ class _Turned:
             start_rad = aside_rad if side == self._settling else min(self._from_rad[side], aside_rad)
             self._from_rad[side], self._now_rad[side] = start_rad, aside_rad - start_rad
             self._most_rad[side] = max(self._most_rad[side], aside_rad - start_rad)
+            if self._most_rad[side] >= ONCE_TURNED_RAD:
+                self._made_ns.setdefault(side, stamp_ns)
+
+    def made(self, said: str | None) -> tuple[str | None, int | None]:
+        """(side, since when) of the turn that was made: the side that was said, unless only the other one was seen.
+
+        None: by what was seen it may be going on.
+        """
+        side = said
+        if len(self._made_ns) == 1 and said not in self._made_ns:
+            side = next(iter(self._made_ns))
+        return side, None if side is None else self._made_ns.get(side)
 
     def to(self, side: str) -> bool:
         """Whether that is a turn to that side."""

@@ -88,6 +88,10 @@ class FakeGuide:
 
     planned = ""
 
+    @property
+    def plan_said(self) -> bool:
+        return self._language.plan_said
+
 
 class FakeLanguage:
     """Answers at once; what else a test wants of it happens during its calls."""
@@ -99,7 +103,7 @@ class FakeLanguage:
         self.caps: list[int] = []
         self.guided: list[Known] = []
         self.overruled, self.look = False, cast("Look | None", None)
-        self.wanted = cast("str | None", None)
+        self.wanted, self.plan_said = cast("str | None", None), True
         self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
         self.during_feed: Callable[[], None] = lambda: None
         self.during_finish: Callable[[FakeRun], None] = lambda run: None

@@ -155,6 +155,18 @@ def test_both_loops_see_the_robot_turn() -> None:
     assert [known.may_be_done for known in of_runner] == [True, *[False] * 4, *[True] * 15]
 
 
+def test_a_text_that_is_cut_short_changes_nothing_of_the_turn() -> None:
+    bench = Bench(clock=Clock(), late_anchor=False)
+    claiming(LEFT, bench.language)
+    think_at(bench, 2.0)
+    bench.language.during_finish = lambda _run: None
+    bench.language.look, bench.language.plan_said = None, False
+    for second, text in ((5.0, FIRST), (8.0, "Situation: in a corri"), (11.0, FIRST)):
+        bench.language.text = text
+        think_at(bench, second)
+    assert bench.language.guided[-1].turn is not None
+
+
 def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_frames() -> None:
     """2 s at 0.8 m/s; a generation's own picture is the newest of its frames."""
     known = threaded(800, 20).guided[1]

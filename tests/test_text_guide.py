@@ -35,7 +35,11 @@ def test_a_turn_is_read_as_training_writes_it(side: str, kind: str, metres: floa
     assert look == Look(side, 0.0 if metres < 1.0 else float(round(metres)))
 
 
-@pytest.mark.parametrize("plan", ["stop in 3 m.", "stop now.", "turn back.", "turn left soon.", "turn left in 4 m"])
+@pytest.mark.parametrize(
+    "plan",
+    ["stop in 3 m.", "stop now.", "wait, then stop in 3 m.", "wait, then stop now.", "turn back.", "turn left soon.",
+     "turn left in 4 m"],
+)  # fmt: skip
 def test_other_plans_are_no_look_at_a_turn(plan: str) -> None:
     assert look_of(f"Plan: {plan}") is None
 
@@ -166,6 +170,13 @@ def test_an_answer_that_was_overruled_says_nothing_of_the_turn() -> None:
     assert memory.left(HERE) == TurnLeft("left", (6.0,)) and not memory.may_be_done
 
 
+@pytest.mark.parametrize("progress", [NEXT, Progress(1, 2, 1)])
+def test_looks_are_of_one_turn_also_where_an_answer_that_was_overruled_leads_to_the_next(progress: Progress) -> None:
+    memory = to_turn()
+    heard(memory, progress, Look("left", 8.0), overruled=True)
+    assert memory.left(HERE) is None
+
+
 STRAIGHT, SWAY = [0.0] * 30, [-13.0, -13.0, 0.0, 13.0, 13.0, 0.0, 0.0]
 SLOWLY = [3.0 * n for n in range(31)]
 
@@ -216,13 +227,33 @@ def test_the_side_is_what_most_answers_said(said: str) -> None:
     assert memory.may_be_done
 
 
-def test_the_rest_of_a_turn_is_not_the_next_one_to_the_same_side() -> None:
+def test_a_side_misread_from_afar_is_forgotten() -> None:
+    memory = TurnMemory()
+    turning(memory, [0.0] * 20)
+    for side in ["right"] * 20 + ["left"] * 9:
+        heard(memory, PROGRESS, Look(side, 6.0), second=1.9)
+    turning(memory, SLOWLY, second=2.0)
+    assert memory.may_be_done
+
+
+@pytest.mark.parametrize("sides", [[], ["right"], ["right", "right"]], ids=["as said", "a tie", "misread"])
+def test_the_rest_of_a_turn_is_not_the_next_one_to_the_same_side(sides: list[str]) -> None:
     memory = to_turn()
-    second = turning(memory, SLOWLY[:12], second=2.0)
+    for side in sides:
+        heard(memory, PROGRESS, Look(side, 6.0), second=1.9)
+    second = turning(memory, SLOWLY[:18], second=2.0)
     heard(memory, NEXT, Look("left", 6.0), second=second - 0.1)
-    second = turning(memory, [*SLOWLY[12:], *[90.0] * 20], second=second)
+    second = turning(memory, [*SLOWLY[18:], *[90.0] * 20], second=second)
     assert not memory.may_be_done
     turning(memory, [90.0 + heading for heading in SLOWLY[:10]], second=second)
+    assert memory.may_be_done
+
+
+def test_the_next_turn_to_the_same_side_may_begin_as_soon_as_it_is_said() -> None:
+    memory = to_turn()
+    second = turning(memory, [*SLOWLY, *[90.0] * 30], second=2.0)
+    heard(memory, NEXT, Look("left", 1.0), second=second - 0.3)
+    turning(memory, [90.0 + heading for heading in SLOWLY], second=second)
     assert memory.may_be_done
 
 
@@ -321,6 +352,23 @@ def test_a_turn_that_is_claimed_and_cannot_be_done_is_known_as_that() -> None:
     assert wanting(known, "turn 3").wanted == DONE
     assert wanting(Known(Progress(2, 2, 0), ONWARD, may_be_done=False), "last").wanted == DONE
     assert not wanting(Known(Progress(2, 3, 0), ONWARD), "turn 3").overruled
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [("turn 3 of 3, passed 2.", DONE), ("turn 3 of 4, passed 1.", DONE), ("turn 1 of 3, passed 7.", BACK)],
+)
+def test_what_a_line_goes_on_with_does_not_change_what_it_was_corrected_for(words: str, wanted: str) -> None:
+    assert wanting(Known(Progress(2, 3, 1), ONWARD, may_be_done=False), words).wanted == wanted
+
+
+@pytest.mark.parametrize(("words", "said"), [("Plan: stop now.\n", True), ("Plan: stop", False), ("", False)])
+def test_a_plan_is_said_once_its_line_is_complete(words: str, said: bool) -> None:
+    guide = TextGuide(NOTHING_KNOWN, letters)
+    for line in words.splitlines(keepends=True):
+        if line.endswith("\n"):
+            guide.line(line.rstrip("\n"))
+    assert guide.plan_said == said
 
 
 # In the decoding loop
