@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from edge.arrival import ARRIVED, is_there
 from edge.back_off import BACKING_OFF, BackOff, BackOffConfig
 from edge.camera import Frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
@@ -196,7 +197,7 @@ class ControlLoop:
             frame_age_ms=None if driven_ns is None else (acted_ns - driven_ns) / 1e6,
             odometry_age_ms=None if pose is None else (acted_ns - pose.stamp_ns) / 1e6,
             speed_scale=self.supervision.speed_scale,
-            hold=self._hold(acted_ns),
+            hold=self._hold(semantic, pose, acted_ns),
         )
         T_odom_base = None if pose is None else pose.T_odom_base
         command = self._stalemate.step(
@@ -288,12 +289,15 @@ class ControlLoop:
             }
             self._recorder.put("/fault", event.stamp_ns, record)
 
-    def _hold(self, now_ns: int) -> str | None:
+    def _hold(self, semantic: SemanticState | None, pose: StampedPose | None, now_ns: int) -> str | None:
         """Why the robot must stand whatever the plan says."""
         if self.supervision.speed_scale <= 0:
             return self.supervision.active[0] if self.supervision.active else "not-supervised"
         until_ns = self._slot.drive_until_ns
-        return THINKING if until_ns is not None and now_ns >= until_ns else None
+        if until_ns is not None and now_ns >= until_ns:
+            return THINKING
+        there = semantic is not None and pose is not None and is_there(semantic.T_odom_stop, pose.T_odom_base)
+        return ARRIVED if there else None
 
     def _send(self, command: VelocityCommand) -> None:
         self.last_seq += 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from edge.arrival import Arrival
 from edge.geometry import SE2
 from edge.path_memory import PERIOD_NS, PathMemory, Way
 from edge.reasoning_text import parse_progress
@@ -23,12 +24,18 @@ MOST_FRAMES = 1 << 16
 class InstructionMemory:
     """Way and progress of one instruction; a new instruction gets a new one. For one thread."""
 
-    def __init__(self, from_ns: int | None) -> None:
+    def __init__(self, from_ns: int | None, instruction: str) -> None:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: it counts from the first frame."""
         self._from_ns = from_ns
         self._path = PathMemory()
         self._known = NOTHING_KNOWN
         self._turn = TurnMemory()
+        self._arrival = Arrival(instruction)
+
+    @property
+    def stop(self) -> SE2 | None:
+        """T_odom_stop: where what was heard so far means to stop (`edge.arrival`)."""
+        return self._arrival.T_odom_stop
 
     def known(self, anchor: EncodedFrame) -> Known:
         """What is known before a generation with this newest frame."""
@@ -52,6 +59,7 @@ class InstructionMemory:
         """Remember what a published generation says of its progress, and of its turn before it was held to it."""
         self._known = self._known.after(text, guide)
         progress = parse_progress(text)
+        self._arrival.heard(text, progress, anchor.T_odom_base)
         if progress is None and not guide.plan_said:
             return  # cut short before it came to that
         overruled = guide.overruled or not guide.plan_said

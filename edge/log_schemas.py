@@ -98,6 +98,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "turn_may_be_done",
             "overruled",
             "planned",
+            "stop",
             "max_new_tokens",
         ),
         generation=_INT,
@@ -118,6 +119,7 @@ SCHEMAS: Mapping[str, Schema] = {
         turn_may_be_done=_BOOL,  # whether the robot can have made it, by odometry
         overruled=_BOOL,  # whether the model would have said another progress
         planned=_TEXT,  # the plan's line as the model said it, where it was held to another distance
+        stop=_VECTOR_OR_NULL,  # (x m, y m, θ rad) in the odometry's frame: where the answers mean to stop
         prompt_tokens=_INT,
         max_new_tokens=_INT,
         new_tokens=_INT,

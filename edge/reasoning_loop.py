@@ -24,6 +24,7 @@ from edge.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.semantic import Context, SemanticState
 from edge.stats import Samples
 from edge.sync_halt import seen_standing
+from edge.text_guide import TextGuide
 
 IDLE_S = 0.02
 FRAME_POLL_S = 0.002
@@ -121,7 +122,7 @@ class ReasoningLoop:
         self._role = role or Role("reasoning", niceness=REASONING_NICENESS)
         self._say = say or (lambda _line: None)
         self._clock = clock
-        self._job = Job(0, instruction, InstructionMemory(None))
+        self._job = Job(0, instruction, InstructionMemory(None, instruction))
         self._under_way: tuple[Job, Interrupt] | None = None
         self._last_anchor_ns = -1
         self._finished_ns: int | None = None
@@ -170,7 +171,7 @@ class ReasoningLoop:
 
     def submit(self, instruction: str) -> None:
         """Follow this (checked) instruction, its way from here on; the generation under way is ended. Never waits."""
-        self._take_up(Job(self._job.number + 1, instruction, InstructionMemory(self._ring.newest_ns)))
+        self._take_up(Job(self._job.number + 1, instruction, InstructionMemory(self._ring.newest_ns, instruction)))
 
     def cancel(self) -> None:
         """End the generation under way, also within a call; the next one begins with the newest frames."""
@@ -272,8 +273,7 @@ class ReasoningLoop:
         delay_s = self._release_delay_s()
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
-        state = self._publish(anchor, generation, context, complete)
-        job.memory.heard(generation.text, guide, anchor)
+        state = self._publish(anchor, generation, context, complete, job, guide)
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -293,6 +293,7 @@ class ReasoningLoop:
                 **known.record(),
                 "overruled": guide.overruled,
                 "planned": guide.planned,
+                "stop": None if state.T_odom_stop is None else state.T_odom_stop.as_tuple(),
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
@@ -373,13 +374,16 @@ class ReasoningLoop:
             if self._is_cancelled(job) or self._stop.wait(min(left_ns / 1e9, IDLE_S)):
                 raise CancelledError
 
-    def _publish(self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool) -> SemanticState:
+    def _publish(
+        self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool, job: Job, guide: TextGuide
+    ) -> SemanticState:
         waypoints = parse_waypoints(generation.text)
         if complete:
             self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
             self.invalid_texts += waypoints is None
         if waypoints is None and self._policy.guided_by_waypoints:
             raise NoGuidanceError
+        job.memory.heard(generation.text, guide, anchor)
         ready_ns = self._clock()
         state = SemanticState(
             generation=self.generations,
@@ -391,6 +395,7 @@ class ReasoningLoop:
             text=generation.text,
             waypoints=waypoints,
             text_complete=complete,
+            T_odom_stop=job.memory.stop,
         )
         # First the state, then the leave to drive: between the two, the old one has run out.
         self._slot.state = state

@@ -34,6 +34,8 @@ class SemanticState:
     waypoints: Waypoints | None
     text_complete: bool = True
     """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
+    T_odom_stop: SE2 | None = None
+    """Where this answer and those before it mean to stop (`edge.arrival`)."""
 
     @cached_property
     def waits(self) -> bool:

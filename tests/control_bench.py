@@ -170,6 +170,7 @@ class Bench:
         text: str = "",
         complete: bool | None = None,
         age_s: float = 0.0,
+        stop: SE2 | None = None,
     ) -> None:
         kv = np.zeros((1, 3, 8), dtype=np.float32)
         here = SE2(self.walked_m if x_m is None else x_m, 0.0, 0.0)
@@ -185,6 +186,7 @@ class Bench:
             text,
             waypoints,
             bool(text) if complete is None else complete,
+            stop,
         )
 
     def tick(self) -> tuple[float, str]:

@@ -274,6 +274,22 @@ def test_without_reasoning_the_way_is_told_and_no_progress() -> None:
     ]
 
 
+HERE = "Objects: vending machine left 2 m.\nProgress: last leg of 0, passed 0.\nPlan: stop in 2 m." + LINE
+
+
+def test_where_to_stop_goes_with_the_answer_that_placed_it_and_ends_with_its_instruction(bench: Bench) -> None:
+    bench.loop.submit("stop at the vending machine")
+    bench.language.text = HERE
+    for second, known in ((2.0, False), (3.0, True)):
+        think_at(bench, second)
+        assert bench.slot.state is not None
+        assert (bench.slot.state.T_odom_stop is not None) is known
+        assert (bench.records[-1]["stop"] is not None) is known
+    bench.loop.submit("stop at the desk")
+    think_at(bench, 4.0)
+    assert bench.slot.state.T_odom_stop is None
+
+
 def test_what_was_told_is_recorded(bench: Bench) -> None:
     bench.language.text = FIRST
     think_at(bench, 2.0)
@@ -285,7 +301,7 @@ def test_what_was_told_is_recorded(bench: Bench) -> None:
 
 
 def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None:
-    ring, memory = TokenRing(100), InstructionMemory(None)
+    ring, memory = TokenRing(100), InstructionMemory(None, "")
     for tick in range(60):
         ring.put(frame_at(tick))
     assert memory.way(ring, frame_at(30)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(31))
@@ -293,7 +309,7 @@ def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None
 
 
 def test_watching_the_ring_looks_at_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    ring, memory, puts = TokenRing(100), InstructionMemory(None), [0]
+    ring, memory, puts = TokenRing(100), InstructionMemory(None, ""), [0]
     put = PathMemory.put
 
     def counted(path: PathMemory, stamp_ns: int, T_odom_base: SE2) -> None:

@@ -68,7 +68,7 @@ class LockstepReasoner:
         self._ring = ring
         self._slot = slot
         self._instruction = instruction
-        self._memory = InstructionMemory(None)
+        self._memory = InstructionMemory(None, instruction)
         self._offsets_s = sorted({offset_s for offset_s in frame_offsets_s if offset_s > 0}, reverse=True)
         self._max_new_tokens = 0 if mode is Mode.NO_REASONING else max_new_tokens
         self._draw = draw
@@ -158,6 +158,9 @@ class LockstepReasoner:
             self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
         number = len(self.released)
         guided = waypoints is not None or not self._policy.guided_by_waypoints
+        if guided:
+            self._memory.heard(generation.text, guide, anchor)
+        stop = self._memory.stop
         self.released.append(
             {
                 "generation": number,
@@ -170,6 +173,7 @@ class LockstepReasoner:
                 **job.known.record(),
                 "overruled": guide.overruled,
                 "planned": guide.planned,
+                "stop": None if stop is None else list(stop.as_tuple()),
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,
                 "text": generation.text,
@@ -179,7 +183,6 @@ class LockstepReasoner:
         )
         if not guided:
             return  # the state before goes on growing old; the supervisor slows down by its age
-        self._memory.heard(generation.text, guide, anchor)
         self._slot.state = SemanticState(
             generation=number,
             anchor_ns=anchor.stamp_ns,
@@ -190,6 +193,7 @@ class LockstepReasoner:
             text=generation.text,
             waypoints=waypoints,
             text_complete=complete,
+            T_odom_stop=stop,
         )
         if self._sync:
             self._slot.drive_until_ns = now_ns + round(SYNC_DRIVE_S * 1e9)
