@@ -66,7 +66,7 @@ class ControlStatistics:
     """|Δt measured for the action expert − (instant of its call − anchor)|."""
     unsent: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
-    """Ticks by what decided their velocity: "ok", the reason for zero, BACKING_OFF or TURNING."""
+    """Ticks by what decided their velocity: "ok", the reason for zero (ARRIVED among them), BACKING_OFF or TURNING."""
     faults: dict[str, int] = field(default_factory=dict)
     """How often each fault of the table was raised."""
 

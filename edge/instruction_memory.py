@@ -1,4 +1,4 @@
-"""What is remembered for as long as one instruction is followed: the way since it began, the progress last said.
+"""What is remembered for as long as one instruction is followed: its way, the progress last said, where to stop.
 
 Shared by the reasoning thread and by the benchmark's virtual time, so that both tell the model the same. It is fed from
 the token ring, where every frame has the pose that it was captured at: what is remembered does not depend on how often
@@ -22,7 +22,7 @@ MOST_FRAMES = 1 << 16
 
 
 class InstructionMemory:
-    """Way and progress of one instruction; a new instruction gets a new one. For one thread."""
+    """Way, progress and stop of one instruction; a new instruction gets a new one. For one thread."""
 
     def __init__(self, from_ns: int | None, instruction: str) -> None:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: it counts from the first frame."""
@@ -59,7 +59,8 @@ class InstructionMemory:
         """Remember what a published generation says of its progress, and of its turn before it was held to it."""
         self._known = self._known.after(text, guide)
         progress = parse_progress(text)
-        self._arrival.heard(text, progress, anchor.T_odom_base)
+        if guide.plan_said and not guide.overruled:
+            self._arrival.heard(text, progress, anchor.T_odom_base)
         if progress is None and not guide.plan_said:
             return  # cut short before it came to that
         overruled = guide.overruled or not guide.plan_said

@@ -81,9 +81,15 @@ def claiming(side: str, language: FakeLanguage) -> FakeLanguage:
     return language
 
 
-def lockstep(ticks: int, latency_s: float, of: Callable[[FakeLanguage], FakeLanguage] = counting) -> FakeLanguage:
+def lockstep(
+    ticks: int,
+    latency_s: float,
+    of: Callable[[FakeLanguage], FakeLanguage] = counting,
+    slot: SemanticSlot | None = None,
+    instruction: str = "go",
+) -> FakeLanguage:
     """Ticks of the benchmark's reasoner."""
-    language, ring, slot = of(FakeLanguage()), TokenRing(160), SemanticSlot()
+    language, ring, slot = of(FakeLanguage()), TokenRing(160), slot or SemanticSlot()
     begin = language.begin
     language.begin = lambda cancelled: begin(  # type: ignore[method-assign, assignment, misc]
         cancelled,
@@ -97,7 +103,7 @@ def lockstep(ticks: int, latency_s: float, of: Callable[[FakeLanguage], FakeLang
         policy=policy,  # type: ignore[arg-type]
         ring=ring,
         slot=slot,
-        instruction="go",
+        instruction=instruction,
         frame_offsets_s=(0.0, 3.0),
         max_new_tokens=4,
         draw=lambda: Timing(round(latency_s * 1e9), 0),
@@ -287,6 +293,31 @@ def test_where_to_stop_goes_with_the_answer_that_placed_it_and_ends_with_its_ins
         assert (bench.records[-1]["stop"] is not None) is known
     bench.loop.submit("stop at the desk")
     think_at(bench, 4.0)
+    assert bench.slot.state.T_odom_stop is None
+
+
+def saying_here(language: FakeLanguage) -> FakeLanguage:
+    language.text = HERE
+    return language
+
+
+@pytest.mark.parametrize(("ticks", "known"), [(30, False), (50, True)], ids=["one answer", "two"])
+def test_the_benchmarks_loop_hands_it_over_as_well(ticks: int, known: bool) -> None:
+    slot = SemanticSlot()
+    lockstep(ticks, 2.0, saying_here, slot, "stop at the vending machine")
+    assert slot.state is not None
+    assert (slot.state.T_odom_stop is not None) is known
+
+
+@pytest.mark.parametrize(("overruled", "whole"), [(True, True), (False, False)], ids=["overruled", "cut short"])
+def test_an_answer_that_is_not_the_models_own_or_not_whole_places_no_stop(
+    bench: Bench, overruled: bool, whole: bool
+) -> None:
+    bench.loop.submit("stop at the vending machine")
+    bench.language.text, bench.language.overruled, bench.language.plan_said = HERE, overruled, whole
+    for second in (2.0, 3.0, 4.0):
+        think_at(bench, second)
+    assert bench.slot.state is not None
     assert bench.slot.state.T_odom_stop is None
 
 
