@@ -13,6 +13,7 @@ import torch
 
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from edge.latency_profile import LatencyProfile
+from export.checkpoint.coverage import CheckpointError
 from export.model.config import PRESETS
 from export.model.config_file import with_overrides
 from export.model.network import build
@@ -148,6 +149,34 @@ def test_an_ablation_keeps_encoder_and_language_model_and_its_action_expert_is_o
     trained = build(TINY.model, 5)
     assert all(torch.equal(a, b) for a, b in zip(model.vision.parameters(), trained.vision.parameters(), strict=True))
     assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), seeded.action.parameters(), strict=True))
+
+
+DEAF = ("action.latency_aware", "action.motion_offset")
+
+
+@pytest.mark.parametrize("to", DEAF)
+def test_an_ablation_of_what_is_heard_begins_with_the_weights_of_the_whole(run_dir: RunDir, to: str) -> None:
+    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
+    model, trained = read_network(path, with_overrides(TINY.model, {to: "false"}), 9), build(TINY.model, 5)
+    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), trained.action.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("to", DEAF)
+def test_an_ablation_of_what_is_heard_goes_on_from_weights_that_heard_it(
+    run_dir: RunDir, tmp_path: Path, to: str
+) -> None:
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    deaf = replace(TINY, model=with_overrides(TINY.model, {to: "false"}))
+    import_start(run_dir.out, deaf.model, [tmp_path / "w.safetensors"], 1)
+    begun, theirs = start_network(replace(job(run_dir), recipe=deaf), "imitate"), build(TINY.model, 7)
+    assert all(torch.equal(a, b) for a, b in zip(begun.action.parameters(), theirs.action.parameters(), strict=True))
+    assert begun.config == deaf.model
+
+
+def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir, tmp_path: Path) -> None:
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    with pytest.raises(CheckpointError, match=r"action\.layers is"):
+        import_start(run_dir.out, with_overrides(TINY.model, {"action.layers": "2"}), [tmp_path / "w.safetensors"], 1)
 
 
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:

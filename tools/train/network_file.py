@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from safetensors import SafetensorError, safe_open
 
 from export.checkpoint.load import load_checkpoint
-from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
@@ -47,13 +48,34 @@ def weights_before(out: Path, stage: str) -> Path | None:
 
 
 def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], seed: int) -> Path:
-    """Begin a run with somebody's weights; an action expert that they lack is of the seed. Raises CheckpointError."""
+    """Begin a run with somebody's weights; an action expert that they lack is of the seed. Raises CheckpointError.
+
+    An ablation of what the action expert hears goes on from weights of ours that heard it, and the other way round.
+    """
     path = stage_weights(out, START)
-    loaded = load_checkpoint(checkpoints, config, fill_seed=seed)
+    loaded = load_checkpoint(checkpoints, _as_written(checkpoints, config), fill_seed=seed)
     save_weights(loaded.model, path, WeightsInfo(trained=loaded.info.trained, origin=loaded.info.origin))
     if len(checkpoints) == 1 and (card := card_of(checkpoints[0])) is not None:
         path.with_name(START_CARD).write_text(card, encoding="utf-8")
     return path
+
+
+def _as_written(checkpoints: Sequence[Path], config: TicVlaConfig) -> TicVlaConfig:
+    """The configuration; where a file of ours differs only in what its action expert hears, that one's."""
+    for path in checkpoints:
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                found = config_from_dict(json.loads((file.metadata() or {})["config"])).action
+        except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError):
+            continue  # not of ours; the one who loads it says what is wrong with it
+        if _hearing(found) == _hearing(config.action):
+            return replace(config, action=found)
+    return config
+
+
+def _hearing(action: ActionConfig) -> ActionConfig:
+    """An action expert that is told all: what it is not told reaches the same tensors as zeros."""
+    return replace(action, latency_aware=True, motion_offset=True)
 
 
 def card_of(weights: Path) -> str | None:
@@ -94,13 +116,16 @@ def start_network(job: StageJob, stage: str) -> TicVla:
 def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
     """A network from a file of ours. An action expert or value network of other numbers begins from the seed.
 
+    What an action expert hears is no such number: ablations of it begin with the same weights as the whole.
+
     Raises NetworkFileError where encoder or language model are others.
     """
     model = build(config, seed)
     try:
         with safe_open(str(path), framework="pt") as file:
             found = config_from_dict(json.loads((file.metadata() or {})["config"]))
-            same = [part for part in PARTS if getattr(found, part) == getattr(config, part)]
+            theirs, ours = (replace(of, action=_hearing(of.action)) for of in (found, config))
+            same = [part for part in PARTS if getattr(theirs, part) == getattr(ours, part)]
             if other := sorted(set(SHARED) - set(same)):
                 raise NetworkFileError(f"{path}: its {other[0]} is not the recipe's; train from the beginning")
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
