@@ -47,6 +47,8 @@ class RunOptions:
     record: Path | None
     instructions: Path | None = None
     """Where further instructions are taken while it drives."""
+    stays: bool = True
+    """Whether it stands where its answers have placed the stop."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ def assemble(
         supervisor=Supervisor(),
         on_tick=on_tick,
         offset_covariance=inputs.offset_covariance,
+        stays=options.stays,
     )
     loops.append((control, reasoning))
     pre_arm = PreArm(

@@ -92,9 +92,11 @@ class ControlLoop:
         supervisor: Supervisor | None = None,
         on_tick: Callable[[bool], None] | None = None,
         offset_covariance: OffsetCovariance | None = None,
+        stays: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise.
+        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise. `stays`: stand
+        where the words have placed the stop.
 
         Without `watch` and `supervisor` the standard ones are used, which know only what the loop itself sees.
         """
@@ -115,6 +117,7 @@ class ControlLoop:
         self._supervisor = supervisor or Supervisor()
         self._on_tick = on_tick
         self._offset_covariance = offset_covariance
+        self._stays = stays
         self.last_seq = 0
         """Sequence number of the last command; arming has used some before the first tick."""
         self._stop = stop
@@ -296,8 +299,9 @@ class ControlLoop:
         until_ns = self._slot.drive_until_ns
         if until_ns is not None and now_ns >= until_ns:
             return THINKING
-        there = semantic is not None and pose is not None and is_there(semantic.T_odom_stop, pose.T_odom_base)
-        return ARRIVED if there else None
+        if not self._stays or semantic is None or pose is None:
+            return None
+        return ARRIVED if is_there(semantic.T_odom_stop, pose.T_odom_base) else None
 
     def _send(self, command: VelocityCommand) -> None:
         self.last_seq += 1

@@ -103,6 +103,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="take further instructions at this local socket while it drives (edge-say TEXT --to PATH)",
     )
+    p.add_argument(
+        "--no-stay", action="store_true", help="go on by the plan also where its answers have placed the stop"
+    )
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
@@ -129,6 +132,7 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
         release_delay=parse_release_delay(args.release_delay),
         record=args.record,
         instructions=args.instructions,
+        stays=not args.no_stay,
     )
     return robot, options
 

@@ -93,7 +93,9 @@ class Attitude:
 class Bench:
     """`tick()` is one tick on time, with a new picture, a new pose and whatever the test has changed."""
 
-    def __init__(self, *, semantic: SemanticConfig | None = None, limits: LimitsConfig = LIMITS) -> None:
+    def __init__(
+        self, *, semantic: SemanticConfig | None = None, limits: LimitsConfig = LIMITS, stays: bool = True
+    ) -> None:
         self.limits = limits
         self.now_ns = 10**12
         self.encode_ns = 0
@@ -140,6 +142,7 @@ class Bench:
             stop=self.stop,
             watch=Watch(config, sources),
             on_tick=self.on_time.append,
+            stays=stays,
             clock=lambda: self.now_ns,
         )
         self.loop.last_seq = 7

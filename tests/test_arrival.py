@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge import runner
 from edge.arrival import AGREEING, ARRIVED, ASIDE_M, NEAR_M, OTHERS, SHORT_M, Arrival, is_there
 from edge.geometry import SE2
 from edge.reasoning_text import MAX_TEXT_CHARS, parse_progress
+from sim_hil.realtime.stack import ROBOT_FILE
 from tests.control_bench import Bench
 
 TOLD = "Walk down the corridor and stop at the Vending Machine."
@@ -195,6 +197,14 @@ def test_the_control_loop_stands_there_and_drives_on_once_the_place_is_further()
         assert (speed_mps == 0.0) is (reason == ARRIVED)
 
 
+def test_a_loop_that_is_not_to_stay_drives_on_there() -> None:
+    bench = Bench(stays=False)
+    bench.drive()
+    bench.think(stop=SE2(bench.walked_m, 0.0, 0.0))
+    bench.see()
+    assert bench.tick()[1] == "ok"
+
+
 def test_standing_to_think_is_told_before_having_arrived() -> None:
     bench = Bench()
     bench.drive()
@@ -202,3 +212,9 @@ def test_standing_to_think_is_told_before_having_arrived() -> None:
     bench.loop._slot.drive_until_ns = 0
     bench.see()
     assert bench.tick() == (0.0, "thinking")
+
+
+@pytest.mark.parametrize(("arguments", "stays"), [((), True), (("--no-stay",), False)])
+def test_the_runner_stays_unless_told_otherwise(arguments: tuple[str, ...], stays: bool) -> None:
+    asked = ["--artifacts", "a", "--robot", str(ROBOT_FILE), "--instruction", TOLD, *arguments]
+    assert runner._read(runner.parser().parse_args(asked))[1].stays is stays

@@ -20,6 +20,7 @@ def asked(*arguments: str) -> Conditions:
     [
         ("--policy", "expert", "--drift", "severe"),
         ("--policy", "artifacts:nano", "--mode", "sync", "--latency", "3", "--variant", "no-latency"),
+        ("--policy", "artifacts:nano", "--stay"),
         ("--policy", "external:127.0.0.1:7001", "--latency", "1.5", "--wording", "2"),
         ("--policy", "external:unix:server.sock", "--camera", "320x180"),
     ],
@@ -35,6 +36,12 @@ def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: fl
     assert latency is not None and latency.generation_s == (latency_s,)
 
 
+def test_the_goal_ends_an_episode_unless_it_is_asked_to_stay_where_it_thinks_that_it_is() -> None:
+    free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
+    assert not free.stays and "stays" not in free.describe()
+    assert stays.stays and "stays where it says" in stays.describe()
+
+
 def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
     assert asked("--policy", "artifacts:nano").policy.where.startswith("/")
 
@@ -48,6 +55,7 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "expert", "--mode", "sync"), "mode: belongs to a policy from artifacts"),
         (("--policy", "expert", "--latency", "2"), "latency: expert does not think"),
         (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
+        (("--policy", "expert", "--stay"), "stay: belongs to a policy from artifacts"),
         (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
         (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
         (("--policy", "still", "--camera", "8x8"), "expected auto or WxH"),

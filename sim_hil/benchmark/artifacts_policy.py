@@ -50,11 +50,16 @@ class ArtifactsPolicy:
     privileged = False
     needs_image = True
 
-    def __init__(self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig) -> None:
-        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they cannot do."""
+    def __init__(
+        self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig, stays: bool = False
+    ) -> None:
+        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they cannot do.
+
+        `stays`: it stands where its answers have placed the stop.
+        """
         self._artifacts = load_artifacts(directory)
         check_suits(self._artifacts, mode)
-        self._mode, self._latency, self._robot = Mode(mode), latency, robot
+        self._mode, self._latency, self._robot, self._stays = Mode(mode), latency, robot, stays
         self._model = Model(self._artifacts, threads=1)
         self._language = LanguageModel(self._artifacts, threads=1)
         self._drive: _Drive | None = None
@@ -74,7 +79,9 @@ class ArtifactsPolicy:
         """Begin an episode with no frames and no semantic state. Raises InstructionError for too long a prompt."""
         self._language.check_instruction(instruction, len(self._artifacts.runtime.frame_offsets_s))
         draw = LatencySampler(self._latency, seed, episode.id).draw
-        self._drive = _Drive(self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw)
+        self._drive = _Drive(
+            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._stays
+        )
 
     def act(self, observation: Observation) -> tuple[float, float, float]:
         """The command of one control period. Raises ValueError without a picture or before an episode."""
@@ -100,7 +107,7 @@ class _Drive:
 
     def __init__(
         self, artifacts: Artifacts, model: Model, language: LanguageModel, robot: RobotConfig, mode: Mode,
-        instruction: str, draw: Any,
+        instruction: str, draw: Any, stays: bool,
     ) -> None:  # fmt: skip
         runtime = artifacts.runtime
         if runtime.tick_period_ms * 1_000_000 != CONTROL_PERIOD_NS:
@@ -152,6 +159,7 @@ class _Drive:
             stop=threading.Event(),
             watch=Watch(watch, sources),
             supervisor=Supervisor(),
+            stays=stays,
             clock=lambda: self._now_ns,
         )
         self.notes: dict[str, Any] = {}

@@ -112,6 +112,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--swap-instructions", type=int, metavar="SEED", help="tell every task the way of another one of its scene"
     )
+    p.add_argument(
+        "--stay", action="store_true",
+        help="stand where the answers have placed the stop, as edge-run does; else only the goal ends an episode",
+    )  # fmt: skip
     p.add_argument("--camera", default="auto", metavar="WxH", help="render this picture though no policy looks at it")
     p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for an answer (default 60)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="episodes at a time, a process each (default 1)")
@@ -166,6 +170,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         wording=args.wording,
         wordings=args.wordings,
         swap_instructions=args.swap_instructions,
+        stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,
     )

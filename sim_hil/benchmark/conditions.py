@@ -79,6 +79,8 @@ class Conditions:
     wordings: str = "benchmark"
     swap_instructions: int | None = None
     """Seed by which every task is given the instruction of another one of its scene; None: its own."""
+    stays: bool = False
+    """Whether a policy from artifacts stands where its answers have placed the stop; an episode ends at the goal."""
     camera: str = "auto"
     """`WxH`: render such a picture in every control period; `auto`: what the policy looks at, if it does."""
     external_timeout_s: float = 60.0
@@ -95,6 +97,8 @@ class Conditions:
             _one_of("mode", self.mode, MODES)
         if (self.mode is not None) != (kind == "artifacts"):
             raise ConditionsError(f"mode: belongs to a policy from artifacts, found {self.mode} with {kind}")
+        if self.stays and kind != "artifacts":
+            raise ConditionsError(f"stay: belongs to a policy from artifacts, found it with {kind}")
         if self.latency is not None and kind in (*BASELINES, "point-goal-net"):
             raise ConditionsError(f"latency: {kind} does not think; expected artifacts:DIR or external:ADDR with it")
         if kind == "artifacts" and self.clock == "lockstep" and self.latency is None:
@@ -153,6 +157,8 @@ class Conditions:
             parts.append(f"{self.wordings} wordings")
         if self.swap_instructions is not None:
             parts.append(f"instructions swapped by {self.swap_instructions}")
+        if self.stays:
+            parts.append("stays where it says that it has arrived")
         return ", ".join([*parts, f"drift {self.drift}"])
 
 

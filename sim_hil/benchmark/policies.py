@@ -48,7 +48,9 @@ def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:
     if conditions.mode is None or conditions.latency is None:
         raise ConditionsError("a policy from artifacts needs a mode and a latency in lockstep")
     directory = artifact_directory(Path(conditions.policy.where), conditions.variant)
-    policy = ArtifactsPolicy(directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config())
+    policy = ArtifactsPolicy(
+        directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config(), stays=conditions.stays
+    )
     if manifest_sha256 and policy.manifest_sha256 != manifest_sha256:
         raise ArtifactError(f"{directory}: not the artifacts that this run was started with; copy them to this machine")
     return policy

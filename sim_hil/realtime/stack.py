@@ -56,6 +56,8 @@ class StackOptions:
     faults: bool = False
     instructions: bool = False
     """Whether the runner takes further instructions while it drives."""
+    stays: bool = True
+    """Whether the runner stands where its answers have placed the stop."""
     pose_hz: int | None = None
     """Poses a second in the trace, in place of edge-hil's default."""
 
@@ -164,6 +166,8 @@ class Stack:
         ]
         if options.instructions:
             command += ["--instructions", str(self.instructions)]
+        if not options.stays:
+            command += ["--no-stay"]
         self.runner = self._children.start(name, command)
         return self.runner
 
