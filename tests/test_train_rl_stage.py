@@ -84,6 +84,28 @@ def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) ->
     assert result["iterations"] == 4 and result["steps"] == 32
 
 
+@pytest.mark.parametrize(("last", "gained"), [(True, 1.0), (False, 0.0)])
+def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
+    last: bool, gained: float, tmp_path: Path
+) -> None:
+    config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
+    driver = _driver(_network(), lambda k: k == 2 or (last and k == 4))
+
+    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
+        driven = driver(order, **told)
+        if order.explore:
+            return driven
+        return replace(driven, ends=[replace(driven.ends[0], id=f"t1-site-{n}-0-go2") for n in range(4)])
+
+    _, result = _improved(tmp_path, config, drive)
+    found = result["gained"]
+    assert (found["episodes"], found["layouts"], found["success"]) == (4, 1, gained)
+    low, high = found["success_ci95"]
+    assert low <= gained <= high and (low < gained or high > gained)
+    told = json.loads((tmp_path / "rl" / "rollouts" / "evaluation-00004.json").read_text())
+    assert [end["success"] for end in told] == [last] * 4
+
+
 @pytest.mark.parametrize("ended", [4, 9])  # in between, and before the last call: the best on fresh scenarios
 def test_a_run_that_was_ended_goes_on_exactly(ended: int, tmp_path: Path) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=1, ppo=PPO, fall_back=1.0)

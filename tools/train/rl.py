@@ -8,6 +8,7 @@ was chosen there by numbers that are partly luck, replaces the policy it began w
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -16,7 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from edge.cli import write_whole
 from export.model.network import initialise
+from sim_hil.benchmark.bootstrap import paired_ci95
 from sim_hil.benchmark.latency import LatencyProfile, load_profile
 from sim_hil.benchmark.policies import robot_config
 from tools.train.action_tail import check_tail
@@ -27,7 +30,7 @@ from tools.train.network_file import START, finish_network, is_trained, read_net
 from tools.train.point_goal_net import build_point_goal, save_point_goal
 from tools.train.ppo import PpoConfig
 from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
-from tools.train.rl_state import STAGE, RlError, Score, State
+from tools.train.rl_state import ROLLOUTS, STAGE, RlError, Score, State
 from tools.train.rl_worker import RolloutOrder
 from tools.train.rollout import Rollout
 from tools.train.scenarios import KEPT_SEEDS, SHARES, TASKS_PER_SCENE
@@ -208,6 +211,7 @@ def improve(
         "steps": state.steps,
         "before": asdict(state.first),
         "best": asdict(state.best),
+        "gained": _gained(job, config),
         **final,
         "log_std": [round(float(v), 4) for v in learner.log_std.detach()],
     }
@@ -262,6 +266,7 @@ def _driven(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) 
 
 def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Score:
     ends = _driven(job, config, order, drive).ends
+    write_whole(Path(order.out).with_suffix(".json"), json.dumps([asdict(end) for end in ends], indent=1) + "\n")
     shutil.rmtree(order.out, ignore_errors=True)
     return Score(
         *(
@@ -269,6 +274,30 @@ def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive
             for values in zip(*((e.success, e.collided, e.spl) for e in ends), strict=True)
         )
     )
+
+
+def _gained(job: StageJob, config: RlConfig) -> dict[str, Any]:
+    """The last policy's evaluation less the first's, episode by episode, with 95 % intervals over their layouts.
+
+    Neither was chosen by it. Empty where a run that was begun by an older version has not told its first one.
+    """
+    folder = job.run_dir.stage(STAGE) / ROLLOUTS
+    files = [folder / f"{_evaluation_name(iteration)}.json" for iteration in (0, config.iterations)]
+    if not all(file.is_file() for file in files):
+        return {}
+    first, last = (json.loads(file.read_text(encoding="utf-8")) for file in files)
+    layouts = [str(end["id"]).rsplit("-", 3)[0] for end in first]  # without task, people and robot
+    found: dict[str, Any] = {"episodes": len(first), "layouts": len(set(layouts))}
+    for name in ("success", "collided", "spl"):
+        was, now = ([float(end[name]) for end in ends] for ends in (first, last))
+        interval = paired_ci95(was, now, layouts, (0.0, 1.0))
+        found[name] = round(float(np.mean(now) - np.mean(was)), 6)
+        found[f"{name}_ci95"] = None if interval is None else [round(bound, 6) for bound in interval]
+    return found
+
+
+def _evaluation_name(iteration: int) -> str:
+    return f"evaluation-{iteration:05d}"
 
 
 @dataclass(frozen=True)
@@ -283,18 +312,18 @@ class _Orders:
     def training(self, iteration: int, policy: Path) -> RolloutOrder:
         """Exploring, on the iteration's scenarios."""
         seed = int(self.job.rng("rollout", iteration).integers(2**31))
-        out = self.job.run_dir.stage(STAGE) / "rollouts" / f"{iteration:05d}"
+        out = self.job.run_dir.stage(STAGE) / ROLLOUTS / f"{iteration:05d}"
         numbers, kinds = self.config.numbers(iteration), self.config.kinds(iteration)
         return self._order(policy, out, _SCENES, numbers, kinds, seed, TASKS_PER_SCENE, explore=True)
 
     def evaluation(self, iteration: int, policy: Path) -> RolloutOrder:
         """The mean action, always on the same scenarios, all kinds of the rotation."""
-        out = self.job.run_dir.stage(STAGE) / "rollouts" / f"evaluation-{iteration:05d}"
+        out = self.job.run_dir.stage(STAGE) / ROLLOUTS / _evaluation_name(iteration)
         return self._mean(policy, out, _EVALUATION_SCENES, self.config.evaluate_episodes)
 
     def final(self, name: str, policy: Path) -> RolloutOrder:
         """The same on scenarios that no evaluation has."""
-        out = self.job.run_dir.stage(STAGE) / "rollouts" / f"final-{name}"
+        out = self.job.run_dir.stage(STAGE) / ROLLOUTS / f"final-{name}"
         return self._mean(policy, out, _FINAL_SCENES, self.config.final_episodes)
 
     def _mean(self, policy: Path, out: Path, scenes: int, count: int) -> RolloutOrder:

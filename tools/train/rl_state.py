@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tools.train.rl import RlConfig
 
 STAGE: Final = "rl"
+ROLLOUTS: Final = "rollouts"
 _ROUNDING: Final = 1e-9
 
 
@@ -116,7 +117,7 @@ class State:
         """Go on if asked to and able to. Raises RlError for another run's checkpoint."""
         if not (self._job.resume and self._path.exists()):
             self._job.run_dir.rewind(STAGE, -1)
-            shutil.rmtree(self._path.parent / "rollouts", ignore_errors=True)
+            shutil.rmtree(self._path.parent / ROLLOUTS, ignore_errors=True)
             return
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
