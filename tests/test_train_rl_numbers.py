@@ -18,7 +18,7 @@ from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.policies import robot_config
 from tools.train.command_policy import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
 from tools.train.gae import advantages
-from tools.train.ppo import PpoConfig, PpoOptimiser
+from tools.train.ppo import PpoConfig, PpoOptimiser, PpoStats
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -160,6 +160,21 @@ def test_the_warm_up_teaches_the_value_alone() -> None:
     optimiser = PpoOptimiser(learner, PpoConfig(value_lr=0.05))
     optimiser.update(learner, torch.randn(128, generator=generator), torch.ones(128), generator, policy=False)
     assert float(learner.worth.detach()) > 0.1 and not learner.mean.detach().any()
+
+
+def test_a_policy_that_has_moved_far_enough_stays_while_the_value_learns_on() -> None:
+    def update(target_kl: float) -> tuple[_OneNumber, PpoStats]:
+        learner, generator = _one_number(), torch.Generator().manual_seed(0)
+        learner.actions = torch.randn(128, 2, generator=generator)
+        config = PpoConfig(action_lr=0.1, value_lr=0.05, batch=16, target_kl=target_kl)
+        optimiser = PpoOptimiser(learner, config)
+        return learner, optimiser.update(learner, learner.actions[:, 0], torch.ones(128), generator)
+
+    far, all_of_it = update(0.0)
+    near, some = update(0.005)
+    assert 0 < some.moved < all_of_it.moved == 5 * 8
+    assert near.mean.detach().norm() < far.mean.detach().norm() / 2
+    assert torch.equal(near.worth, far.worth)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing() -> None:

@@ -13,7 +13,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PpoConfig:
-    """Table 9; `target_kl` ends an update's epochs early when the policy has moved that far (0: never)."""
+    """Table 9; where a minibatch shows that the policy has moved by 1.5 `target_kl` it moves no more in this update.
+
+    The value function learns on. 0: it may move for all epochs.
+    """
 
     action_lr: float = 1e-5
     value_lr: float = 1e-4
@@ -69,7 +72,8 @@ class PpoStats:
     """Share of steps whose ratio lay outside the clip."""
     skipped: int
     """Minibatches whose gradient was not finite; nothing was learned from them."""
-    epochs: int
+    moved: int
+    """Minibatches that the policy was moved by."""
 
 
 class PpoOptimiser:
@@ -95,36 +99,34 @@ class PpoOptimiser:
             old = torch.cat([learner.act(rows)[0] for rows in torch.arange(count).split(config.batch)])
         scaled = (advantages - advantages.mean()) / (advantages.std(unbiased=False) + 1e-8)
         totals = {"policy": 0.0, "value": 0.0, "entropy": 0.0, "kl": 0.0, "clipped": 0.0}
-        done, skipped, epochs = 0, 0, 0
+        valued, moved, skipped = 0, 0, 0
         for _ in range(config.epochs):
-            epochs += 1
-            moved = 0.0
             for rows in torch.randperm(count, generator=generator).split(config.batch):
                 value_loss = torch.nn.functional.mse_loss(learner.value(rows), returns[rows])
                 skipped += not _step(self.critic, value_loss, learner.critic_parameters, config.grad_clip)
                 totals["value"] += float(value_loss.detach())
-                done += 1
+                valued += 1
                 if not policy:
                     continue
                 log_prob, entropy, penalty = learner.act(rows)
-                ratio = torch.exp(log_prob - old[rows])
+                difference = log_prob - old[rows]
+                ratio = torch.exp(difference)
+                kl = float((ratio - 1 - difference).mean().detach())
+                if config.target_kl and kl > 1.5 * config.target_kl:
+                    policy = False
+                    continue
                 advantage = scaled[rows]
                 within = ratio.clamp(1 - config.clip, 1 + config.clip)
                 policy_loss = -torch.minimum(ratio * advantage, within * advantage).mean()
                 loss = policy_loss - config.entropy * entropy + penalty
                 skipped += not _step(self.actor, loss, learner.actor_parameters, config.grad_clip)
-                with torch.no_grad():
-                    difference = log_prob - old[rows]
-                    kl = float((torch.exp(difference) - 1 - difference).mean())
-                    totals["clipped"] += float(((ratio - 1).abs() > config.clip).float().mean())
                 totals["kl"] += kl
+                totals["clipped"] += float(((ratio.detach() - 1).abs() > config.clip).float().mean())
                 totals["policy"] += float(policy_loss.detach())
                 totals["entropy"] += float(entropy.detach())
-                moved = max(moved, kl)
-            if policy and config.target_kl and moved > 1.5 * config.target_kl:
-                break
-        mean = {key: total / max(done, 1) for key, total in totals.items()}
-        return PpoStats(mean["policy"], mean["value"], mean["entropy"], mean["kl"], mean["clipped"], skipped, epochs)
+                moved += 1
+        mean = {key: total / max(valued if key == "value" else moved, 1) for key, total in totals.items()}
+        return PpoStats(mean["policy"], mean["value"], mean["entropy"], mean["kl"], mean["clipped"], skipped, moved)
 
 
 def _step(
