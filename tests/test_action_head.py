@@ -34,6 +34,8 @@ from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights, weights_sha256
 from tests.action_heads import HEADS, TINY, drives, expert, instants, lively, normal, states, with_head
 
+pytestmark = pytest.mark.usefixtures("one_thread")  # many threads on tiny tensors cost more than they give
+
 PARAMETERISATIONS = ("increments", "offsets")
 
 
