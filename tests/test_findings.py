@@ -25,7 +25,8 @@ from tools.benchmark_runs import RunsError
 from tools.findings import main, plan_lines, plan_of, rows_of
 from tools.findings_rows import CLAIMS, ROWS, RUNS, Finding, Level, runs_of
 from tools.findings_verdict import FAILS, HOLDS, OPEN, judge, judge_all, verdict_of
-from tools.train.evaluate import EvaluateConfig, EvaluateError, write_suite
+from tools.train.config_evaluate import EvaluateConfig
+from tools.train.evaluate import EvaluateError, write_suite
 
 TWO_S = LatencyProfile.constant(2.0)
 

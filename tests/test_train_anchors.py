@@ -23,7 +23,6 @@ from tests.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.anchors import (
     WAYPOINTS_START,
     Anchor,
-    DrawConfig,
     Drawn,
     Prompts,
     anchors_of,
@@ -33,6 +32,7 @@ from tools.train.anchors import (
     too_far,
     waiting,
 )
+from tools.train.config_sft import DrawConfig
 from tools.train.trace_words import TURN_BACK, Trace
 
 NANO = PRESETS["nano"]

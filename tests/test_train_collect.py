@@ -19,14 +19,14 @@ from sim_hil.benchmark.instructions import is_held_out
 from sim_hil.benchmark.policies import robot_config
 from tests.train_fake_worker import BEGUN
 from tools.train import collect, collection
-from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import Draw, Order, messages
 from tools.train.collection import CollectError, CollectFailedError, Collection, fill, job_count
+from tools.train.config_collect import CollectConfig
+from tools.train.config_evaluate import EvaluateConfig
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.distributed import Ranks
 from tools.train.drive import Dataset, Drive
-from tools.train.evaluate import EvaluateConfig
 from tools.train.job import QuietProgress
 from tools.train.scenarios import KEPT_SEEDS
 

@@ -17,7 +17,7 @@ from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
 from tools.train import record as recording
-from tools.train.collect_config import CollectConfig
+from tools.train.config_collect import CollectConfig
 from tools.train.detour import Detour
 from tools.train.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
 from tools.train.record import (

@@ -21,14 +21,13 @@ from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
 from tests.training_drives import dataset, drive
-from tools.train import collection, dagger
-from tools.train.collect_config import CollectConfig
+from tools.train import collection, dagger, own_drives
 from tools.train.collection import CollectError, Collection
+from tools.train.config_collect import CollectConfig, DaggerConfig
 from tools.train.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
 from tools.train.distributed import Ranks
 from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
 from tools.train.job import QuietProgress
-from tools.train.recipe import DaggerConfig
 from tools.train.record import DrivePlan, Look, record
 from tools.train.steering import Velocity
 
@@ -186,8 +185,8 @@ def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
     job.recipe.dagger = DaggerConfig(newest_only=newest_only)
     job.run_dir.begun = lambda name: name in ("sft-0", "sft-1")
     dataset(tmp_path / "collect", *(drive(name, frames=20) for name in ("e0", "d1-0", "d2-0", "n2-0")))
-    assert dagger.drives_after(job, "sft").ids == seen
-    assert len(dagger.drives_after(job, "imitate").ids) == 4  # no round has come before it
+    assert own_drives.drives_after(job, "sft").ids == seen
+    assert len(own_drives.drives_after(job, "imitate").ids) == 4  # no round has come before it
 
 
 def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
@@ -196,7 +195,7 @@ def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
     job.run_dir.begun = lambda name: name == "sft-0"
     dataset(tmp_path / "collect", drive("e0", frames=20))
     with pytest.raises(DriveError, match="d1- or n1-"):
-        dagger.drives_after(job, "sft")
+        own_drives.drives_after(job, "sft")
 
 
 def test_under_torchrun_it_refuses(tmp_path: Path, artifacts: Artifacts) -> None:

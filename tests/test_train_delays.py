@@ -9,30 +9,31 @@ import numpy as np
 import pytest
 
 from edge.latency_profile import LatencyError, LatencyProfile
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import DelayConfig
+from tools.train.delays import Delays
 
 
 def test_the_papers_delays_are_uniform_from_0_to_10_s() -> None:
-    mass = DelayConfig().load().mass
+    mass = Delays.of(DelayConfig()).mass
     assert len(mass) == 101
     np.testing.assert_allclose(mass[1:100], 0.01)
     # Half of what rounds to 0.0 s would be below 0, half of what rounds to 10.0 s beyond 10.
     assert mass[0] == pytest.approx(0.005) and mass[100] == pytest.approx(0.005)
-    assert DelayConfig().load().mean_s == pytest.approx(5.0)
+    assert Delays.of(DelayConfig()).mean_s == pytest.approx(5.0)
 
 
 def test_bounds_of_the_uniform_delays_are_kept() -> None:
-    mass = DelayConfig(low_s=1.0, high_s=2.0).load().mass
+    mass = Delays.of(DelayConfig(low_s=1.0, high_s=2.0)).mass
     assert set(np.flatnonzero(mass)) == set(range(10, 21))
     assert mass.sum() == pytest.approx(1.0)
 
 
 def test_a_share_of_the_ages_can_be_near_without_the_others_going() -> None:
     config = DelayConfig(near_share=0.6, near_s=4.0)
-    mass = config.load().mass
+    mass = Delays.of(config).mass
     np.testing.assert_allclose(mass[1:40], 0.4 * 0.01 + 0.6 * 0.025)
     np.testing.assert_allclose(mass[41:100], 0.4 * 0.01)
-    assert config.load().mean_s == pytest.approx(0.4 * 5.0 + 0.6 * 2.0)
+    assert Delays.of(config).mean_s == pytest.approx(0.4 * 5.0 + 0.6 * 2.0)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,7 @@ def test_a_near_share_that_makes_no_sense_is_refused(low_s: float, share: float,
 
 
 def test_far_ages_alone_need_no_near_end() -> None:
-    assert set(np.flatnonzero(DelayConfig(low_s=4.0, high_s=5.0).load().mass)) == set(range(40, 51))
+    assert set(np.flatnonzero(Delays.of(DelayConfig(low_s=4.0, high_s=5.0)).mass)) == set(range(40, 51))
 
 
 @pytest.mark.parametrize("seconds", [0.4, 2.0, 7.0])
@@ -98,10 +99,10 @@ def test_a_profile_is_read_from_the_file_that_the_recipe_names(tmp_path: Path) -
     path = tmp_path / "orin.json"
     path.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
     np.testing.assert_allclose(
-        DelayConfig(profile=str(path)).load().mass, Delays.of_profile(LatencyProfile.constant(2.0)).mass
+        Delays.of(DelayConfig(profile=str(path))).mass, Delays.of_profile(LatencyProfile.constant(2.0)).mass
     )
     with pytest.raises(LatencyError, match="cannot be read"):
-        DelayConfig(profile=str(tmp_path / "none.json")).load()
+        Delays.of(DelayConfig(profile=str(tmp_path / "none.json")))
 
 
 @pytest.mark.parametrize("bounds", [(-1.0, 2.0), (3.0, 3.0), (0.0, 61.0)])

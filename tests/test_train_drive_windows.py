@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import cos, pi, sin
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edge.geometry import SE2
-from tests.training_drives import SPEED_MPS, TURN_RADPS, arc, dataset, drive
+from tests.training_drives import SPEED_MPS, TURN_RADPS, arc, drive
 from tools.train.drive import Drive
 from tools.train.windows import relative, windows
 
@@ -95,12 +94,6 @@ def test_odometry_changes_nothing_in_what_is_to_be_learned() -> None:
 def test_a_stride_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="stride"):
         next(windows(drive(), 0.01))
-
-
-def test_a_data_set_gives_the_samples_of_all_its_drives(tmp_path: Path) -> None:
-    found = dataset(tmp_path, drive("e1", frames=61), drive("e0", frames=31))
-    assert [(window.drive_id, window.k) for window in found.samples()] == [("e0", 0), ("e1", 0), ("e1", 30)]
-    assert [window.k for window in found.samples(stride_s=1.0, ids=("e0",))] == [0, 10, 20]
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (2.0, -1.0, 3.1), (-4.0, 5.0, -2.0)])

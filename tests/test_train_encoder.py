@@ -16,9 +16,9 @@ from tests.train_drives import tiny_model
 from tests.train_encoder_rank import CONFIG, encoder_job
 from tests.train_stage_contract import Run, StageContract
 from tools.train import optim
-from tools.train.encoder import EncoderConfig, EncoderError, budget, run
-from tools.train.encoder_data import FramesConfig
-from tools.train.optim import OptimConfig
+from tools.train.config_encoder import EncoderConfig, FramesConfig
+from tools.train.config_optim import OptimConfig
+from tools.train.encoder import EncoderError, budget, run
 from tools.train.recipe import Recipe
 from tools.train.tokens import encoder_sha256
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tools.train.augment import AugmentConfig, augmented, decoded, encoded, through_jpeg
+from tools.train.augment import augmented, decoded, encoded, through_jpeg
+from tools.train.config_encoder import AugmentConfig
 
 STILL = AugmentConfig(brightness=0.0, contrast=0.0, colour=0.0, blur_share=0.0, noise_share=0.0, jpeg_share=0.0)
 

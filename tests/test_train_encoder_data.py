@@ -11,10 +11,9 @@ import pytest
 from export.typed import plain
 from sim_hil.layouts import is_reserved
 from tools.train import scenarios
+from tools.train.config_encoder import MOST_SCENES, FramesConfig
 from tools.train.encoder_data import (
     FIRST_LAYOUT,
-    MOST_SCENES,
-    FramesConfig,
     FramesError,
     FrameSet,
     Shard,

@@ -20,22 +20,14 @@ from tests.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, si
 from tests.train_stage_contract import Run, StageContract
 from tools.train import optim
 from tools.train.chain import Step, run_step
+from tools.train.config_imitate import POINT_GOAL, ImitateConfig, ImitateEvalConfig, SampleConfig
+from tools.train.config_optim import OptimConfig
 from tools.train.drive import Dataset
-from tools.train.imitate import (
-    POINT_GOAL,
-    POINT_GOAL_FILE,
-    ImitateConfig,
-    ImitateError,
-    budget,
-    fit,
-    run,
-)
-from tools.train.imitate_eval import ImitateEvalConfig
-from tools.train.imitation_data import NoStates, SampleConfig, SampleError
+from tools.train.imitate import POINT_GOAL_FILE, ImitateError, budget, fit, run
+from tools.train.imitation_data import NoStates, SampleError
 from tools.train.imitation_pupils import ExpertPupil, PointGoalPupil
 from tools.train.job import StageJob
 from tools.train.network_file import finish_network, stage_weights
-from tools.train.optim import OptimConfig
 from tools.train.point_goal_net import PointGoalFileError, build_point_goal, load_point_goal
 from tools.train.recipe import load_recipe
 

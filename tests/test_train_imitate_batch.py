@@ -14,7 +14,8 @@ from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.train_drives import tiny_model
 from tools.train.action_batch import Group, collate, plan, smooth_l1, trunk
-from tools.train.imitation_pupils import ExpertPupil, LossConfig
+from tools.train.config_imitate import LossConfig
+from tools.train.imitation_pupils import ExpertPupil
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)

@@ -17,11 +17,12 @@ from export.model.tokenizer import NANO_TOKENIZER
 from tests.train_drives import MadeUpTokens, tiny_model, write_dataset
 from tests.train_imitate_rank import FRAMES, SideStates, side_dataset, side_drive
 from tools.train.action_batch import Group
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
+from tools.train.delays import Delays
 from tools.train.drive import NOISE, Dataset, Drive
-from tools.train.drive_frames import LEAST_KNOWN, DriveFrames, DriveFramesError, WeightConfig
-from tools.train.imitation_data import Chosen, NoStates, SampleConfig, SampleError, Samples, States
-from tools.train.kv_build import KvConfig, build_kv_cache
+from tools.train.drive_frames import LEAST_KNOWN, DriveFrames, DriveFramesError
+from tools.train.imitation_data import Chosen, NoStates, SampleError, Samples, States
+from tools.train.kv_build import build_kv_cache
 from tools.train.kv_cache import CachedState
 
 TEN_S = Delays.uniform(DelayConfig())

@@ -12,11 +12,12 @@ import torch
 from tests.train_drives import MadeUpTokens, tiny_model
 from tests.train_imitate_rank import SideStates, side_dataset
 from tools.train.action_batch import ActionBatch
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import DelayConfig, ImitateEvalConfig, SampleConfig
+from tools.train.delays import Delays
 from tools.train.drive import Dataset
 from tools.train.drive_frames import DriveFrames
-from tools.train.imitate_eval import ImitateEvalConfig, draw_errors, evaluate, keep_state, to_waypoints
-from tools.train.imitation_data import SampleConfig, Samples
+from tools.train.imitate_eval import draw_errors, evaluate, keep_state, to_waypoints
+from tools.train.imitation_data import Samples
 
 CPU = torch.device("cpu")
 FEW = ImitateEvalConfig(samples=96, batch=16)

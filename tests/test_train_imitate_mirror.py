@@ -12,11 +12,12 @@ from edge.geometry import SE2
 from tests.train_drives import MadeUpTokens, tiny_model
 from tests.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive
 from tools.train.anchors import anchors_of
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import DelayConfig, SampleConfig
+from tools.train.delays import Delays
 from tools.train.drive import Dataset
 from tools.train.drive_frames import DriveFrames
 from tools.train.imitate import run
-from tools.train.imitation_data import SampleConfig, Samples
+from tools.train.imitation_data import Samples
 from tools.train.mirror import mirrored
 from tools.train.mirror_drives import (
     MIRROR,

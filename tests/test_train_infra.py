@@ -18,9 +18,10 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tests import train_ranks
 from tools.train import checkpoint
+from tools.train.config_optim import OptimConfig
 from tools.train.distributed import SINGLE, BatchOrder, Ranks
 from tools.train.job import StageJob
-from tools.train.optim import OptimConfig, Optimiser, autocast, computes_bf16, learning_rate
+from tools.train.optim import Optimiser, autocast, computes_bf16, learning_rate
 from tools.train.recipe import Recipe, load_recipe
 from tools.train.run_dir import RunDir, RunDirError
 

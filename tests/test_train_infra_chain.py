@@ -20,8 +20,10 @@ from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights
 from export.shipped import shipped_weights
 from tools.train import chain, cli
-from tools.train.chain import Step, adopt, is_done, may_begin, retired, run_step, steps_of, steps_until
+from tools.train.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
 from tools.train.collection import CollectFailedError
+from tools.train.config_collect import DaggerConfig
+from tools.train.delays import Delays
 from tools.train.exported import ExportError, export_artifacts, model_argument
 from tools.train.job import StageJob
 from tools.train.model_card import CardError, card, ship, write_card
@@ -33,7 +35,7 @@ from tools.train.network_file import (
     start_network,
     weights_before,
 )
-from tools.train.recipe import DaggerConfig, Recipe, load_recipe
+from tools.train.recipe import Recipe, load_recipe
 from tools.train.run_dir import RunDir, RunDirError
 from tools.train.vector_env import RolloutFailedError
 
@@ -218,9 +220,9 @@ def test_a_run_goes_on_from_the_weights_that_imitation_left_elsewhere(run_dir: R
 
 def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
     assert adopted(run_dir, tmp_path, "imitate-1") == ["dagger-2", "imitate-2", "rl", "evaluate"]
-    assert (retired(run_dir, "sft"), retired(run_dir, "imitate")) == (1, 1)
+    assert (run_dir.retired("sft"), run_dir.retired("imitate")) == (1, 1)
     run_step(job(run_dir), Step("imitate", 2), stage_that("after"))
-    assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and retired(run_dir, "imitate") == 2
+    assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and run_dir.retired("imitate") == 2
 
 
 @pytest.mark.parametrize(
@@ -355,7 +357,7 @@ def test_a_run_keeps_its_own_copy_of_a_devices_delays(
     assert run(*asked) == EXIT_DONE
     profile.write_text(json.dumps(LatencyProfile.constant(5.0).as_json()))
     imitation = load_recipe(str(out / "recipe.toml")).imitate
-    assert imitation is not None and imitation.delays.load().mean_s == pytest.approx(3.0, abs=0.1)
+    assert imitation is not None and Delays.of(imitation.delays).mean_s == pytest.approx(3.0, abs=0.1)
     assert run(*asked, "--resume") == EXIT_BAD_INPUT
     assert "begun with other numbers (imitate.delays.profile" in capsys.readouterr().err
 

@@ -9,16 +9,8 @@ import pytest
 
 from export.model.config import PRESETS
 from sim_hil.benchmark.variants import VARIANTS as BENCHMARK_VARIANTS
-from tools.train.recipe import (
-    DaggerConfig,
-    Recipe,
-    RecipeError,
-    filled,
-    load_recipe,
-    recipe_names,
-    recipe_of,
-    stage_seed,
-)
+from tools.train.config_collect import DaggerConfig
+from tools.train.recipe import Recipe, RecipeError, filled, load_recipe, recipe_names, recipe_of, stage_seed
 from tools.train.variants import VARIANTS
 
 NANO = PRESETS["nano"]

@@ -15,10 +15,12 @@ from tokenizers import Tokenizer
 from export.model.network import TicVla, build
 from export.model.tokenizer import NANO_TOKENIZER
 from tests.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
-from tools.train.anchors import WAYPOINTS_START, DrawConfig, Drawn, Prompts, anchors_of
+from tools.train.anchors import WAYPOINTS_START, Drawn, Prompts, anchors_of
+from tools.train.config_imitate import KvConfig
+from tools.train.config_sft import DrawConfig
 from tools.train.distributed import Ranks
 from tools.train.drive import Dataset
-from tools.train.kv_build import KvConfig, build_kv_cache, cache_key
+from tools.train.kv_build import build_kv_cache, cache_key
 from tools.train.kv_cache import KvCache, KvCacheError
 
 CONTENT = NANO_TOKENIZER.read_bytes()

@@ -10,8 +10,9 @@ import pytest
 from edge.geometry import SE2
 from edge.reasoning_text import parse_waypoints
 from tests.training_drives import drive
-from tools.train.anchors import AROUND, Anchor, anchors_of, waiting
-from tools.train.language_augment import ShowConfig, disturbed, shifted
+from tools.train.anchors import Anchor, anchors_of, waiting
+from tools.train.config_sft import AROUND, ShowConfig
+from tools.train.language_augment import disturbed, shifted
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from edge.reasoning_text import Progress, format_progress
 from edge.text_guide import BACK, Known
 from tests.train_drives import WORDINGS, made_up_drive
 from tools.train.anchors import Anchor, Drawn, anchors_of
-from tools.train.language_eval import EvalConfig, Score, closed_loop, landmarks_of, side_of
+from tools.train.config_sft import EvalConfig
+from tools.train.language_eval import Score, closed_loop, landmarks_of, side_of
 
 
 @pytest.fixture(scope="module")

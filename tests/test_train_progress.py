@@ -14,9 +14,9 @@ from sim_hil.benchmark.expert_route import RoutePlanner
 from sim_hil.benchmark.openings import Frame
 from sim_hil.benchmark.robots import footprint_m, max_step_m
 from tests.training_scenarios import all_scenarios, progress_of, scenarios
+from tools.train.config_scenes import CORRIDOR, KINDS
 from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario
-from tools.train.sites import CORRIDOR, KINDS
 
 Points = list[tuple[float, float]]
 

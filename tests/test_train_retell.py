@@ -19,11 +19,12 @@ from sim_hil.benchmark.tasks import Task, begins_ahead, make_task
 from tests.train_drives import made_up_drive, write_dataset
 from tests.training_scenarios import SPEED_MPS, drive_along, scenarios
 from tools.train.anchors import anchors_of
+from tools.train.config_sft import RetellConfig
 from tools.train.distributed import Ranks
 from tools.train.drive import Drive
 from tools.train.progress_labels import RouteProgress
 from tools.train.record import off_way_m
-from tools.train.retell import RetellConfig, RetellError, Retelling, Retellings, retell, told_along
+from tools.train.retell import RetellError, Retelling, Retellings, retell, told_along
 from tools.train.scenarios import Scenario
 from tools.train.trace_words import TURN_BACK
 

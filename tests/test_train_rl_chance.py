@@ -22,9 +22,9 @@ from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
 from tools.train import rl_worker
 from tools.train.async_mind import START_NS, AsyncMind
-from tools.train.rl_drive import CONTROL_S, Chosen, DriveOptions, _Wheel, drive_episode
+from tools.train.rl_drive import CONTROL_S, DriveOptions, _Wheel, drive_episode
 from tools.train.rl_worker import RolloutOrder, delays, scenarios
-from tools.train.rollout import EpisodeEnd, EpisodeSteps
+from tools.train.rollout import Chosen, EpisodeEnd, EpisodeSteps
 from tools.train.scenarios import FIRST_SEED
 from tools.train.vector_env import split
 

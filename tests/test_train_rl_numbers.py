@@ -17,8 +17,9 @@ from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.policies import robot_config
 from tools.train.command_policy import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
+from tools.train.config_rl import PpoConfig
 from tools.train.gae import advantages
-from tools.train.ppo import PpoConfig, PpoOptimiser, PpoStats
+from tools.train.ppo import PpoOptimiser, PpoStats
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

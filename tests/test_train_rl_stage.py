@@ -17,11 +17,11 @@ from export.model.network import TicVla
 from export.model.weights import WeightsInfo, save_weights
 from tests.test_train_rl_tail import LIMITS, _config, _episode, _network
 from tools.train import rollout
+from tools.train.config_rl import PpoConfig, RlConfig
 from tools.train.job import StageJob, StopFlag
 from tools.train.network_file import finish_network
-from tools.train.ppo import PpoConfig
 from tools.train.recipe import Recipe
-from tools.train.rl import STAGE, RlConfig, RlError, improve, run
+from tools.train.rl import STAGE, RlError, improve, run
 from tools.train.rl_learners import TailLearner
 from tools.train.rl_state import Score, State
 from tools.train.rl_worker import RolloutOrder

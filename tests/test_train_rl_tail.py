@@ -26,7 +26,8 @@ from tools.train.action_tail import (
     tail_parameters,
 )
 from tools.train.command_policy import CommandLimits, command_mean
-from tools.train.ppo import PpoConfig, PpoOptimiser
+from tools.train.config_rl import PpoConfig
+from tools.train.ppo import PpoOptimiser
 from tools.train.rl_learners import TailLearner
 from tools.train.rollout import EpisodeEnd, EpisodeSteps
 

@@ -15,17 +15,16 @@ from sim_hil.layouts import BENCHMARK_SEEDS, LayoutError
 from sim_hil.scene import Scene, load_scene
 from tests.training_scenarios import EACH, SEED, all_scenarios, scenarios
 from tools.demo import INSTRUCTION
+from tools.train.config_scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
 from tools.train.scenarios import (
     FIRST_SEED,
     LEAST_WORDINGS,
-    SHARES,
-    TASKS_PER_SCENE,
     ScenarioError,
     kind_of_group,
     scenario_group,
     training_episodes,
 )
-from tools.train.sites import CORRIDOR, KINDS, Site, SiteError, corridor
+from tools.train.sites import Site, SiteError, corridor
 
 SUITE = load_suite("dynanav")
 

@@ -25,16 +25,15 @@ from tools.train import optim
 from tools.train.anchors import Prompts, anchors_of
 from tools.train.budget import budget_of
 from tools.train.chain import Step, run_step
-from tools.train.collect_config import CollectConfig
+from tools.train.config_collect import CollectConfig, TourConfig
+from tools.train.config_optim import OptimConfig
+from tools.train.config_sft import RetellConfig, SftConfig
 from tools.train.drive import Dataset
 from tools.train.job import StageJob
 from tools.train.mirror import Views
 from tools.train.network_file import stage_weights
-from tools.train.optim import OptimConfig
 from tools.train.recipe import load_recipe
-from tools.train.retell import RetellConfig
-from tools.train.sft import Samples, SftConfig, SftError, budget, run
-from tools.train.tour_config import TourConfig
+from tools.train.sft import Samples, SftError, budget, run
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -19,16 +19,15 @@ from tests.train_drives import made_up_drive, write_dataset
 from tests.training_scenarios import progress_of, scenarios
 from tools.train.anchors import Anchor
 from tools.train.carried import Carriage, Glider, carried
-from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import messages
 from tools.train.collection import Collection
+from tools.train.config_collect import CollectConfig, TourConfig
 from tools.train.distributed import SINGLE
 from tools.train.drive import TOUR_DRIVER, Dataset, Drive, DriveError
 from tools.train.job import QuietProgress
 from tools.train.mirror import Joined, Seconds, SecondsDataset, Views
 from tools.train.record import Look, Recorded
 from tools.train.scenarios import Scenario
-from tools.train.tour_config import TourConfig
 from tools.train.tours import build_tours, tour_anchors
 from tools.train.trace_words import TURN_BACK, stop
 

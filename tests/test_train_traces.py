@@ -17,8 +17,8 @@ from sim_hil.people import RENDER_FIELDS, People
 from sim_hil.scene import Scene
 from tests.training_scenarios import all_scenarios, progress_of, scenarios
 from tools.train import trace_words
+from tools.train.config_scenes import CORRIDOR, KINDS
 from tools.train.scenarios import Scenario
-from tools.train.sites import CORRIDOR, KINDS
 from tools.train.traces import PEOPLE_M, Trace, Tracer
 
 NOBODY = (np.zeros((0, 3)), np.zeros((0, 2)))

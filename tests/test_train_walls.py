@@ -15,12 +15,13 @@ from sim_hil.nav_grid import NavGrid
 from tests.train_drives import VAL_LAYOUT, MadeUpTokens, tiny_model, write_dataset
 from tests.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive, trained
 from tools.train.action_batch import Group, collate
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import DelayConfig, LossConfig, SampleConfig
+from tools.train.delays import Delays
 from tools.train.drive import Drive
 from tools.train.drive_frames import DriveFrames
 from tools.train.imitate_eval import plans_into_walls
-from tools.train.imitation_data import SampleConfig, Samples
-from tools.train.imitation_pupils import LossConfig
+from tools.train.imitation_data import Samples
+from tools.train.imitation_pupils import plan_loss
 from tools.train.mirror_drives import mirrored_drive
 from tools.train.sites import Site
 from tools.train.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
@@ -172,7 +173,7 @@ def test_walls_are_added_to_equation_4(tmp_path: Path, walls: Walls) -> None:
     assert batch.around is not None
     near = too_near(plan, batch.target, batch.known, *batch.around, 0.1)
     assert near.max() > 0
-    torch.testing.assert_close(more.of(plan, batch), plain.of(plan, batch) + 3.0 * near)
+    torch.testing.assert_close(plan_loss(more, plan, batch), plan_loss(plain, plan, batch) + 3.0 * near)
 
 
 def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 
 from edge.reasoning_text import Progress
 from export.model.config import PRESETS, TicVlaConfig
+from tools.train.config_collect import TRACE_EVERY
 from tools.train.dataset import DatasetWriter
-from tools.train.drive import EXPERT, PICTURE_PX, TRACE_EVERY, About, Dataset, Drive, Entry
+from tools.train.drive import EXPERT, PICTURE_PX, About, Dataset, Drive, Entry
 
 WORDINGS = ("Turn left, then stop at the desk.", "Take the first left and wait at the desk.")
 VAL_LAYOUT = 106

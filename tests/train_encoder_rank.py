@@ -13,13 +13,14 @@ import torch
 from safetensors.numpy import save_file
 
 from tests.train_drives import tiny_model
-from tools.train.augment import AugmentConfig, encoded
+from tools.train.augment import encoded
+from tools.train.config_encoder import AugmentConfig, EncoderConfig, FramesConfig
+from tools.train.config_optim import OptimConfig
 from tools.train.distributed import leave, ranks_of_environment
-from tools.train.encoder import EncoderConfig, run
-from tools.train.encoder_data import FramesConfig, Shard, finish, path_of, plan
+from tools.train.encoder import run
+from tools.train.encoder_data import Shard, finish, path_of, plan
 from tools.train.encoder_labels import CLASSES, COLOUR_WORDS, COLUMNS, LANDMARK, NONE, PERSON, SOMEBODY, label_shapes
 from tools.train.job import StageJob
-from tools.train.optim import OptimConfig
 from tools.train.recipe import Recipe
 from tools.train.run_dir import RunDir
 

@@ -15,16 +15,16 @@ from edge.reasoning_text import format_waypoints
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, build
 from tests.train_drives import VAL_LAYOUT, MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.config_collect import TRACE_EVERY
+from tools.train.config_imitate import ImitateConfig, ImitateEvalConfig, SampleConfig
+from tools.train.config_optim import OptimConfig
 from tools.train.distributed import leave, ranks_of_environment
-from tools.train.drive import EXPERT, FUTURE_STEPS, TRACE_EVERY, Dataset, Drive
+from tools.train.drive import EXPERT, FUTURE_STEPS, Dataset, Drive
 from tools.train.futures import label_futures
-from tools.train.imitate import ImitateConfig, fit
-from tools.train.imitate_eval import ImitateEvalConfig
-from tools.train.imitation_data import SampleConfig
+from tools.train.imitate import fit
 from tools.train.imitation_pupils import ExpertPupil
 from tools.train.job import StageJob
 from tools.train.kv_cache import CachedState
-from tools.train.optim import OptimConfig
 from tools.train.recipe import Recipe
 from tools.train.run_dir import RunDir
 from tools.train.windows import relative

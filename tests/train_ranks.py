@@ -8,8 +8,9 @@ from pathlib import Path
 
 import torch
 
+from tools.train.config_optim import OptimConfig
 from tools.train.distributed import BatchOrder, Ranks, leave, ranks_of_environment
-from tools.train.optim import OptimConfig, Optimiser
+from tools.train.optim import Optimiser
 
 SAMPLES, BATCH, EPOCHS = 50, 8, 3
 

@@ -11,16 +11,15 @@ import torch
 
 from export.model.network import TicVla, build
 from tests.train_drives import MadeUpTokens, tiny_model
-from tools.train.anchors import DrawConfig
+from tools.train.config_optim import OptimConfig
+from tools.train.config_sft import DrawConfig, EvalConfig, SftConfig
 from tools.train.distributed import leave, ranks_of_environment
 from tools.train.drive import Dataset
 from tools.train.job import StageJob
-from tools.train.language_eval import EvalConfig
 from tools.train.mirror import Views
-from tools.train.optim import OptimConfig
 from tools.train.recipe import Recipe
 from tools.train.run_dir import RunDir
-from tools.train.sft import SftConfig, fit
+from tools.train.sft import fit
 
 CONFIG = SftConfig(
     epochs=2,

@@ -10,10 +10,10 @@ import numpy as np
 
 from edge.geometry import SE2
 from tests.train_drives import made_up_drive
+from tools.train.config_scenes import KINDS
 from tools.train.drive import Drive
 from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario, scenario_group
-from tools.train.sites import KINDS
 from tools.train.trace_words import NOBODY, NOTHING
 from tools.train.traces import Tracer
 

@@ -27,47 +27,19 @@ from edge.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
 from edge.ring import TOLERANCE_S, EncodedFrame
 from edge.text_guide import Known, TextGuide
 from export.model.config import TicVlaConfig
-from tools.train.drive import RATE_HZ, TRACE_EVERY, Drive
+from tools.train.config_collect import RATE_HZ, TRACE_EVERY
+from tools.train.config_sft import AROUND, DrawConfig
+from tools.train.drive import Drive
 from tools.train.trace_words import TURN_BACK, Trace
 
 FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """How far before the newest frame the older ones are (paper appendix A), the oldest first."""
 WAYPOINTS_START: Final = "waypoints:"
 """An assistant's turn that begins so has no reasoning: the model is asked for the points alone."""
-AROUND: Final = 3
-"""Frames before and after an anchor at which its words still hold."""
 _NS: Final = 1_000_000_000
 _NEAR: Final = 3  # traces, before and after
 _AHEAD_SHARE: Final = 0.5  # of wrong words
 _STALE_S: Final = 20.0
-
-
-@dataclass(frozen=True)
-class DrawConfig:
-    """What is drawn for each sample."""
-
-    waypoints_only: float = 0.2
-    """Share of answers that are waypoints without reasoning."""
-    before_min_s: float = 0.3
-    before_max_s: float = 4.0
-    """The last generation's newest frame is so long ago: what a generation takes."""
-    before_late: float = 0.15
-    before_latest_s: float = 10.0
-    """A share of generations takes longer, up to this."""
-    before_wrong: float = 0.25
-    """Share of wrong words about the progress so far: a model that trusted them blindly could never mend a mistake."""
-    way_turn_rad: float = 0.035
-    way_scale: float = 0.02
-    way_point_m: float = 0.05
-    """Standard deviations of what odometry tells of the way, beyond what it was recorded with."""
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.waypoints_only <= 1 and 0 <= self.before_wrong < 1 and 0 <= self.before_late <= 1):
-            raise ValueError("expected waypoints_only and before_late from 0 to 1 and before_wrong from 0 to below 1")
-        if not 0 < self.before_min_s <= self.before_max_s <= self.before_latest_s <= 60:
-            raise ValueError("expected 0 < before_min_s <= before_max_s <= before_latest_s <= 60")
-        if min(self.way_turn_rad, self.way_scale, self.way_point_m) < 0:
-            raise ValueError("expected way_turn_rad, way_scale and way_point_m from 0 on")
 
 
 @dataclass(frozen=True)

@@ -6,44 +6,13 @@ here is only how a view looks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.train.config_encoder import AugmentConfig
+
 Picture = NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class AugmentConfig:
-    """How much pictures are changed; what is called a share is the chance of each picture."""
-
-    brightness: float = 0.3
-    """Most by which all is brighter or darker, as a share."""
-    contrast: float = 0.25
-    """Most by which differences from the mean grow or shrink, as a share."""
-    colour: float = 0.08
-    """Most by which each of red, green and blue is off, as a share."""
-    blur_share: float = 0.3
-    blur_px: float = 0.9
-    """Largest standard deviation of the blur."""
-    noise_share: float = 0.3
-    noise: float = 6.0
-    """Largest standard deviation of the noise, of 255."""
-    jpeg_share: float = 0.5
-    jpeg_quality_min: int = 40
-    jpeg_quality_max: int = 95
-
-    def __post_init__(self) -> None:
-        if not all(0 <= amount < 1 for amount in (self.brightness, self.contrast, self.colour)):
-            raise ValueError("expected brightness, contrast and colour from 0 to below 1")
-        if not all(0 <= share <= 1 for share in (self.blur_share, self.noise_share, self.jpeg_share)):
-            raise ValueError("expected shares from 0 to 1")
-        if not (0 < self.blur_px <= 5 and 0 <= self.noise <= 64):
-            raise ValueError("expected blur_px above 0 to 5 and noise from 0 to 64")
-        if not 1 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100:
-            raise ValueError("jpeg_quality: expected 1 <= min <= max <= 100")
 
 
 def augmented(picture: Picture, config: AugmentConfig, rng: np.random.Generator) -> Picture:

@@ -1,28 +1,36 @@
-"""What a run will take before it is begun: samples of every stage, and time by throughputs that were measured.
-
-A stage's module may have `budget(recipe)`: a list of (what, number of samples, key of its throughput).
-"""
+"""What a run will take before it is begun: samples of every stage, and time by throughputs that were measured."""
 
 from __future__ import annotations
 
-import importlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from export.progress import duration
+from tools.train import collect, encoder, imitate, rl, sft
 from tools.train.chain import Step
+from tools.train.config_collect import OF_TOURS
 from tools.train.optim import computes_bf16
-from tools.train.recipe import STAGES, Recipe
-from tools.train.tour_config import OF_TOURS
+from tools.train.recipe import Recipe
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
+Work = list[tuple[str, int, str]]
+"""What is to be done, how many samples of it, and the key of its throughput."""
+
+BUDGETS: Final[Mapping[str, Callable[[Recipe], Work]]] = {
+    "collect": collect.budget,
+    "encoder": encoder.budget,
+    "sft": sft.budget,
+    "imitate": imitate.budget,
+    "rl": rl.budget,
+}
+"""Name of a stage and the function that tells its work; `evaluate` and `dagger` are told here."""
 FILE: Final = Path(__file__).with_name("throughput.toml")
 
 
@@ -60,7 +68,7 @@ def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
     return lines
 
 
-def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
+def _work(recipe: Recipe, step: Step) -> Work:
     if step.stage == "dagger":
         shown = (
             [("drives of the expert", recipe.dagger.expert_episodes, "drive")] if recipe.dagger.expert_episodes else []
@@ -69,12 +77,11 @@ def _work(recipe: Recipe, step: Step) -> list[tuple[str, int, str]]:
     if step.stage == "evaluate":
         count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
         return [("episodes", count, "policy-drive")]
-    told = getattr(importlib.import_module(STAGES[step.stage][0]), "budget", None)
-    work = [] if told is None else list(told(recipe))
+    work = BUDGETS[step.stage](recipe)
     return _again(recipe, step.stage, work) if step.round else work
 
 
-def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> list[tuple[str, int, str]]:
+def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> Work:
     """What goes on after a round of DAgger: what is cached of the new drives, and the share that is learned again."""
     dagger = recipe.dagger
     drives = dagger.episodes + dagger.expert_episodes

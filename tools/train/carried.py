@@ -27,15 +27,14 @@ from sim_hil.camera import CameraWorld
 from sim_hil.nav_grid import NavGrid
 from sim_hil.people import UPDATE_HZ, People
 from tools.train.augment import encoded
-from tools.train.collect_config import CollectConfig
+from tools.train.config_collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.detour import Course, draw_detour
-from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
+from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
 from tools.train.encoder_ids import ASPECT
 from tools.train.encoder_poses import body_state
 from tools.train.record import Look, NothingToLearnError, Recorded
 from tools.train.scenarios import Scenario
 from tools.train.sites import Site
-from tools.train.tour_config import TourConfig
 from tools.train.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]

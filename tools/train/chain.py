@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from tools.train import collect, encoder, evaluate, imitate, rl, sft
+from tools.train.dagger import run_round
 from tools.train.drive import file_sha256
 from tools.train.exported import export_artifacts
 from tools.train.job import StageJob
 from tools.train.network_file import ORDER, START, stage_weights, weights_before
-from tools.train.recipe import STAGES, Recipe
+from tools.train.recipe import Recipe
 from tools.train.run_dir import RunDir, RunDirError
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
@@ -26,6 +27,15 @@ ADOPTED: Final = "adopted"
 """In a stage's result: it was not run here, the run began with weights that it had left."""
 
 StageRun = Callable[[StageJob], dict[str, Any]]
+RUNS: Final[Mapping[str, StageRun]] = {
+    "collect": collect.run,
+    "encoder": encoder.run,
+    "sft": sft.run,
+    "imitate": imitate.run,
+    "rl": rl.run,
+    "evaluate": evaluate.run,
+}
+"""Name of a stage and the function that does it."""
 
 
 @dataclass(frozen=True)
@@ -57,19 +67,11 @@ def steps_of(command: str, recipe: Recipe) -> list[Step]:
     return steps
 
 
-def retired(run_dir: RunDir, stage: str) -> int:
-    """How often a stage was kept aside, to go on after a round of DAgger."""
-    number = 0
-    while run_dir.begun(f"{stage}-{number}"):
-        number += 1
-    return number
-
-
 def is_done(run_dir: RunDir, step: Step) -> bool:
     """Whether a step has finished."""
     if step.stage == "dagger":
         return run_dir.result(step.name) is not None
-    if step.stage in GO_ON and step.round != (now := retired(run_dir, step.stage)):
+    if step.stage in GO_ON and step.round != (now := run_dir.retired(step.stage)):
         return step.round < now
     return run_dir.result(step.stage) is not None
 
@@ -79,7 +81,7 @@ def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
     where = step.name if step.stage == "dagger" else step.stage
     if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
         raise RunDirError(f"{run_dir.out}: its drives are another run's (--from); set dagger.rounds=0")
-    again = step.stage in GO_ON and step.round > retired(run_dir, step.stage)
+    again = step.stage in GO_ON and step.round > run_dir.retired(step.stage)
     if run_dir.begun(where) and not resume and not again:
         raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
 
@@ -104,7 +106,7 @@ def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
     start = stage_weights(run_dir.out, START)
     result = {ADOPTED: file_sha256(start), "after": steps[-1].name}
     for step in steps:
-        if step.stage in GO_ON and step.round > retired(run_dir, step.stage):
+        if step.stage in GO_ON and step.round > run_dir.retired(step.stage):
             run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
         name = step.name if step.stage == "dagger" else step.stage
         run_dir.stage(name)
@@ -121,7 +123,7 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
         if job.ranks.first:
             job.run_dir.finish(step.name, result)
         return result
-    if step.stage in GO_ON and step.round > retired(job.run_dir, step.stage):
+    if step.stage in GO_ON and step.round > job.run_dir.retired(step.stage):
         # The drives have become more: the stage goes on over all of them, and what it was is kept.
         job.ranks.barrier()  # all ranks have looked
         if job.ranks.first:
@@ -136,13 +138,10 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
 
 def module_run(stage: str) -> StageRun:
     """The function of a stage's module."""
-    run: StageRun = importlib.import_module(STAGES[stage][0]).run
-    return run
+    return RUNS[stage]
 
 
 def _round(job: StageJob, step: Step) -> dict[str, Any]:
-    from tools.train.dagger import run_round
-
     weights = weights_before(job.run_dir.out, "rl")
     if weights is None or weights.parent.name != "imitate":
         raise RunDirError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")

@@ -27,6 +27,7 @@ from edge.cli import (
     write_result,
     write_whole,
 )
+from edge.latency_profile import load_profile
 from export.progress import duration, peak_rss_bytes
 from tools.benchmark_runs import RunsError
 from tools.train import budget, chain
@@ -209,8 +210,6 @@ def _own_profile(args: argparse.Namespace) -> tuple[Path, str]:
 
     A run that goes on after the file was measured again would otherwise learn under other delays without a word.
     """
-    from edge.latency_profile import load_profile
-
     content = json.dumps(load_profile(args.delay_profile).as_json()) + "\n"
     if args.out is None:
         return args.delay_profile.absolute(), content

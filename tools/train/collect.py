@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from tools.train.collect_config import CollectConfig
-
-if TYPE_CHECKING:
-    from tools.train.job import StageJob
-    from tools.train.recipe import Recipe
-
-__all__ = ["CollectConfig", "budget", "run"]
+from tools.train.collection import CollectError, Collection, fill, job_count, result_of
+from tools.train.config_collect import CollectConfig
+from tools.train.dataset import DatasetWriter
+from tools.train.job import StageJob
+from tools.train.recipe import Recipe
 
 PREFIX = "e"
 
@@ -22,10 +20,6 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 
 def run(job: StageJob) -> dict[str, Any]:
     """Record the recipe's drives into `collect/`; goes on where a run before was ended. Raises CollectError."""
-    # Here: a recipe needs the numbers alone, and the simulator takes its time to load.
-    from tools.train.collection import CollectError, Collection, fill, job_count, result_of
-    from tools.train.dataset import DatasetWriter
-
     config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
     if job.ranks.world > 1:
         raise CollectError("collect starts processes of its own (collect.jobs): run it without torchrun")

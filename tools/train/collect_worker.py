@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +24,16 @@ from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import SceneError
-from tools.train.collect_config import CollectConfig
+from tools.train.carried import Carriage, carried
+from tools.train.config_collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
+from tools.train.config_scenes import SHARES
 from tools.train.dagger_driver import PolicyDriver, PolicyOptions
 from tools.train.detour import draw_detour
-from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, RATE_HZ, TOUR_DRIVER, TRACE_EVERY, About, Drive, Entry
+from tools.train.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
 from tools.train.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
-from tools.train.scenarios import SHARES, Scenario, ScenarioError, training_episodes
+from tools.train.scenarios import Scenario, ScenarioError, training_episodes
 from tools.train.steering import SteeringNoise, Velocity
-from tools.train.tour_config import TourConfig
 from tools.train.traces import Tracer
-
-if TYPE_CHECKING:
-    from tools.train.carried import Carriage
 
 MODULE: Final = "tools.train.collect_worker"
 _TAG: Final = 0xC011
@@ -187,16 +185,11 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
 
 def _carriage(tour: TourConfig, scenario: Scenario, scenarios: Sequence[Scenario]) -> Carriage:
     """Of a scenario's layout; the first one there says how many people there are, whoever is asked for first."""
-    from tools.train.carried import Carriage
-
     first = next(each for each in scenarios if each.layout_seed == scenario.layout_seed)
     return Carriage(scenario.site, min(first.episode.people, tour.people_most))
 
 
 def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, carriage: Carriage) -> Entry:
-    # Here: who records drives needs nothing of it.
-    from tools.train.carried import carried
-
     draw = Draw.of(order.config, order.seed, number)
     rng = np.random.default_rng((order.seed, number, _TAG, 2))
     recorded = carried(scenario, carriage, tour, draw.look, draw.drift, order.config, rng)

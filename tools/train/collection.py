@@ -13,14 +13,13 @@ from typing import Any, Final
 import numpy as np
 
 from sim_hil.benchmark.worker_pool import Told, Workers
-from tools.train.collect_config import CollectConfig
 from tools.train.collect_worker import MODULE, Order
+from tools.train.config_collect import CollectConfig, TourConfig
 from tools.train.dagger_driver import PolicyOptions
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Entry
 from tools.train.job import StageFailedError
 from tools.train.scenarios import KEPT_SEEDS, MAX_SEED
-from tools.train.tour_config import TourConfig
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5

@@ -13,9 +13,6 @@ from torch import Tensor
 
 from edge.controller import TARGET_TIME_S, TURN_IN_PLACE_M
 
-LOG_STD_RANGE = (-4.0, 0.5)
-"""exp: 0.018 to 1.6 m/s and rad/s. Below it nothing is explored, above it nothing is driven."""
-
 
 @dataclass(frozen=True)
 class CommandLimits:

@@ -7,34 +7,19 @@ labelled are the states that the deployed policy gets itself into. New drives of
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from tools.train.collect_config import CollectConfig
-from tools.train.drive import Dataset
-
-if TYPE_CHECKING:
-    from tools.train.job import StageJob
+from edge.manifest import load_artifacts
+from tools.train.collection import CollectError, Collection, fill, job_count, result_of
+from tools.train.config_collect import CollectConfig
+from tools.train.dagger_driver import PolicyOptions
+from tools.train.dataset import DatasetWriter
+from tools.train.drive import POLICY_DRIVER
+from tools.train.job import StageJob
+from tools.train.own_drives import prefixes_of
 
 BETA: Final = 0.5  # the expert's share of the first round; halved in every one after it
 _EXPERT_TURNS: Final = 1_000  # rounds, of which there are 100 at most, take the turns below
-
-
-def prefixes_of(round_number: int) -> tuple[str, str]:
-    """How the ids of a round's drives begin, the policy's and the expert's; rounds count from 1."""
-    return f"d{round_number}-", f"n{round_number}-"
-
-
-def drives_after(job: StageJob, stage: str) -> Dataset:
-    """The drives that a stage learns from: all, or those of the newest round (`dagger.newest_only`). Raises DriveError.
-
-    Before the first round those are the same.
-    """
-    from tools.train.chain import retired
-
-    dataset, rounds = Dataset.open(job.run_dir.stage("collect")), retired(job.run_dir, stage)
-    if rounds and job.recipe.dagger.newest_only:
-        return dataset.of(*prefixes_of(rounds))
-    return dataset
 
 
 def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, Any]:
@@ -42,12 +27,6 @@ def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, An
 
     Raises ArtifactError for artifacts that cannot drive, CollectError.
     """
-    from edge.manifest import load_artifacts
-    from tools.train.collection import CollectError, Collection, fill, job_count, result_of
-    from tools.train.dagger_driver import PolicyOptions
-    from tools.train.dataset import DatasetWriter
-    from tools.train.drive import POLICY_DRIVER
-
     if round_number < 1:
         raise ValueError(f"dagger: rounds count from 1, found {round_number}")
     if job.ranks.world > 1:

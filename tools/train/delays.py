@@ -17,41 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.latency_profile import LatencyProfile, load_profile
-from tools.train.drive import RATE_HZ
+from tools.train.config_collect import RATE_HZ
+from tools.train.config_imitate import DelayConfig
 
 Array = NDArray[np.float64]
 
-LONGEST_S: Final = 60.0
 _MOST_TIMES: Final = 1000  # of a profile: more are stood for by as many of their order statistics
 _ROUNDING: Final = 1e-12
-
-
-@dataclass(frozen=True)
-class DelayConfig:
-    """Ages to train under: uniform from `low_s` to `high_s` (paper, Algorithm 1), or those of a device's profile."""
-
-    low_s: float = 0.0
-    high_s: float = 10.0
-    profile: str = ""
-    """A file of `edge-calib latency`; empty: uniform."""
-    near_share: float = 0.0
-    """Share of ages that are uniform up to `near_s` instead: it is by fresh words that a policy learns to listen. Of a
-    profile's it is not used."""
-    near_s: float = 4.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.low_s < self.high_s <= LONGEST_S:
-            raise ValueError(
-                f"expected 0 <= low_s < high_s <= {LONGEST_S:g} s, found {self.low_s:g} and {self.high_s:g}"
-            )
-        if not 0 <= self.near_share <= 1:
-            raise ValueError(f"near_share: expected 0 to 1, found {self.near_share:g}")
-        if self.near_share and not self.low_s < self.near_s <= self.high_s:
-            raise ValueError(f"near_s: expected above low_s and up to high_s, found {self.near_s:g}")
-
-    def load(self) -> Delays:
-        """The distribution; raises LatencyError for a profile that cannot be used."""
-        return Delays.of_profile(load_profile(Path(self.profile))) if self.profile else Delays.uniform(self)
 
 
 @dataclass(frozen=True)
@@ -65,6 +37,11 @@ class Delays:
         whole = float(self.mass.sum())
         if self.mass.ndim != 1 or not len(self.mass) or np.any(self.mass < 0) or not math.isclose(whole, 1.0):
             raise ValueError(f"delays: expected chances that add up to 1, found {self.mass.shape} with sum {whole:g}")
+
+    @staticmethod
+    def of(config: DelayConfig) -> Delays:
+        """The distribution that `config` describes; raises LatencyError for a profile that cannot be used."""
+        return Delays.of_profile(load_profile(Path(config.profile))) if config.profile else Delays.uniform(config)
 
     @staticmethod
     def none() -> Delays:

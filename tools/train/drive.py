@@ -23,11 +23,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from edge.geometry import SE2
-from tools.train.windows import Window, windows
+from tools.train.config_collect import TRACE_EVERY
 
-RATE_HZ: Final = 10
 FUTURE_STEPS: Final = 50
-TRACE_EVERY: Final = 10  # frames: reasoning is written down once a second
 PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)
 PICTURE_PX: Final = 128
 EXPERT, NOISE, POLICY = 0, 1, 2  # who commanded a frame: values of `by`
@@ -322,11 +320,6 @@ class Dataset:
         """One after the other, all by default; no more than one is in memory."""
         for drive_id in self.ids if ids is None else ids:
             yield self.load(drive_id, pictures=pictures)
-
-    def samples(self, stride_s: float = 3.0, ids: Sequence[str] | None = None) -> Iterator[Window]:
-        """Episodes of 20 s, one every `stride_s`, with history and future (paper appendix B)."""
-        for drive in self.drives(ids, pictures=False):
-            yield from windows(drive, stride_s)
 
 
 def file_sha256(path: Path) -> str:

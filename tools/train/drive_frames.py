@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.geometry import SE2
-from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, RATE_HZ, Drive
+from tools.train.config_collect import RATE_HZ
+from tools.train.config_imitate import WeightConfig
+from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, Drive
 from tools.train.trace_words import NOBODY
 from tools.train.walls import Walls
 
@@ -26,30 +28,6 @@ _LEADS_M: Final = 0.3
 
 class DriveFramesError(ValueError):
     """A network whose plans have no label; one line."""
-
-
-@dataclass(frozen=True)
-class WeightConfig:
-    """How often frames are drawn, as factors on an ordinary one's chance; those that hold are multiplied."""
-
-    turn: float = 2.0
-    """Its label turns by more than 0.5 rad within 3 s."""
-    people: float = 2.0
-    """Somebody is in view within 6 m."""
-    goal: float = 2.0
-    goal_m: float = 4.0
-    """The goal is nearer than this."""
-    recovery: float = 1.5
-    """Something other than the expert commands within the next 5 s, so that the label leads back."""
-    policy: float = 1.0
-    """Its drive is a policy's (DAgger)."""
-    stuck: float = 1.0
-    """It has stood for a second and its label does not: a policy that sees this too seldom stands for good."""
-
-    def __post_init__(self) -> None:
-        factors = (self.turn, self.people, self.goal, self.recovery, self.policy, self.stuck)
-        if not all(0 < factor <= 100 for factor in factors) or not 0 <= self.goal_m <= 100:
-            raise ValueError("expected factors above 0, up to 100, and goal_m from 0 to 100")
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from math import isqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -25,19 +25,18 @@ from numpy.typing import NDArray
 from edge.policy import fit_frame
 from export.model.network import TicVla
 from tools.train import checkpoint
-from tools.train.augment import AugmentConfig, augmented
+from tools.train.augment import augmented
+from tools.train.config_encoder import EncoderConfig
 from tools.train.distributed import BatchOrder
-from tools.train.encoder_data import FramesConfig, FrameSet, Shard, fill, frames_sha256, plan
+from tools.train.encoder_data import FrameSet, Shard, fill, frames_sha256, plan
 from tools.train.encoder_heads import Balance, EncoderHeads, as_tensors, losses, total
 from tools.train.encoder_labels import COLUMNS, PIXELS, mirrored_label
 from tools.train.encoder_score import Fixed, Score, decide
 from tools.train.job import StageJob
 from tools.train.network_file import finish_network, start_network
-from tools.train.optim import OptimConfig, Optimiser, autocast
+from tools.train.optim import Optimiser, autocast
+from tools.train.recipe import Recipe
 from tools.train.tokens import encoder_sha256
-
-if TYPE_CHECKING:
-    from tools.train.recipe import Recipe
 
 STAGE: Final = "encoder"
 _HEADS, _AUGMENT, _LOOK = 0xE0C2, 0xE0C3, 0xE0C4
@@ -45,36 +44,6 @@ _HEADS, _AUGMENT, _LOOK = 0xE0C2, 0xE0C3, 0xE0C4
 
 class EncoderError(ValueError):
     """A network, pictures or a checkpoint that cannot be learned from; one line."""
-
-
-@dataclass(frozen=True)
-class EncoderConfig:
-    """Training of the vision encoder on the simulator's own labels."""
-
-    frames: FramesConfig = field(default_factory=FramesConfig)
-    epochs: int = 2
-    batch: int = 64
-    """Pictures of all ranks together."""
-    optim: OptimConfig = field(
-        default_factory=lambda: OptimConfig(
-            lr=1e-3, final_lr_share=0.02, weight_decay=0.02, warmup_steps=500, bf16=True
-        )
-    )
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
-    mirrored: float = 0.5
-    """Share of pictures that are shown as a mirror shows them: later stages learn from drives in the mirror."""
-    checkpoint_steps: int = 500
-    """Steps between two checkpoints."""
-    look_steps: int = 500
-    """Steps between two looks at held-out pictures."""
-    look_frames: int = 768
-    """Held-out pictures of one look; at the end it is all of them."""
-
-    def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, self.checkpoint_steps, self.look_steps) < 1 or self.look_frames < 0:
-            raise ValueError("expected epochs, batch, checkpoint_steps and look_steps from 1 on, look_frames from 0 on")
-        if not 0 <= self.mirrored <= 1:
-            raise ValueError(f"expected mirrored to be a share from 0 to 1, found {self.mirrored}")
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:

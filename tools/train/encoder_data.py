@@ -25,21 +25,19 @@ from export.typed import build, plain
 from sim_hil.benchmark.episode import ROBOTS
 from sim_hil.benchmark.worker_pool import Told, Workers
 from tools.train.augment import Picture, decoded
+from tools.train.config_encoder import OUTDOORS_LEAST, FramesConfig
+from tools.train.config_scenes import CORRIDOR, OUTDOORS
 from tools.train.drive import file_sha256
 from tools.train.encoder_labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
 from tools.train.job import StageProgress
-from tools.train.sites import CORRIDOR, KINDS, OUTDOORS
 
 FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder_worker"
 FIRST_LAYOUT: Final = 10_000_000_000
 """Of layouts that pictures are taken in: above every seed that drives are recorded in (`tools.train.scenarios`)."""
-MOST_SCENES: Final = 50_000
-"""Of each sort; where a layout cannot be built, the one so many further on is taken."""
 _OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts
 _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
-_OUTDOORS_LEAST: Final = 20  # people
 _CORRIDOR_MOST: Final = 12
 _LEAST_HELD: Final = 32  # pictures of a scene, which takes seconds to build
 _EMPTY_SHARE: Final = 0.12  # of scenes indoors
@@ -47,50 +45,6 @@ _EMPTY_SHARE: Final = 0.12  # of scenes indoors
 
 class FramesError(ValueError):
     """Training pictures that cannot be made or read; one line."""
-
-
-@dataclass(frozen=True)
-class FramesConfig:
-    """How many pictures, where, and how they are taken. A kind that is named twice has twice as many scenes."""
-
-    count: int = 120_000
-    """To learn from; 0: the encoder stays as it is."""
-    held: int = 6_000
-    """In layouts that are never learned from."""
-    per_scene: int = 600
-    kinds: tuple[str, ...] = (
-        "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "sidewalk",
-        "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "corridor",
-    )  # fmt: skip
-    people_indoors: int = 60
-    """Most of one scene."""
-    people_outdoors: int = 120
-    moment: int = 8
-    """Pictures taken before everybody moves on."""
-    moment_s: float = 0.5
-    """For how long they move."""
-    sharp_share: float = 0.3
-    """Pictures rendered twice as large and shrunk, as a real camera's are."""
-    jpeg_quality_min: int = 85
-    jpeg_quality_max: int = 100
-    jobs: int = 0
-    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.count <= 10_000_000 and 0 <= self.held <= 1_000_000 and 1 <= self.per_scene <= 100_000):
-            raise ValueError("expected count up to 10000000, held up to 1000000 and per_scene from 1 to 100000")
-        if max(self.count, self.held) > MOST_SCENES * self.per_scene:
-            raise ValueError(f"expected {MOST_SCENES} scenes at most; set per_scene higher")
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {', '.join(self.kinds) or 'none'}")
-        if self.held and set(self.kinds) <= {CORRIDOR}:
-            raise ValueError(f"held: {CORRIDOR} is one scene, which is learned from; name another kind or set held = 0")
-        if not (0 <= self.people_indoors <= 200 and _OUTDOORS_LEAST <= self.people_outdoors <= 200):
-            raise ValueError(f"expected up to 200 people, {_OUTDOORS_LEAST} or more outdoors")
-        if not (1 <= self.moment <= 1000 and 0 < self.moment_s <= 60 and 0 <= self.sharp_share <= 1):
-            raise ValueError("expected moment from 1 to 1000, moment_s above 0 to 60 and sharp_share from 0 to 1")
-        if not 30 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100 or not 0 <= self.jobs <= 1024:
-            raise ValueError("expected jpeg_quality 30 <= min <= max <= 100 and 0 to 1024 jobs")
 
 
 @dataclass(frozen=True)
@@ -176,7 +130,7 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
 
 def _people(config: FramesConfig, kind: str, rng: np.random.Generator) -> int:
     if kind in OUTDOORS:
-        return int(rng.integers(_OUTDOORS_LEAST, config.people_outdoors + 1))
+        return int(rng.integers(OUTDOORS_LEAST, config.people_outdoors + 1))
     most = min(config.people_indoors, _CORRIDOR_MOST) if kind == CORRIDOR else config.people_indoors
     return 0 if rng.uniform() < _EMPTY_SHARE else int(rng.integers(0, most + 1))
 

@@ -22,8 +22,9 @@ from sim_hil.layouts import LayoutError
 from sim_hil.people import UPDATE_HZ, People, appearances
 from sim_hil.scene import Scene
 from tools.train.augment import encoded
+from tools.train.config_encoder import MOST_SCENES
 from tools.train.drive import PICTURE_PX
-from tools.train.encoder_data import MOST_SCENES, WORKER, Shard, finish, path_of
+from tools.train.encoder_data import WORKER, Shard, finish, path_of
 from tools.train.encoder_ids import ASPECT, IdWorld, view_of
 from tools.train.encoder_labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder_poses import Poses, body_state

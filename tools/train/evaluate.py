@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from edge.cli import write_whole
-
-if TYPE_CHECKING:
-    from tools.train.job import StageJob
+from sim_hil.benchmark.conditions import Conditions, PolicySpec
+from sim_hil.benchmark.episode import load_suite, suite_to_toml
+from sim_hil.benchmark.jobs import RunWatcher
+from sim_hil.benchmark.latency import LatencyProfile
+from sim_hil.benchmark.results import EpisodeResult
+from sim_hil.benchmark.summary import summarise
+from sim_hil.scene import scene_to_toml
+from tools.benchmark_runs import run_episodes
+from tools.train.config_evaluate import EvaluateConfig
+from tools.train.config_scenes import SHARES
+from tools.train.exported import export_artifacts
+from tools.train.job import StageJob
+from tools.train.network_file import weights_before
+from tools.train.scenarios import training_episodes
 
 STAGE: Final = "evaluate"
 SUITE: Final = "training.toml"
@@ -22,42 +32,11 @@ class EvaluateError(ValueError):
     """Nothing to evaluate; one line."""
 
 
-@dataclass(frozen=True)
-class EvaluateConfig:
-    """Which episodes are driven, and how slow reasoning is in them."""
-
-    episodes: int = 60
-    scenario_seed: int = 9001
-    """Of `tools.train.scenarios`: layouts that no other stage draws."""
-    kinds: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the kinds of scenes; empty: those of `tools.train.scenarios`."""
-    latency_s: float = 2.0
-    drift: str = "none"
-    jobs: int = 0
-    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.episodes <= 10_000 and 0 <= self.scenario_seed <= 9_999 and 0 <= self.jobs <= 1024):
-            raise ValueError("expected 1 to 10000 episodes, a scenario_seed of 0 to 9999 and 0 to 1024 jobs")
-        if not 0 <= self.latency_s <= 60 or self.drift not in ("none", "typical", "severe"):
-            raise ValueError("expected latency_s from 0 to 60 and drift none, typical or severe")
-
-
 def run(job: StageJob) -> dict[str, Any]:
     """Export the run's newest weights, drive, and return the benchmark's summary; resumes by itself.
 
     Raises EvaluateError, ExportError, RunsError, ScenarioError, StoreError.
     """
-    from sim_hil.benchmark.conditions import Conditions, PolicySpec
-    from sim_hil.benchmark.episode import load_suite
-    from sim_hil.benchmark.jobs import RunWatcher
-    from sim_hil.benchmark.latency import LatencyProfile
-    from sim_hil.benchmark.results import EpisodeResult
-    from sim_hil.benchmark.summary import summarise
-    from tools.benchmark_runs import run_episodes
-    from tools.train.exported import export_artifacts
-    from tools.train.network_file import weights_before
-
     config = job.recipe.evaluate or EvaluateConfig()
     weights = weights_before(job.run_dir.out, STAGE)
     if weights is None or weights.parent.name not in ("imitate", "rl"):
@@ -96,10 +75,6 @@ def write_suite(folder: Path, config: EvaluateConfig) -> Path:
 
     Raises EvaluateError where there is one of other numbers: its results would be taken for these.
     """
-    from sim_hil.benchmark.episode import suite_to_toml
-    from sim_hil.scene import scene_to_toml
-    from tools.train.scenarios import SHARES, training_episodes
-
     path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
     numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
     if path.exists() and mark.exists():

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from edge.geometry import SE2
 from sim_hil.benchmark.expert_motion import STEP_S, Choice
 from sim_hil.benchmark.expert_route import SPACING_M
-from tools.train.drive import EXPERT, FUTURE_STEPS, RATE_HZ
+from tools.train.config_collect import RATE_HZ
+from tools.train.drive import EXPERT, FUTURE_STEPS
 from tools.train.windows import relative
 
 Array = NDArray[np.float64]

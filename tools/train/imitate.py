@@ -10,24 +10,29 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import asdict, replace
+from typing import Any, Final
 
 import torch
 
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
-from tools.train.chain import retired
-from tools.train.dagger import drives_after
-from tools.train.delays import DelayConfig, Delays
+from tools.train.config_imitate import (
+    POINT_GOAL,
+    TIC_VLA,
+    DelayConfig,
+    ImitateConfig,
+    SampleConfig,
+)
+from tools.train.delays import Delays
 from tools.train.drive import Dataset
 from tools.train.drive_frames import DriveFrames
-from tools.train.imitate_eval import ImitateEvalConfig, draw_errors, evaluate
-from tools.train.imitation_data import NoStates, SampleConfig, SampleError, Samples, States
-from tools.train.imitation_pupils import ExpertPupil, LossConfig, PointGoalPupil, Pupil
+from tools.train.imitate_eval import draw_errors, evaluate
+from tools.train.imitation_data import NoStates, SampleError, Samples, States
+from tools.train.imitation_pupils import ExpertPupil, PointGoalPupil, Pupil
 from tools.train.imitation_steps import ImitateError, Training
 from tools.train.job import StageJob
-from tools.train.kv_build import SEEN_PARTS, KvConfig, build_kv_cache, parts_sha256
+from tools.train.kv_build import SEEN_PARTS, build_kv_cache, parts_sha256
 from tools.train.kv_cache import KvCache
 from tools.train.language_batch import FrameTokens
 from tools.train.mirror import FOLDER as MIRRORED
@@ -44,64 +49,22 @@ from tools.train.mirror_drives import (
 )
 from tools.train.mirror_drives import STATES as MIRRORED_STATES
 from tools.train.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.optim import OptimConfig
+from tools.train.own_drives import drives_after
 from tools.train.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
+from tools.train.recipe import Recipe
 from tools.train.tokens import TokenCache
 from tools.train.walls import Scenes
 
-if TYPE_CHECKING:
-    from tools.train.recipe import Recipe
-
 STAGE: Final = "imitate"
-TIC_VLA, POINT_GOAL = "tic-vla", "point-goal"
 STATES: Final = "kv"
 """Folder of the semantic states, beside the drives."""
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 _START: Final = 0x1A14
 
 
-@dataclass(frozen=True)
-class ImitateConfig:
-    """Imitation learning with delayed inference."""
-
-    policy: str = TIC_VLA
-    """Or point-goal: the paper's behaviour cloning baseline, from picture, state and goal, told nothing."""
-    samples: int = 384_000
-    """Samples in all (the paper: 10 epochs of frames 3 s apart)."""
-    batch: int = 64
-    """Samples of one step, of all ranks together (the paper: 16 on each of 8)."""
-    go_on_share: float = 0.5
-    """Of `samples` after a round of DAgger, from the weights before it; 0: from the beginning with all of them."""
-    inject_delay: bool = True
-    """False: states are always those of now (the crosses in the paper's Table 2)."""
-    delays: DelayConfig = field(default_factory=DelayConfig)
-    sample: SampleConfig = field(default_factory=SampleConfig)
-    states: KvConfig = field(default_factory=KvConfig)
-    mirrored: float = 0.3
-    """Share of samples that are of the drives as a mirror shows them, at whole seconds."""
-    loss: LossConfig = field(default_factory=LossConfig)
-    optim: OptimConfig = field(default_factory=lambda: OptimConfig(bf16=True))
-    """Table 8; in bfloat16, which is nearly twice as fast on two cores."""
-    held_samples: int = 1024
-    """Of held-out layouts, whose loss is looked at every `held_steps` steps and at the end."""
-    held_steps: int = 500
-    checkpoint_steps: int = 500
-    evaluate: ImitateEvalConfig = field(default_factory=ImitateEvalConfig)
-
-    def __post_init__(self) -> None:
-        if self.policy not in (TIC_VLA, POINT_GOAL):
-            raise ValueError(f"policy: expected {TIC_VLA} or {POINT_GOAL}, found {self.policy!r}")
-        if min(self.samples, self.batch, self.held_steps, self.checkpoint_steps) < 1 or self.held_samples < 0:
-            raise ValueError("expected samples, batch, held_steps and checkpoint_steps from 1, held_samples from 0 on")
-        if self.batch % self.sample.group:
-            raise ValueError(f"batch: expected a multiple of sample.group ({self.sample.group}), found {self.batch}")
-        if not (0 <= self.go_on_share <= 1 and 0 <= self.mirrored < 1):
-            raise ValueError("expected go_on_share from 0 to 1 and mirrored from 0 to below 1")
-
-
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """(what, how many, which measured rate) before there are drives: they are planned as for fine-tuning."""
-    from tools.train.sft import PLANNED_DRIVE_S
+    from tools.train.config_collect import PLANNED_DRIVE_S
 
     config = recipe.imitate or ImitateConfig()
     seconds = round(PLANNED_DRIVE_S * recipe.collect.episodes) if recipe.collect is not None else 0
@@ -194,7 +157,7 @@ def _point_goal(
 
 def _start(job: StageJob, config: ImitateConfig) -> tuple[TicVla, float]:
     """The network to begin with, and the share of `samples` that it is trained for."""
-    network, rounds = start_network(job, STAGE), retired(job.run_dir, STAGE)
+    network, rounds = start_network(job, STAGE), job.run_dir.retired(STAGE)
     if not rounds or not config.go_on_share or config.policy == POINT_GOAL:
         return network, 1.0
     path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
@@ -221,7 +184,7 @@ def fit(
     `own`: states of the held-out drives with what the language model says itself.
     """
     config = _config(job)
-    delays = config.delays.load() if config.inject_delay and pupil.hears else Delays.none()
+    delays = Delays.of(config.delays) if config.inject_delay and pupil.hears else Delays.none()
     scenes = Scenes() if config.loss.walls else None
     drives = _frames(job, dataset, dataset.train, config.sample, scenes)
     if mirror is not None:

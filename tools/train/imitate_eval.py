@@ -24,7 +24,8 @@ from edge.geometry import SE2
 from edge.guidance import waypoints_now
 from edge.reasoning_text import WAYPOINT_TIMES_S, Waypoints
 from tools.train.action_batch import ActionBatch, Group, collate
-from tools.train.drive import RATE_HZ
+from tools.train.config_collect import RATE_HZ
+from tools.train.config_imitate import ImitateEvalConfig
 from tools.train.imitation_data import Chosen, Samples
 from tools.train.walls import OPEN_M, room
 
@@ -38,24 +39,6 @@ _COLOURS: Final[Mapping[str, str]] = {
     POLICY: "#1f6f8b", KEEP: "#5b6774", WAYPOINTS: "#2c8c4a", OTHER_WORDS: "#d1603d",
 }  # fmt: skip
 _TAG: Final = 0xADE
-
-
-@dataclass(frozen=True)
-class ImitateEvalConfig:
-    """How much is looked at."""
-
-    samples: int = 4096
-    batch: int = 64
-    edges_s: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
-    """Ages are told apart by these; the last bin holds its upper edge."""
-    own_words: bool = True
-    """Look also at what becomes of it when the language model has said the texts itself."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 1 or self.batch < 1:
-            raise ValueError("expected samples and a batch from 1 on")
-        if len(self.edges_s) < 2 or any(a >= b for a, b in pairwise(self.edges_s)) or self.edges_s[0] < 0:
-            raise ValueError(f"edges_s: expected two or more rising ages from 0 s on, found {self.edges_s}")
 
 
 def keep_state(state: Array, steps: int) -> Array:

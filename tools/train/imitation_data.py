@@ -11,7 +11,7 @@ A sample's inputs are of frame k and before; only its label is of the future.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from math import radians
 from typing import Protocol
 
@@ -23,9 +23,10 @@ from edge.guidance import waypoints_now
 from edge.reasoning_text import Waypoints
 from export.model.config import TicVlaConfig
 from tools.train.action_batch import Around, Group
+from tools.train.config_collect import RATE_HZ
+from tools.train.config_imitate import SampleConfig
 from tools.train.delays import Delays
-from tools.train.drive import RATE_HZ
-from tools.train.drive_frames import DriveFrames, WeightConfig
+from tools.train.drive_frames import DriveFrames
 from tools.train.kv_cache import CachedState
 from tools.train.language_batch import FrameTokens
 from tools.train.walls import nothing_near
@@ -35,54 +36,6 @@ Array = NDArray[np.float64]
 
 class SampleError(ValueError):
     """Drives that give no samples, or a network that cannot learn from them; one line."""
-
-
-@dataclass(frozen=True)
-class SampleConfig:
-    """What a sample is made of beside its frame."""
-
-    group: int = 4
-    """Frames that act on one state and share its keys and values: fewer vary more, more are faster."""
-    reasoning: bool = True
-    """False: states end with their prompt, as those of a model that says nothing."""
-    cut_text: float = 0.1
-    """Share of states whose text ends early: a power budget may cut it at any token."""
-    prompt_only: float = 0.05
-    """Share of states of a prompt without any text: what the mode without reasoning drives by."""
-    text_only: float = 0.0
-    """Share of states whose prompt is hidden: of a turn it tells the side, and only the text tells when."""
-    standing_start: float = 0.5
-    """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
-    longest_told_s: float = 10.0
-    """Δt beyond this is told as this, as the robot tells it (the targets' `runtime.max_delay_s`)."""
-    offset_noise_m_per_m: float = 0.02
-    """Of the motion offset, in m for each metre driven since the state, one standard deviation (paper, Table 14)."""
-    offset_noise_deg_per_m: float = 1.0
-    blind: float = 0.0
-    """Share of samples without the picture of now, so that what is said has to be heard: an expert's pictures alone
-    nearly tell its way."""
-    weights: WeightConfig = field(default_factory=WeightConfig)
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.group <= 64:
-            raise ValueError(f"group: expected 1 to 64 frames, found {self.group}")
-        of_text = self.cut_text, self.prompt_only, self.text_only
-        if not (min(of_text) >= 0 and sum(of_text) <= 1):
-            raise ValueError("expected cut_text, prompt_only and text_only from 0 on, together 1 at most")
-        if not (0 <= self.standing_start <= 1 and 0 <= self.blind <= 1):
-            raise ValueError("expected standing_start and blind from 0 to 1")
-        if not 0 < self.longest_told_s <= 600:
-            raise ValueError(f"longest_told_s: expected above 0 and up to 600 s, found {self.longest_told_s:g}")
-        if not (0 <= self.offset_noise_m_per_m <= 1 and 0 <= self.offset_noise_deg_per_m <= 90):
-            raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
-
-    def undisturbed(self) -> SampleConfig:
-        """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
-        even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
-        return replace(
-            self, blind=0.0, cut_text=0.0, prompt_only=0.0, text_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
-            offset_noise_deg_per_m=0.0, weights=even,
-        )  # fmt: skip
 
 
 class States(Protocol):

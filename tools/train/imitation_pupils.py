@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,38 +11,18 @@ from torch import Tensor, nn
 from export.model.action import ActionExpert
 from tools.train import action_batch
 from tools.train.action_batch import ActionBatch
+from tools.train.config_imitate import LossConfig
 from tools.train.drive_frames import DriveFrames
 from tools.train.point_goal_net import PointGoalNet
 from tools.train.walls import too_near
 
 
-@dataclass(frozen=True)
-class LossConfig:
-    """Equation 4, of the query head and of the point-goal network: smooth L1 of the integrated poses; and walls."""
-
-    beta: float = 1.0
-    """Below this error it is quadratic, m and rad; torch's own value, the paper names none."""
-    heading_weight: float = 1.0
-    """Of an error of one radian beside one of a metre."""
-
-    walls: float = 0.0
-    """Of each metre that a plan comes too near to walls (`tools.train.walls`); 0: these are not looked at. Heads that
-    learn by another objective leave it out."""
-    room_m: float = 0.2
-    """Nearer than this is too near, unless the expert's own plan comes as near."""
-
-    def __post_init__(self) -> None:
-        if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
-            raise ValueError("expected beta above 0 and heading_weight from 0 on, both up to 100")
-        if not (0 <= self.walls <= 100 and 0 <= self.room_m <= 1):
-            raise ValueError("expected walls from 0 to 100 and room_m from 0 to 1")
-
-    def of(self, plan: Tensor, batch: ActionBatch) -> Tensor:
-        """Of every frame's plan [B, steps, 3]: equation 4, and what it comes too near to walls."""
-        loss = action_batch.smooth_l1(plan, batch, beta=self.beta, heading_weight=self.heading_weight)
-        if not self.walls or batch.around is None:
-            return loss
-        return loss + self.walls * too_near(plan.float(), batch.target, batch.known, *batch.around, self.room_m)
+def plan_loss(config: LossConfig, plan: Tensor, batch: ActionBatch) -> Tensor:
+    """Of every frame's plan [B, steps, 3]: equation 4, and what it comes too near to walls."""
+    loss = action_batch.smooth_l1(plan, batch, beta=config.beta, heading_weight=config.heading_weight)
+    if not config.walls or batch.around is None:
+        return loss
+    return loss + config.walls * too_near(plan.float(), batch.target, batch.known, *batch.around, config.room_m)
 
 
 class Pupil(ABC):
@@ -83,7 +62,7 @@ class ExpertPupil(Pupil):
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """Equation 4 and walls; a diffusion's or a flow's own objective (paper appendix D)."""
         if self._action.config.action.head == "query":
-            return self._loss.of(self.plan(batch), batch)
+            return plan_loss(self._loss, self.plan(batch), batch)
         return action_batch.errors(self._action, batch, generator)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
@@ -112,7 +91,7 @@ class PointGoalPupil(Pupil):
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """Equation 4 and walls."""
-        return self._loss.of(self.plan(batch), batch)
+        return plan_loss(self._loss, self.plan(batch), batch)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
         """There is nothing to be looked at."""

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import torch
 
 from tools.train import checkpoint
 from tools.train.action_batch import ActionBatch, Group, collate
+from tools.train.config_imitate import ImitateConfig
 from tools.train.imitation_data import Samples
 from tools.train.imitation_pupils import Pupil
 from tools.train.job import StageJob
 from tools.train.optim import Optimiser, autocast
 from tools.train.prefetch import Ahead
-
-if TYPE_CHECKING:
-    from tools.train.imitate import ImitateConfig
 
 _DRAWS, _HELD, _NOISE = 0x1A11, 0x1A12, 0x1A13
 FILE: Final = "checkpoint.safetensors"

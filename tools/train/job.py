@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 from zlib import crc32
 
 import numpy as np
@@ -13,10 +13,8 @@ import torch
 
 from export.progress import duration
 from tools.train.distributed import SINGLE, Ranks
-
-if TYPE_CHECKING:
-    from tools.train.recipe import Recipe
-    from tools.train.run_dir import RunDir
+from tools.train.recipe import Recipe
+from tools.train.run_dir import RunDir
 
 
 class StageFailedError(Exception):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 from zlib import crc32
@@ -15,9 +15,11 @@ import torch
 from tokenizers import Tokenizer
 
 from export.model.network import TicVla
-from tools.train.anchors import WAYPOINTS_START, Anchor, DrawConfig, Drawn, Prompts, anchors_of, draw
+from tools.train.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts, anchors_of, draw
+from tools.train.config_imitate import KvConfig
+from tools.train.config_sft import DrawConfig
 from tools.train.distributed import SINGLE, Ranks
-from tools.train.drive import POLICY_DRIVER, TRACE_EVERY, Dataset
+from tools.train.drive import POLICY_DRIVER, Dataset
 from tools.train.greedy import decode
 from tools.train.job import QuietProgress, StageProgress
 from tools.train.kv_cache import FORMAT, KvCache, KvCacheError, Made, begin, write_states
@@ -26,32 +28,6 @@ from tools.train.language_batch import FrameTokens, Row, collate, frames_of, run
 SEEN_PARTS: Final = ("vision", "language")
 """Parts of the network that a semantic state depends on."""
 _TAG: Final = 0x5EE
-
-
-@dataclass(frozen=True)
-class KvConfig:
-    """Which states are kept."""
-
-    draws: int = 1
-    """States of each anchor, each with words and a `before` of its own."""
-    own_share: float = 0.0
-    """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
-    own_share_policy: float = 0.8
-    """The same along a policy's drives (DAgger): off the way the truth leads back, but on the robot nobody says it."""
-    max_new_tokens: int = 72
-    """Of its own texts."""
-    every: int = TRACE_EVERY
-    """Frames between two anchors."""
-    batch: int = 32
-    words: DrawConfig = field(default_factory=lambda: DrawConfig(waypoints_only=0.0))
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.draws <= 64 and self.batch >= 1 and self.max_new_tokens >= 0):
-            raise ValueError("expected 1 to 64 draws, a batch and max_new_tokens from 0 on")
-        if not all(0 <= share <= 1 for share in (self.own_share, self.own_share_policy)):
-            raise ValueError("expected own_share and own_share_policy from 0 to 1")
-        if self.every < 1 or self.every % TRACE_EVERY:
-            raise ValueError(f"expected every to be a multiple of {TRACE_EVERY} frames, found {self.every}")
 
 
 def parts_sha256(network: TicVla, parts: Iterable[str] = SEEN_PARTS) -> str:

@@ -6,7 +6,7 @@ for a third of a second before and after it; the waypoints are those of the very
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,28 +14,9 @@ from numpy.typing import NDArray
 from edge.geometry import SE2
 from edge.path_memory import told_point
 from edge.reasoning_text import format_waypoints
-from tools.train.anchors import AROUND, Anchor, frames_at
+from tools.train.anchors import Anchor, frames_at
+from tools.train.config_sft import AROUND, ShowConfig
 from tools.train.language_batch import Halves
-
-
-@dataclass(frozen=True)
-class ShowConfig:
-    """How much what is shown differs from what was recorded."""
-
-    shift_frames: int = AROUND
-    """The newest frame is up to so many earlier or later (0.1 s each)."""
-    jitter_frames: int = 2
-    """And the older ones up to so many beyond that, each on its own."""
-    noise: float = 0.1
-    """Standard deviation of what is added to a visual token's numbers, in units of theirs."""
-    drop: float = 0.1
-    """Share of visual tokens that are blank."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.shift_frames <= AROUND or not 0 <= self.jitter_frames <= 5:
-            raise ValueError(f"expected shift_frames from 0 to {AROUND} and jitter_frames from 0 to 5")
-        if not (0 <= self.noise <= 1 and 0 <= self.drop < 1):
-            raise ValueError("expected noise from 0 to 1 and drop from 0 to below 1")
 
 
 def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anchor:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from math import hypot
 from typing import Any, Final
 
@@ -20,35 +19,14 @@ from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from export.model.language import LanguageModel
 from tools.train import trace_words
 from tools.train.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
-from tools.train.drive import RATE_HZ
+from tools.train.config_collect import RATE_HZ
+from tools.train.config_sft import EvalConfig
 from tools.train.greedy import decode
 from tools.train.language_batch import FrameTokens, Row, collate, frames_of
 
 _TAG: Final = 0xE7A1
 _SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
 _PLACE: Final = re.compile(rf" ({'|'.join(trace_words.SIDES)}) \d+ m$", re.ASCII)
-
-
-@dataclass(frozen=True)
-class EvalConfig:
-    """How much is looked at."""
-
-    anchors: int = 384
-    """Anchors that are answered with the right words before them."""
-    epoch_anchors: int = 64
-    """The same after every epoch, for a curve."""
-    drives: int = 64
-    """Drives along which the model hears only itself."""
-    gap_s: float = 2.0
-    """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
-    max_new_tokens: int = 72
-    batch: int = 48
-
-    def __post_init__(self) -> None:
-        if min(self.anchors, self.epoch_anchors, self.drives) < 0 or self.batch < 1 or self.max_new_tokens < 1:
-            raise ValueError("expected anchors and drives from 0 on, batch and max_new_tokens from 1 on")
-        if self.gap_s < 1 or self.gap_s != round(self.gap_s):
-            raise ValueError(f"expected gap_s to be whole seconds from 1 on, found {self.gap_s}")
 
 
 class Score:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from edge.geometry import SE2
 from edge.reasoning_text import Waypoints, format_waypoints
 from tools.train.anchors import Anchor
-from tools.train.drive import TRACE_EVERY, Dataset, Drive
+from tools.train.config_collect import TRACE_EVERY
+from tools.train.drive import Dataset, Drive
 from tools.train.language_batch import FrameTokens, Halves
 
 FOLDER: Final = "tokens-mirrored"

@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.train.drive import TRACE_EVERY, Dataset, Drive
+from tools.train.config_collect import TRACE_EVERY
+from tools.train.drive import Dataset, Drive
 from tools.train.drive_frames import DriveFrames
 from tools.train.imitation_data import States
 from tools.train.kv_cache import CachedState

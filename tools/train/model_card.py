@@ -16,7 +16,7 @@ from edge.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
 from export.progress import duration
-from tools.train.chain import ADOPTED, GO_ON, retired
+from tools.train.chain import ADOPTED, GO_ON
 from tools.train.drive import file_sha256
 from tools.train.network_file import CARD, START, START_CARD, read_network, stage_weights
 from tools.train.own_drives import IMPORTED
@@ -225,7 +225,7 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
         )
     for name in ("encoder", "sft", "imitate", "rl"):
         if name in results:
-            again = retired(run_dir, name) if name in GO_ON else 0
+            again = run_dir.retired(name) if name in GO_ON else 0
             after = f" (after {again} rounds of DAgger)" if again else ""
             lines += ["", f"### {name}{after}", "", *_facts(results[name])]
     return "\n".join(lines) + "\n"

@@ -5,35 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from functools import cache
 
 import torch
 
 from tools.train import checkpoint
+from tools.train.config_optim import OptimConfig
 from tools.train.distributed import SINGLE, Ranks
-
-
-@dataclass(frozen=True)
-class OptimConfig:
-    """Numbers of an optimiser; the defaults are the paper's for the action expert (Table 8)."""
-
-    lr: float = 2e-4
-    final_lr_share: float = 0.0
-    """What of `lr` the cosine ends at."""
-    weight_decay: float = 1e-2
-    warmup_steps: int = 1000
-    clip: float = 1.0
-    beta1: float = 0.9
-    beta2: float = 0.999
-    bf16: bool = False
-    """Compute forward passes in bfloat16; weights and moments stay float32."""
-
-    def __post_init__(self) -> None:
-        if not (0 < self.lr < 1 and 0 <= self.final_lr_share <= 1 and 0 <= self.weight_decay < 1 and self.clip > 0):
-            raise ValueError("expected lr and weight_decay below 1, final_lr_share from 0 to 1 and clip above 0")
-        if not (self.warmup_steps >= 0 and 0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
-            raise ValueError("expected warmup_steps from 0 on and betas from 0 to below 1")
 
 
 class Optimiser:

@@ -1,4 +1,4 @@
-"""Drives that were recorded elsewhere, which a run learns from instead of collecting some."""
+"""Which drives a run learns from: all of its own or those of the newest round, or another data set's instead."""
 
 from __future__ import annotations
 
@@ -9,11 +9,28 @@ from typing import Any, Final
 
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import Dataset
+from tools.train.job import StageJob
 from tools.train.run_dir import RunDir, RunDirError
 
 _PARTIAL: Final = "collect.partial"
 IMPORTED: Final = "imported"
 """In the result of `collect`: the drives are not this repository's expert's."""
+
+
+def prefixes_of(round_number: int) -> tuple[str, str]:
+    """How the ids of a round's drives begin, the policy's and the expert's; rounds count from 1."""
+    return f"d{round_number}-", f"n{round_number}-"
+
+
+def drives_after(job: StageJob, stage: str) -> Dataset:
+    """The drives that a stage learns from: all, or those of the newest round (`dagger.newest_only`). Raises DriveError.
+
+    Before the first round those are the same.
+    """
+    dataset, rounds = Dataset.open(job.run_dir.stage("collect")), job.run_dir.retired(stage)
+    if rounds and job.recipe.dagger.newest_only:
+        return dataset.of(*prefixes_of(rounds))
+    return dataset
 
 
 def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:

@@ -10,32 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class PpoConfig:
-    """Table 9; where a minibatch shows that the policy has moved by 1.5 `target_kl` it moves no more in this update.
-
-    The value function learns on. 0: it may move for all epochs.
-    """
-
-    action_lr: float = 1e-5
-    value_lr: float = 1e-4
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    grad_clip: float = 0.5
-    entropy: float = 0.001
-    epochs: int = 5
-    batch: int = 64
-    target_kl: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (0 < self.action_lr < 1 and 0 < self.value_lr < 1 and 0 < self.gamma <= 1 and 0 <= self.gae_lambda <= 1):
-            raise ValueError("ppo: expected learning rates, gamma and gae_lambda within 0 to 1")
-        if not (0 < self.clip < 1 and self.grad_clip > 0 and self.entropy >= 0 and self.target_kl >= 0):
-            raise ValueError("ppo: expected clip within 0 to 1, grad_clip above 0, entropy and target_kl from 0 on")
-        if self.epochs < 1 or self.batch < 2:
-            raise ValueError("ppo: expected 1 epoch or more and batches of 2 or more")
+from tools.train.config_rl import PpoConfig
 
 
 class Learner(Protocol):

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
 
 from calib.toml_text import toml_text
 from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, with_overrides
+from export.model.config_file import config_for, config_from_dict, with_overrides
 from export.settings import MODEL_PREFIX, model_settings
 from export.typed import FieldError, build, field_types, from_text, near, plain
-
-if TYPE_CHECKING:
-    from tools.train.collect import CollectConfig
-    from tools.train.encoder import EncoderConfig
-    from tools.train.evaluate import EvaluateConfig
-    from tools.train.imitate import ImitateConfig
-    from tools.train.rl import RlConfig
-    from tools.train.sft import SftConfig
+from tools.train.config_collect import CollectConfig, DaggerConfig
+from tools.train.config_encoder import EncoderConfig
+from tools.train.config_evaluate import EvaluateConfig
+from tools.train.config_imitate import ImitateConfig
+from tools.train.config_rl import RlConfig
+from tools.train.config_sft import SftConfig
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -34,43 +31,20 @@ else:
 
 SCHEMA: Final = 1
 FOLDER: Final = Path(__file__).parent / "recipes"
-STAGES: Final[Mapping[str, tuple[str, str]]] = {
-    "collect": ("tools.train.collect", "CollectConfig"),
-    "encoder": ("tools.train.encoder", "EncoderConfig"),
-    "sft": ("tools.train.sft", "SftConfig"),
-    "imitate": ("tools.train.imitate", "ImitateConfig"),
-    "rl": ("tools.train.rl", "RlConfig"),
-    "evaluate": ("tools.train.evaluate", "EvaluateConfig"),
+STAGES: Final[Mapping[str, type]] = {
+    "collect": CollectConfig,
+    "encoder": EncoderConfig,
+    "sft": SftConfig,
+    "imitate": ImitateConfig,
+    "rl": RlConfig,
+    "evaluate": EvaluateConfig,
 }
-"""Name of a stage, the module whose `run(job)` does it, and the dataclass of its numbers there."""
+"""Name of a stage and the dataclass of its numbers."""
 MAX_RECIPE_BYTES: Final = 1 << 20
 
 
 class RecipeError(ValueError):
     """A recipe that cannot be used; one line: what, expected, found."""
-
-
-@dataclass(frozen=True)
-class DaggerConfig:
-    """Rounds in which the expert relabels the policy's own drives, after which imitation goes on."""
-
-    rounds: int = 2
-    episodes: int = 150
-    """Drives of the policy in one round."""
-    expert_episodes: int = 0
-    """New drives of the expert alone beside them, in other layouts than all before."""
-    newest_only: bool = False
-    """Learn after a round from its drives alone. It then needs nothing of what is before it but the weights."""
-    sft_rounds: int = 1
-    """The language model goes on after so many of the first rounds: an expert's drives hardly show it a missed turn."""
-    latency_mean_s: float = 2.0
-    """Mean generation time in those drives; each drive draws its own between 0 and twice this."""
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.rounds <= 100 and 1 <= self.episodes <= 100_000 and 0 <= self.latency_mean_s <= 10):
-            raise RecipeError("expected 0 to 100 rounds of 1 to 100000 episodes and a mean latency of 0 to 10 s")
-        if min(self.sft_rounds, self.expert_episodes) < 0 or self.expert_episodes > 100_000:
-            raise RecipeError("expected sft_rounds from 0 on and expert_episodes of 0 to 100000")
 
 
 @dataclass(frozen=True)
@@ -145,7 +119,7 @@ def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recip
     content: dict[str, Any] = {
         key: dict(value) if isinstance(value, Mapping) else value for key, value in tables.items()
     }
-    kinds = {name: stage_config(name) for name in STAGES} | {"dagger": DaggerConfig}
+    kinds = {**STAGES, "dagger": DaggerConfig}
     for setting in overrides:
         _set(content, kinds, setting)
     stages = {name: build(kind, filled(kind(), content.get(name, {})), f"[{name}]") for name, kind in kinds.items()}
@@ -173,16 +147,8 @@ def stage_seed(recipe: Recipe, stage: str) -> int:
     return int(np.random.default_rng((recipe.seed, crc32(stage.encode()))).integers(2**31))
 
 
-def stage_config(name: str) -> type:
-    """The dataclass of a stage's numbers, from the stage's own module."""
-    module, kind = STAGES[name]
-    return getattr(importlib.import_module(module), kind)  # type: ignore[no-any-return]
-
-
 def _model(table: object) -> TicVlaConfig:
     """A preset with changes, or every number of a network."""
-    from export.model.config_file import config_from_dict
-
     if not isinstance(table, Mapping):
         raise RecipeError("expected a table [model] with preset")
     if "preset" not in table:

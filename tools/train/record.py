@@ -16,8 +16,9 @@ from sim_hil.benchmark.expert import ExpertPolicy
 from sim_hil.benchmark.observation import Observation
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
 from sim_hil.scene import Scene
+from tools.train.config_collect import RATE_HZ, TRACE_EVERY
 from tools.train.detour import Detour, DetourDriver
-from tools.train.drive import NOISE, PICTURE_PX, PLAN_TIMES_S, RATE_HZ, TRACE_EVERY
+from tools.train.drive import NOISE, PICTURE_PX, PLAN_TIMES_S
 from tools.train.futures import chosen_future, label_futures
 from tools.train.steering import Velocity
 

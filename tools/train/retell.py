@@ -33,8 +33,10 @@ from sim_hil.layouts import LayoutError
 from sim_hil.scene import SceneObject, Vec3
 from tools.train import trace_words as words
 from tools.train.anchors import Anchor, anchors_of
+from tools.train.config_collect import TRACE_EVERY
+from tools.train.config_sft import RetellConfig
 from tools.train.distributed import SINGLE, Ranks
-from tools.train.drive import PLAN_TIMES_S, TRACE_EVERY, Dataset, Drive, Entry
+from tools.train.drive import PLAN_TIMES_S, Dataset, Drive, Entry
 from tools.train.job import QuietProgress, StageProgress
 from tools.train.progress_labels import RouteProgress
 from tools.train.scenarios import Scenario, ScenarioError, is_sound, scenario_of
@@ -56,20 +58,6 @@ _TAG: Final = 0x2E7E11
 
 class RetellError(ValueError):
     """Retellings that cannot be read; one line: what, expected, found, what to do."""
-
-
-@dataclass(frozen=True)
-class RetellConfig:
-    """How many other ways are told of each drive."""
-
-    ways: int = 0
-    """At most; 0: none."""
-    tries: int = 24
-    """Goals that are looked at for them, by chance."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.ways <= 64 or not 0 <= self.tries <= 1000:
-            raise ValueError(f"expected 0 to 64 ways and 0 to 1000 tries, found {self.ways}, {self.tries}")
 
 
 @dataclass(frozen=True)

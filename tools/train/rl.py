@@ -11,121 +11,38 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from edge.cli import write_whole
 from export.model.network import initialise
 from sim_hil.benchmark.bootstrap import paired_ci95
-from sim_hil.benchmark.latency import LatencyProfile, load_profile
 from sim_hil.benchmark.policies import robot_config
 from tools.train.action_tail import check_tail
-from tools.train.command_policy import LOG_STD_RANGE, CommandLimits
+from tools.train.command_policy import CommandLimits
+from tools.train.config_rl import RlConfig
+from tools.train.config_scenes import TASKS_PER_SCENE
 from tools.train.exported import export_artifacts
 from tools.train.job import StageFailedError, StageJob
 from tools.train.network_file import START, finish_network, is_trained, read_network, weights_before
 from tools.train.point_goal_net import build_point_goal, save_point_goal
-from tools.train.ppo import PpoConfig
+from tools.train.recipe import Recipe
 from tools.train.rl_learners import Learner, PointGoalLearner, TailLearner
 from tools.train.rl_state import ROLLOUTS, STAGE, RlError, Score, State
 from tools.train.rl_worker import RolloutOrder
 from tools.train.rollout import Rollout
-from tools.train.scenarios import KEPT_SEEDS, SHARES, TASKS_PER_SCENE
+from tools.train.scenarios import KEPT_SEEDS
 from tools.train.vector_env import drive
 
-if TYPE_CHECKING:
-    from tools.train.recipe import Recipe
-
-POLICIES: Final = ("action", "point-goal")
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 # Seeds of scenarios that no other stage draws: to learn from, to choose the best by, to say whether it is better.
 _EVALUATION_SCENES, _SCENES, _FINAL_SCENES = KEPT_SEEDS[1:]
 _EVALUATION_TASKS: Final = 2  # of one layout: more layouts tell more than more tasks in one
-_DELAYS: Final = 41
 STEPS_PER_EPISODE: Final = 300
 """As a rule: 30 s. For the plan of a run alone."""
-
-
-@dataclass(frozen=True)
-class RlConfig:
-    """Online reinforcement learning of the last layer and the head."""
-
-    policy: str = "action"
-    """What is trained: the action expert's last layer and head, or the paper's `point-goal` baseline from nothing."""
-    iterations: int = 300
-    episodes: int = 16
-    """Whole episodes of one iteration; with some 250 steps each, 4,000 steps (the paper: 1,024)."""
-    episodes_per_job: int = TASKS_PER_SCENE
-    """One layout's: a job that begins inside a layout has to draw the tasks before its own too."""
-    ppo: PpoConfig = field(default_factory=PpoConfig)
-    log_std: tuple[float, ...] = (-1.9, -1.5)
-    """Of the exploration of v and ω at the start: 0.15 m/s and 0.22 rad/s."""
-    reward_scale: float = 0.01
-    mean_delay_s: float = 5.0
-    """Times of a generation are drawn evenly from 0 to twice this (paper: some 50 environment steps on average)."""
-    delay_profile: str = ""
-    """A file of `edge-calib latency` to draw from instead."""
-    rotation: tuple[str, ...] = ("office", "hospital", "warehouse")
-    rotate_every: int = 100
-    """Iterations in one kind of scene before the next; 0: all kinds in every iteration."""
-    tasks: int = 3
-    """Tasks of each kind, all of one layout, each time with another crowd; 0: always another one."""
-    drift: str = "typical"
-    max_s: float = 90.0
-    warmup_iterations: int = 3
-    """In which the value network learns and the policy does not."""
-    imitation: float = 0.0
-    """Weight of a penalty on leaving the imitated commands; the paper has none."""
-    evaluate_every: int = 10
-    evaluate_episodes: int = 24
-    keep_margin: float = 0.06
-    """By how much more the evaluation's success must be than the best's to replace it: the best of many is luck too."""
-    fall_back: float = 0.08
-    """By how much success may drop below the best's, or collisions rise at no more success, before that one is taken up
-    again."""
-    final_episodes: int = 32
-    """On fresh scenarios, with the policy it began with and with the best; the best is kept if it is ahead there."""
-    jobs: int = 0
-    """Worker processes; 0: as many as there are cores. Changes nothing in what comes out."""
-
-    def __post_init__(self) -> None:
-        driven = (self.episodes, self.episodes_per_job, self.evaluate_episodes, self.final_episodes)
-        counts = (self.iterations, self.evaluate_every, *driven)
-        if self.policy not in POLICIES:
-            raise ValueError(f"policy {self.policy!r}: expected one of {', '.join(POLICIES)}")
-        if min(counts) < 1 or min(self.rotate_every, self.tasks, self.warmup_iterations, self.jobs) < 0:
-            raise ValueError("expected counts of 1 or more, and rotate_every, tasks, warmup_iterations, jobs from 0 on")
-        if len(self.log_std) != 2 or not all(LOG_STD_RANGE[0] <= v <= LOG_STD_RANGE[1] for v in self.log_std):
-            raise ValueError(f"log_std: expected two numbers within {LOG_STD_RANGE}, found {self.log_std}")
-        if unknown := sorted(set(self.rotation) - set(SHARES)):
-            raise ValueError(f"rotation: unknown kind {unknown[0]!r}, expected of {', '.join(SHARES)}")
-        if not self.rotation or self.drift not in ("none", "typical", "severe"):
-            raise ValueError("expected a rotation of one kind or more, and drift none, typical or severe")
-        if not (self.reward_scale > 0 and 0 <= self.mean_delay_s <= 30 and 5 <= self.max_s <= 3600):
-            raise ValueError("expected reward_scale above 0, mean_delay_s from 0 to 30 and max_s from 5 to 3600")
-        if not (self.imitation >= 0 and 0 <= self.fall_back <= 1 and 0 <= self.keep_margin <= 1):
-            raise ValueError("expected imitation from 0 on, fall_back and keep_margin from 0 to 1")
-
-    def kinds(self, iteration: int) -> dict[str, float]:
-        """Shares of the kinds of scenes that an iteration drives in."""
-        if self.rotate_every == 0:
-            return dict.fromkeys(self.rotation, 1.0)
-        return {self.rotation[(iteration // self.rotate_every) % len(self.rotation)]: 1.0}
-
-    def numbers(self, iteration: int) -> tuple[int, ...]:
-        """Scenarios that an iteration drives in, of their seed."""
-        first = iteration * self.episodes
-        return tuple(n % self.tasks if self.tasks else n for n in range(first, first + self.episodes))
-
-    def delays(self) -> LatencyProfile:
-        """Reasoning times to draw from, with how late each captures its newest frame. Raises LatencyError."""
-        if self.delay_profile:
-            return load_profile(Path(self.delay_profile))
-        times = tuple(round(float(v), 4) for v in np.linspace(0.0, 2 * self.mean_delay_s, _DELAYS))
-        return LatencyProfile("training", "drawn", times)
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:

@@ -15,7 +15,7 @@ from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.gym_env import DynaNavEnv
 from sim_hil.benchmark.world import EpisodeWorld
-from tools.train.rollout import EpisodeEnd, EpisodeSteps, goal_features
+from tools.train.rollout import Chosen, EpisodeEnd, EpisodeSteps, goal_features
 from tools.train.scenarios import Scenario
 
 CONTROL_S: Final = 0.1
@@ -24,18 +24,6 @@ STUCK_M: Final = 0.5
 """An episode is cut off when the robot has come no further than this in that time: nothing is learned from waiting."""
 
 Floats = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """What a pilot would do: the mean command (v m/s, ω rad/s), and what optimisation needs beside what was seen."""
-
-    mean: tuple[float, float]
-    queries: Floats | None = None
-    latency: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    generation: int = 0
-    speed_scale: float = 1.0
-    """Share of the limits that the runner would leave: less where the last answer is too old."""
 
 
 class Pilot(Protocol):

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from export.model.network import TicVla
 from tools.train.action_tail import freeze_all_but_tail, load_tail, now_of, padded, tail, tail_parameters
-from tools.train.command_policy import LOG_STD_RANGE, CommandLimits, arc_command, entropy, log_prob, within_limits
+from tools.train.command_policy import CommandLimits, arc_command, entropy, log_prob, within_limits
+from tools.train.config_rl import LOG_STD_RANGE
 from tools.train.gae import advantages
 from tools.train.point_goal_net import PointGoalNet
 from tools.train.rollout import GOAL_SCALE_M, Rollout

@@ -16,7 +16,7 @@ from tools.train.action_tail import now_of, prefix, semantic_of, tail
 from tools.train.async_mind import AsyncMind, Models
 from tools.train.command_policy import CommandLimits, command_mean
 from tools.train.point_goal_net import PointGoalNet
-from tools.train.rl_drive import Chosen
+from tools.train.rollout import Chosen
 
 Floats = npt.NDArray[np.float32]
 

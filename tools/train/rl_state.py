@@ -8,19 +8,16 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import torch
 
 from export.model.weights import weights_sha256
 from tools.train import checkpoint
-from tools.train.command_policy import LOG_STD_RANGE
+from tools.train.config_rl import LOG_STD_RANGE, RlConfig
 from tools.train.job import StageJob
 from tools.train.ppo import PpoOptimiser
 from tools.train.rl_learners import Learner
-
-if TYPE_CHECKING:
-    from tools.train.rl import RlConfig
 
 STAGE: Final = "rl"
 ROLLOUTS: Final = "rollouts"

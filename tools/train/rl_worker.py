@@ -26,11 +26,12 @@ from tools.train import checkpoint, rollout
 from tools.train.action_tail import check_tail, load_tail
 from tools.train.async_mind import Models
 from tools.train.command_policy import CommandLimits
+from tools.train.config_scenes import TASKS_PER_SCENE
 from tools.train.network_file import read_network
 from tools.train.point_goal_net import PointGoalNet
 from tools.train.rl_drive import DriveOptions, Pilot, drive_episode
 from tools.train.rl_pilots import PointGoalPilot, TailPilot
-from tools.train.scenarios import FIRST_SEED, TASKS_PER_SCENE, Scenario, training_episodes
+from tools.train.scenarios import FIRST_SEED, Scenario, training_episodes
 
 MODULE: Final = "tools.train.rl_worker"
 _TAG, _CROWD, _DELAYS = 0x71, 0xC0, 0xDE

@@ -9,15 +9,12 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
-
-if TYPE_CHECKING:
-    from tools.train.rl_drive import Chosen
 
 FORMAT: Final = "tic-vla-edge-rollout/1"
 GOAL_SCALE_M: Final = 10.0
@@ -45,6 +42,18 @@ class EpisodeEnd:
     reward: float
     spl: float
     time_s: float
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What a pilot would do: the mean command (v m/s, ω rad/s), and what optimisation needs beside what was seen."""
+
+    mean: tuple[float, float]
+    queries: Floats | None = None
+    latency: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    generation: int = 0
+    speed_scale: float = 1.0
+    """Share of the limits that the runner would leave: less where the last answer is too old."""
 
 
 @dataclass

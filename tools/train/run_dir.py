@@ -113,6 +113,13 @@ class RunDir:
         if lines:
             write_whole(self.log_path, "".join(json.dumps(line) + "\n" for line in lines))
 
+    def retired(self, stage: str) -> int:
+        """How often a stage was kept aside, to go on after a round of DAgger."""
+        number = 0
+        while self.begun(f"{stage}-{number}"):
+            number += 1
+        return number
+
     @property
     def recipe_path(self) -> Path:
         """Every number of the run."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot, isfinite
-from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -23,14 +22,11 @@ from sim_hil.benchmark.sights import named_landmarks, named_too_small, worst_lea
 from sim_hil.benchmark.tasks import Task, make_task, sample_task
 from sim_hil.layouts import RESERVED_BELOW, LayoutError, is_reserved
 from sim_hil.scene import Scene
-from tools.train.sites import CORRIDOR, KINDS, Site
+from tools.train.config_scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
+from tools.train.sites import Site
 
 WORDINGS: Final = 12  # of one task
 LEAST_WORDINGS: Final = 8
-TASKS_PER_SCENE: Final = 8
-SHARES: Final[Mapping[str, float]] = MappingProxyType(
-    {"hospital": 0.25, "office": 0.25, "warehouse": 0.24, "sidewalk": 0.20, CORRIDOR: 0.06}
-)
 FIRST_SEED: Final = 1_000_000  # of episodes: far above the suite's
 MAX_SEED: Final = 9_999
 KEPT_SEEDS: Final = range(9_001, 9_005)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,30 +21,27 @@ from tokenizers import Tokenizer
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train import checkpoint
-from tools.train.anchors import Anchor, DrawConfig, Prompts, anchors_of, draw, waiting
-from tools.train.chain import retired
-from tools.train.collect_config import CollectConfig
-from tools.train.dagger import drives_after
-from tools.train.drive import RATE_HZ, Dataset
+from tools.train.anchors import Anchor, Prompts, anchors_of, draw, waiting
+from tools.train.config_collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ, CollectConfig
+from tools.train.config_optim import OptimConfig
+from tools.train.config_sft import DrawConfig, SftConfig, ShowConfig
+from tools.train.drive import Dataset
 from tools.train.job import StageJob
 from tools.train.kv_build import parts_sha256
-from tools.train.language_augment import ShowConfig, disturbed, shifted
+from tools.train.language_augment import disturbed, shifted
 from tools.train.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
-from tools.train.language_eval import EvalConfig, evaluate, glance
+from tools.train.language_eval import evaluate, glance
 from tools.train.mirror import FOLDER as MIRRORED
 from tools.train.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.optim import OptimConfig, Optimiser, autocast
-from tools.train.retell import RetellConfig, Retellings
+from tools.train.optim import Optimiser, autocast
+from tools.train.own_drives import drives_after
+from tools.train.recipe import Recipe
+from tools.train.retell import Retellings
 from tools.train.tokens import TokenCache
-from tools.train.tour_config import OF_TOURS, TourConfig
 from tools.train.tours import build_tours, tour_anchors
 
-if TYPE_CHECKING:
-    from tools.train.recipe import Recipe
-
 STAGE: Final = "sft"
-PLANNED_DRIVE_S: Final = 30.0
 PLANNED_TOUR_S: Final = 45.0
 _DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
 _RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
@@ -53,49 +50,6 @@ _DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
 
 class SftError(ValueError):
     """Data or a checkpoint that cannot be learned from; one line."""
-
-
-@dataclass(frozen=True)
-class SftConfig:
-    """Supervised fine-tuning of the language model."""
-
-    epochs: int = 8
-    batch: int = 32
-    """Samples of all ranks together."""
-    words: DrawConfig = field(default_factory=DrawConfig)
-    shown: ShowConfig = field(default_factory=ShowConfig)
-    retold: RetellConfig = field(default_factory=RetellConfig)
-    """Other instructions under which every drive is shown too."""
-    tours: TourConfig = field(default_factory=TourConfig)
-    """Robots that were carried along told ways, whose words are learned beside those of the drives."""
-    tours_again: float = 0.25
-    """Share of them that is learned again, others each time, where it goes on after a round of DAgger."""
-    mirrored: float = 0.5
-    """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
-    go_on_share: float = 0.4
-    go_on_lr_share: float = 0.3
-    """Of epochs and of the learning rate, after a round of DAgger, from the weights before; 0: from the beginning."""
-    deciding: int = 2
-    """How often an anchor that decides (`tools.train.anchors`) is shown in an epoch; the others once."""
-    optim: OptimConfig = field(
-        default_factory=lambda: OptimConfig(lr=1e-3, final_lr_share=0.02, warmup_steps=200, bf16=True)
-    )
-    """The paper's 2e-5 (Table 8) is for a language model that can speak; ours begins from nothing."""
-    held_anchors: int = 512
-    """Anchors of held-out layouts whose loss is looked at after every epoch."""
-    checkpoint_steps: int = 200
-    """Steps between two checkpoints."""
-    evaluate: EvalConfig = field(default_factory=EvalConfig)
-
-    def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, self.checkpoint_steps) < 1 or self.held_anchors < 0:
-            raise ValueError("expected epochs, batch and checkpoint_steps from 1 on and held_anchors from 0 on")
-        if not (0 <= self.go_on_share <= 1 and 0 < self.go_on_lr_share <= 1):
-            raise ValueError("expected go_on_share from 0 to 1 and go_on_lr_share above 0 to 1")
-        if not 1 <= self.deciding <= 16:
-            raise ValueError(f"expected deciding to be 1 to 16, found {self.deciding}")
-        if not (0 <= self.mirrored <= 1 and 0 <= self.tours_again <= 1):
-            raise ValueError("expected mirrored and tours_again to be shares from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -220,7 +174,7 @@ def run(job: StageJob) -> dict[str, Any]:
 
 def _start(job: StageJob, config: SftConfig) -> tuple[TicVla, int, OptimConfig]:
     """The network to begin with, for how many epochs it is trained and how."""
-    rounds = retired(job.run_dir, STAGE)
+    rounds = job.run_dir.retired(STAGE)
     if not rounds or not config.go_on_share:
         return start_network(job, STAGE), config.epochs, config.optim
     path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
@@ -338,7 +292,7 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 def _tours(job: StageJob, dataset: Dataset) -> Dataset:
     """Those to learn from now, made where they are not there yet."""
     collected = job.recipe.collect or CollectConfig()
-    config, rounds = _config(job), retired(job.run_dir, STAGE)
+    config, rounds = _config(job), job.run_dir.retired(STAGE)
     job.progress.say("carrying robots about")
     tours = build_tours(
         dataset, config.tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,

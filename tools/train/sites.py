@@ -11,14 +11,11 @@ import numpy as np
 from sim_hil.benchmark.robots import robot_grid, telling_grid
 from sim_hil.benchmark.tasks import goals
 from sim_hil.benchmark.visibility import Sightlines
-from sim_hil.layouts import KINDS as LAYOUTS
 from sim_hil.layouts import generate, is_reserved
 from sim_hil.nav_grid import NavGrid
 from sim_hil.scene import Area, Scene, SceneObject, load_scene
+from tools.train.config_scenes import CORRIDOR, KINDS, OUTDOORS
 
-CORRIDOR: Final = "corridor"
-KINDS: Final = (*LAYOUTS, CORRIDOR)
-OUTDOORS: Final = frozenset(("sidewalk",))
 # What can be told apart and gone to in the demo's corridor.
 _CORRIDOR_LANDMARKS: Final = frozenset(
     ("vending machine", "bench", "water dispenser", "fire extinguisher", "cabinet", "notice board", "exit door")

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from tools.train.drive import EXPERT, NOISE, POLICY, RATE_HZ
+from tools.train.config_collect import RATE_HZ
+from tools.train.drive import EXPERT, NOISE, POLICY
 
 Velocity = tuple[float, float, float]
 

@@ -14,11 +14,12 @@ from dataclasses import asdict, replace
 from typing import Final
 
 from tools.train.anchors import Anchor, anchors_of
-from tools.train.collect_config import CollectConfig
+from tools.train.collection import Collection, fill, job_count
+from tools.train.config_collect import CollectConfig, TourConfig
+from tools.train.dataset import DatasetWriter
 from tools.train.distributed import Ranks
 from tools.train.drive import Dataset
 from tools.train.job import StageProgress
-from tools.train.tour_config import TourConfig
 
 FOLDER: Final = "tours"
 FORMAT: Final = 3
@@ -43,10 +44,6 @@ def build_tours(
     They have layouts of their own; those of a layout that the data set holds out are left out. Raises CollectError,
     DriveError, OSError, and KeyboardInterrupt when `stopped`.
     """
-    # Here: who learns without tours needs no simulator.
-    from tools.train.collection import Collection, fill, job_count
-    from tools.train.dataset import DatasetWriter
-
     folder = dataset.folder / FOLDER / _key(config, collect, seed)
     with ranks.by_first() as here:
         if here:

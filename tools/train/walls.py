@@ -18,7 +18,10 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from sim_hil.benchmark.expert import driving_of
+from sim_hil.layouts import LayoutError
 from tools.train.drive import Drive
+from tools.train.sites import Site, SiteError
 
 CELL_M: Final = 0.1
 X_M: Final = (-0.6, 5.4)
@@ -96,11 +99,6 @@ class Scenes:
 
     def along(self, drive: Drive, *, in_mirror: bool = False) -> Walls | None:
         """Those along a drive (its poses in the mirror, if it is a mirror's); None where its scene is not ours."""
-        # Here: who does not look at walls needs no simulator.
-        from sim_hil.benchmark.expert import driving_of
-        from sim_hil.layouts import LayoutError
-        from tools.train.sites import Site, SiteError
-
         about = drive.about
         key = (about.kind, about.layout_seed, about.robot)
         if key not in self._floors:

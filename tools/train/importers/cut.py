@@ -11,16 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.train.drive import (
-    EXPERT,
-    FUTURE_STEPS,
-    PICTURE_PX,
-    PLAN_TIMES_S,
-    RATE_HZ,
-    TRACE_EVERY,
-    About,
-    Drive,
-)
+from tools.train.config_collect import RATE_HZ, TRACE_EVERY
+from tools.train.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
 from tools.train.futures import driven_future
 from tools.train.importers.recording import ImportedError, Recording, Words, read_picture
 from tools.train.windows import EPISODE_S, relative

@@ -1,9 +1,14 @@
-"""The numbers of a collection of drives."""
+"""The numbers of recorded data: drives of the expert, tours, and rounds of DAgger."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
+
+RATE_HZ: Final = 10
+TRACE_EVERY: Final = 10  # frames: reasoning is written down once a second
+PLANNED_DRIVE_S: Final = 30.0
 
 
 @dataclass(frozen=True)
@@ -64,3 +69,62 @@ class CollectConfig:
             raise ValueError(f"expected wall_m from 0 to 0.3, found {self.wall_m}")
         if not 0 <= self.margin_m <= 0.5 or not 0.3 <= self.arrive_share <= 1:
             raise ValueError("expected margin_m from 0 to 0.5 and arrive_share from 0.3 to 1")
+
+
+OF_TOURS: Final = "tours: "
+"""How the lines of a budget begin that are not of drives."""
+
+
+@dataclass(frozen=True)
+class TourConfig:
+    """How many tours, and how varied. The same numbers and seed give the same tours.
+
+    But for a pixel here and there in those of a layout that was ended in between: a renderer draws what it has drawn
+    before in the order in which it first did.
+    What is called a share is the chance of each tour.
+    """
+
+    count: int = 0
+    """0: none."""
+    per_layout: int = 8
+    people_most: int = 20
+    """More people than these a scene never has: they hide what is spoken of, and take their time to be moved."""
+    stray_share: float = 0.35
+    """Tours that leave their way, as a rule for an opening near theirs, else for some other place, and come back."""
+    stray_m: float = 8.0
+    """So far they are carried to some other place at most."""
+    linger_s: float = 5.0
+    """A tour goes on for up to so long after it has arrived, half of it at least: on to the goal, where it stands."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= 1_000_000 or not 1 <= self.per_layout <= 100:
+            raise ValueError(
+                f"expected a count of 0 to 1000000 and per_layout of 1 to 100, found {self.count}, {self.per_layout}"
+            )
+        if not 0 <= self.people_most <= 200 or not 0 <= self.stray_share <= 1:
+            raise ValueError("expected people_most from 0 to 200 and stray_share from 0 to 1")
+        if not (1 <= self.stray_m <= 50 and 0 <= self.linger_s <= 60):
+            raise ValueError("expected stray_m from 1 to 50 and linger_s from 0 to 60")
+
+
+@dataclass(frozen=True)
+class DaggerConfig:
+    """Rounds in which the expert relabels the policy's own drives, after which imitation goes on."""
+
+    rounds: int = 2
+    episodes: int = 150
+    """Drives of the policy in one round."""
+    expert_episodes: int = 0
+    """New drives of the expert alone beside them, in other layouts than all before."""
+    newest_only: bool = False
+    """Learn after a round from its drives alone. It then needs nothing of what is before it but the weights."""
+    sft_rounds: int = 1
+    """The language model goes on after so many of the first rounds: an expert's drives hardly show it a missed turn."""
+    latency_mean_s: float = 2.0
+    """Mean generation time in those drives; each drive draws its own between 0 and twice this."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.rounds <= 100 and 1 <= self.episodes <= 100_000 and 0 <= self.latency_mean_s <= 10):
+            raise ValueError("expected 0 to 100 rounds of 1 to 100000 episodes and a mean latency of 0 to 10 s")
+        if min(self.sft_rounds, self.expert_episodes) < 0 or self.expert_episodes > 100_000:
+            raise ValueError("expected sft_rounds from 0 on and expert_episodes of 0 to 100000")
