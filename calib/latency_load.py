@@ -11,15 +11,17 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from edge.artifact_files import ArtifactError
+from edge.frame import fit_frame
 from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.language import ContextOverflowError, LanguageModel
 from edge.latency_profile import times_of
 from edge.manifest import Artifacts
-from edge.policy import Policy, fit_frame
-from edge.reasoning_loop import Mode, ReasoningLoop, SemanticSlot
+from edge.policy import Policy
+from edge.reasoning_loop import Mode, ReasoningLoop
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
+from edge.semantic import SemanticSlot
 from edge.warm_up import warm_up
 from export.calibration import Clip
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 SCHEMA_VERSION = 3
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
-"""Beside the manifest, which cannot list it: it signs the manifest's bytes (`edge.signature`)."""
+"""Beside the manifest, which cannot list it: it signs the manifest's bytes (`edge.trust`)."""
 MAX_MANIFEST_BYTES = 4_000_000
 HASH_BLOCK_BYTES = 1 << 20
 SEAL = "manifest_sha256"

@@ -20,13 +20,14 @@ from edge.policy import Policy
 from edge.power.monitor import Activity, PowerMonitor
 from edge.power.plan import read_power_plan
 from edge.pre_arm import PreArm
-from edge.reasoning_loop import Mode, ReasoningLoop, SemanticSlot
+from edge.reasoning_loop import Mode, ReasoningLoop
 from edge.recorder import Recorder
 from edge.release import ReleaseDelay
 from edge.ring import TokenRing
 from edge.robot_inputs import RobotInputs
 from edge.run_power import make_power_monitor
 from edge.scheduling import GiveWay, Schedule, TickActivity
+from edge.semantic import SemanticSlot
 from edge.supervisor import Supervisor
 from firmware_bridge.config import RobotConfig
 

@@ -5,26 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.frame import Frame, fit_frame
 from edge.jpeg import jpeg_refusal
-from edge.policy import fit_frame
 from firmware_bridge.unitree.client import CameraError
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One camera picture ready for the encoder, with its capture stamp and the JPEG it came from."""
-
-    stamp_ns: int
-    pixels: npt.NDArray[np.uint8]
-    """[1, px, px, 3], RGB."""
-    jpeg: bytes
 
 
 def decode_frame(jpeg: bytes, image_px: int) -> npt.NDArray[np.uint8]:

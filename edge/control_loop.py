@@ -13,20 +13,19 @@ import numpy.typing as npt
 
 from edge.arrival import ARRIVED, is_there
 from edge.back_off import BACKING_OFF, BackOff, BackOffConfig
-from edge.camera import Frame
 from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
 from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
+from edge.frame import Frame
 from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.guidance import waypoints_now
 from edge.monitors.watch import Watch, WatchConfig
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
-from edge.reasoning_loop import SemanticSlot
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
-from edge.semantic import SemanticState
+from edge.semantic import SemanticSlot, SemanticState
 from edge.stalemate import TURNING, Stalemate, StalemateConfig
 from edge.stats import Samples
 from edge.supervisor import FaultEvent, State, Supervisor, SupervisorInputs, SupervisorOutputs

@@ -34,8 +34,8 @@ from edge.graph import GraphError
 from edge.manifest import Artifacts, load_artifacts
 from edge.power.plan import PowerPlan, read_power_plan
 from edge.power.select import open_meter
-from edge.signature import STATE_DIRECTORY
 from edge.target_facts import PlanFacts, TargetFacts, plan_facts, target_facts
+from edge.trust import STATE_DIRECTORY
 from edge.unit_check import run_command
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 

@@ -20,7 +20,7 @@ from edge.cli import (
 )
 from edge.manifest import load_artifacts
 from edge.prompt import InstructionError
-from edge.signature import KeyFileError
+from edge.trust import KeyFileError
 from edge.unit_text import UnitError
 from firmware_bridge.config import ConfigError
 

@@ -22,8 +22,8 @@ from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.device_nodes import device_nodes
 from edge.manifest import Artifacts, load_artifacts
 from edge.prompt import check_instruction
-from edge.signature import STATE_DIRECTORY, Trust
 from edge.target_facts import TargetFacts, target_facts
+from edge.trust import STATE_DIRECTORY, Trust
 from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
 from edge.unit_text import UnitError
 from firmware_bridge.config import DdsConfig, load_robot_config

@@ -22,7 +22,7 @@ from edge.artifact_files import (
 from edge.external_data import ExternalDataError, external_data
 from edge.provider_options import wrong_option
 from edge.reasoning_text import WAYPOINT_TIMES_S
-from edge.signature import Trust
+from edge.trust import Trust
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")

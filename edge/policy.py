@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from typing import cast
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
@@ -19,15 +18,6 @@ from edge.scheduling import Schedule, TickActivity, run_as
 from edge.semantic import Context, SemanticState
 
 FloatArray = npt.NDArray[np.float32]
-
-
-def fit_frame(rgb: npt.NDArray[np.uint8], image_px: int) -> npt.NDArray[np.uint8]:
-    """Camera image [h, w, 3] → the encoder's [1, px, px, 3]; the whole field of view, as InternVL's single tile."""
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-        raise ValueError(f"expected a uint8 image [h, w, 3], found {rgb.dtype}{list(rgb.shape)}")
-    shrinks = rgb.shape[0] > image_px
-    resized = cv2.resize(rgb, (image_px, image_px), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-    return cast(npt.NDArray[np.uint8], resized[None])
 
 
 class Policy:

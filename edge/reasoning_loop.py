@@ -21,7 +21,7 @@ from edge.reasoning_text import parse_waypoints
 from edge.recorder import Recorder
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import REASONING_NICENESS, GiveWay, Role, enter
-from edge.semantic import Context, SemanticState
+from edge.semantic import Context, SemanticSlot, SemanticState
 from edge.stats import Samples
 from edge.sync_halt import seen_standing
 from edge.text_guide import TextGuide
@@ -65,15 +65,6 @@ class NoGuidanceError(RuntimeError):
 
 class MissedFrameError(RuntimeError):
     """There was no frame at the planned instant, so the older ones are of no use."""
-
-
-class SemanticSlot:
-    """Where the reasoning thread leaves its newest result; reading and replacing a field are single operations."""
-
-    def __init__(self) -> None:
-        self.state: SemanticState | None = None
-        self.drive_until_ns: int | None = None
-        """Until when there may be driving; None: no such limit."""
 
 
 class ReasoningLoop:

@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.camera import CameraPoller, Frame
+from edge.camera import CameraPoller
 from edge.camera_geometry import Attitude, CameraGeometry
 from edge.findings import FindingQueue
+from edge.frame import Frame
 from edge.log_records import Throttle, battery_record, odometry_record
 from edge.monitors.robot import LinkMonitor
 from edge.odometry import DriftEstimator, OdometryInputs, OdometryOutputs

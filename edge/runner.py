@@ -34,8 +34,8 @@ from edge.reasoning_loop import Mode
 from edge.recording import parts
 from edge.release import ReleaseDelayError, parse_release_delay
 from edge.session import RunSession
-from edge.signature import STATE_DIRECTORY, KeyFileError, Trust
 from edge.terminal import operator_lines
+from edge.trust import STATE_DIRECTORY, KeyFileError, Trust
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.unitree.dds import DdsError

@@ -49,3 +49,12 @@ class SemanticState:
     def motion_offset(self, T_odom_base: SE2) -> SE2:
         """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
         return self.T_odom_anchor.inverse() @ T_odom_base
+
+
+class SemanticSlot:
+    """Where the reasoning thread leaves its newest result; reading and replacing a field are single operations."""
+
+    def __init__(self) -> None:
+        self.state: SemanticState | None = None
+        self.drive_until_ns: int | None = None
+        """Until when there may be driving; None: no such limit."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.device import CUDA, OPENVINO, TENSORRT
-from edge.signature import STATE_DIRECTORY
+from edge.trust import STATE_DIRECTORY
 from edge.unit_text import Setting, UnitError, argument, bound, render, word
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"

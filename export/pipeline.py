@@ -180,7 +180,7 @@ class Pipeline:
                 "coverage": loaded.coverage.to_dict(),
             }
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
-            (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded))
+            (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded.tokenizer))
 
         key = self._key("weights", self.job.weights.fingerprint(), WEIGHTS_CODE, build)
         return self._stage("weights", key, build)

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from tokenizers import Tokenizer
 
+from edge.frame import fit_frame
 from edge.geometry import SE2, interpolate
 from edge.path_memory import way_of
-from edge.policy import fit_frame
 from edge.prompt import PromptBuilder, PromptIds
 from edge.reasoning_text import WAYPOINT_TIMES_S
 from edge.ring import EncodedFrame

@@ -35,7 +35,6 @@ from sim_hil.scene_read import (
 )
 from sim_hil.scene_table import SceneError, Table
 from sim_hil.scene_terrain import ConvexPiece, Terrain
-from sim_hil.scene_write import scene_to_toml
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -45,7 +44,7 @@ else:
 __all__ = [
     "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
     "WALL_TEXTURES", "Area", "Box", "ConvexPiece", "Floor", "Footprint", "Place", "Route", "Scene", "SceneError",
-    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names", "scene_to_toml",
+    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names",
 ]  # fmt: skip
 
 SCENES = Path(__file__).with_name("scenes")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from math import degrees, radians
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from sim_hil.scene import Scene
+from sim_hil.scene import Scene
 
 
 def scene_to_toml(scene: Scene) -> str:

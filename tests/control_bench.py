@@ -6,19 +6,18 @@ import threading
 
 import numpy as np
 
-from edge.camera import Frame
 from edge.control_loop import ControlLoop
 from edge.controller import Controller, ControllerConfig
 from edge.findings import FindingQueue
+from edge.frame import Frame
 from edge.geometry import SE2
 from edge.graph import GraphError
 from edge.monitors.semantic import SemanticConfig
 from edge.monitors.watch import Sources, Watch, WatchConfig
 from edge.pose_history import PoseHistory, StampedPose
-from edge.reasoning_loop import SemanticSlot
 from edge.reasoning_text import parse_waypoints
 from edge.ring import TokenRing
-from edge.semantic import SemanticState
+from edge.semantic import SemanticSlot, SemanticState
 from firmware_bridge.config import LimitsConfig
 from firmware_bridge.link import BridgeStatus
 

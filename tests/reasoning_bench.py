@@ -15,10 +15,11 @@ from edge.graph import CancelledError, GraphError, Interrupt
 from edge.language import Generation
 from edge.path_memory import Way
 from edge.reasoning_budget import ReasoningBudget
-from edge.reasoning_loop import ReasoningLoop, SemanticSlot
+from edge.reasoning_loop import ReasoningLoop
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import Role
+from edge.semantic import SemanticSlot
 from edge.text_guide import Known
 from edge.turn_memory import Look
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge.camera import CameraPoller, decode_frame
-from edge.policy import fit_frame
+from edge.frame import fit_frame
 from edge.visual_odometry import grey_frame
 from firmware_bridge.unitree.client import CameraError
 

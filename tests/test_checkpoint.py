@@ -249,7 +249,7 @@ def test_the_directory_brings_its_tokenizer_if_the_ids_are_the_networks(vlm: Pat
     tokenizer.save(str(vlm / "tokenizer.json"))
     loaded = load_checkpoint([vlm], CONFIG, fill_seed=0)
     assert loaded.tokenizer == (vlm / "tokenizer.json").read_bytes()
-    assert tokenizer_for(CONFIG, loaded) == loaded.tokenizer
+    assert tokenizer_for(CONFIG, loaded.tokenizer) == loaded.tokenizer
     Tokenizer(models.WordLevel(tokens | {"<IMG_CONTEXT>": 11}, unk_token="t0")).save(str(vlm / "tokenizer.json"))
     assert "<IMG_CONTEXT> is id 11, the network was built for 10" in refusal(vlm)
     (vlm / "tokenizer.json").write_text("{}", encoding="utf-8")

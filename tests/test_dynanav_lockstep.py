@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from edge.geometry import SE2
-from edge.reasoning_loop import Mode, SemanticSlot
+from edge.reasoning_loop import Mode
 from edge.ring import EncodedFrame, TokenRing
+from edge.semantic import SemanticSlot
 from sim_hil.benchmark.latency import Timing
 from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner
 from tests.reasoning_bench import KV, FakeLanguage, FakePolicy

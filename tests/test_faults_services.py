@@ -15,7 +15,7 @@ from sim_hil.faults.camera import FaultyVideoHub
 from sim_hil.faults.commands import CLEAR, FaultCommand, parse
 from sim_hil.faults.requests import SportFaults
 from sim_hil.unitree.service import Answer, Received
-from sim_hil.unitree.videohub import encode_jpeg
+from sim_hil.unitree.video_service import encode_jpeg
 
 MOVE = '{"x": 0.5, "y": 0, "z": 0}'
 ZERO = '{"x": 0, "y": 0, "z": 0}'

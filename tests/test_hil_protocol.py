@@ -25,7 +25,7 @@ from sim_hil.trace import TraceWriter
 from sim_hil.unitree.camera_process import CameraProcess, CameraProcessError
 from sim_hil.unitree.service import Received
 from sim_hil.unitree.snapshot import TornSnapshotError
-from sim_hil.unitree.videohub import ERROR_NO_IMAGE, VideoHub
+from sim_hil.unitree.video_service import ERROR_NO_IMAGE, VideoHub
 from tests.processes import GO2_SIM, REPOSITORY, Running, hil_arguments, read_trace, running, wait_for
 
 

@@ -16,8 +16,9 @@ from sim_hil.layouts.__main__ import main
 from sim_hil.layouts.check import overlaps, problems
 from sim_hil.layouts.plan import LayoutError
 from sim_hil.nav_grid import NavGrid
-from sim_hil.scene import Scene, load_scene, parse_scene, scene_to_toml
+from sim_hil.scene import Scene, load_scene, parse_scene
 from sim_hil.scene_map import draw_map, map_view
+from sim_hil.scene_write import scene_to_toml
 
 SEED = 4711
 HOLDS = {

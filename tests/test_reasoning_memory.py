@@ -13,9 +13,10 @@ from edge.instruction_memory import InstructionMemory
 from edge.path_memory import PathMemory, Way, way_of
 from edge.progress_guide import EITHER_WAY, FREE, ONWARD
 from edge.reasoning_budget import ReasoningBudget
-from edge.reasoning_loop import Mode, SemanticSlot
+from edge.reasoning_loop import Mode
 from edge.reasoning_text import Progress
 from edge.ring import EncodedFrame, TokenRing
+from edge.semantic import SemanticSlot
 from edge.text_guide import BACK, DONE
 from edge.turn_memory import LEFT, MOST_REFUSED, RIGHT, Look
 from sim_hil.benchmark.latency import Timing

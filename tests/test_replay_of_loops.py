@@ -10,20 +10,22 @@ from pathlib import Path
 
 import pytest
 
-from edge.camera import Frame, decode_frame
+from edge.camera import decode_frame
 from edge.control_loop import ControlLoop
 from edge.controller import Controller, ControllerConfig
+from edge.frame import Frame
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.log_schemas import SCHEMAS
 from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
 from edge.pose_history import PoseHistory, StampedPose
-from edge.reasoning_loop import Mode, ReasoningLoop, SemanticSlot
+from edge.reasoning_loop import Mode, ReasoningLoop
 from edge.recorder import Recorder
 from edge.recording import read_messages
 from edge.replay import main
 from edge.ring import TokenRing
+from edge.semantic import SemanticSlot
 from firmware_bridge.config import LimitsConfig
 from tests import synthetic_run
 from tests.test_log_schemas import complaints

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from edge import robot_inputs
-from edge.camera import Frame
 from edge.camera_geometry import Attitude
 from edge.faults import FAULTS
+from edge.frame import Frame
 from edge.robot_inputs import RobotInputs
 from firmware_bridge.config import load_robot_config
 from firmware_bridge.unitree import client

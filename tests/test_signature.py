@@ -15,7 +15,8 @@ import pytest
 from edge import signature
 from edge.artifact_files import ArtifactError, seal
 from edge.manifest import load_artifacts
-from edge.signature import KeyFileError, Trust, keygen, main, sign
+from edge.signature import keygen, main, sign
+from edge.trust import KeyFileError, Trust
 
 pytest.importorskip("cryptography")
 

@@ -11,9 +11,10 @@ from tokenizers import Tokenizer
 
 from edge.language import Generation
 from edge.prompt import PromptBuilder, PromptIds, Segment
-from edge.reasoning_loop import Mode, SemanticSlot
+from edge.reasoning_loop import Mode
 from edge.reasoning_text import Progress, parse_progress, parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
+from edge.semantic import SemanticSlot
 from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from export.model.config import PRESETS
 from export.model.tokenizer import NANO_TOKENIZER

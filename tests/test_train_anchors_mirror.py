@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.policy import fit_frame
+from edge.frame import fit_frame
 from edge.reasoning_text import parse_progress, parse_waypoints
 from export.model.network import build
 from tests.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset

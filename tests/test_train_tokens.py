@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 import torch
 
-from edge.policy import fit_frame
+from edge.frame import fit_frame
 from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.precision import Precision

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tokenizers import Tokenizer
 
@@ -12,9 +11,6 @@ from export.checkpoint.sources import inside
 from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
 from export.model.tokenizer import NANO_TOKENIZER
 from export.model.tokenizer_1b import TokenizerError, build_tokenizer
-
-if TYPE_CHECKING:
-    from export.checkpoint.load import LoadedCheckpoint
 
 TOKENIZER = "tokenizer.json"
 MAX_TOKENIZER_BYTES = 64 << 20
@@ -58,13 +54,13 @@ def directory_tokenizer(directory: Path, language: LanguageConfig) -> bytes | No
     return check_tokenizer(path.read_bytes(), language, f"{directory.resolve().name}/{TOKENIZER}")
 
 
-def tokenizer_for(config: TicVlaConfig, loaded: LoadedCheckpoint | None) -> bytes:
-    """tokenizer.json for the artifacts: the checkpoint's own, else the one whose ids the network has.
+def tokenizer_for(config: TicVlaConfig, own: bytes | None) -> bytes:
+    """tokenizer.json for the artifacts: the checkpoint's `own` if it has one, else the one whose ids the network has.
 
     Raises CheckpointError when the ids are neither InternVL3's nor those of preset `nano`.
     """
-    if loaded is not None and loaded.tokenizer is not None:
-        return loaded.tokenizer
+    if own is not None:
+        return own
     ids = special_ids(config.language)
     if ids == special_ids(PRESETS["nano"].language):
         return check_tokenizer(NANO_TOKENIZER.read_bytes(), config.language, NANO_TOKENIZER.name)

@@ -15,19 +15,18 @@ import numpy.typing as npt
 
 from edge.artifact_files import ArtifactError
 from edge.assembly import FRAME_MAX_AGE_MS, semantic_config
-from edge.camera import Frame
 from edge.control_loop import ControlLoop
 from edge.controller import Controller, ControllerConfig, VelocityCommand
+from edge.frame import Frame, fit_frame
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.monitors.watch import Sources, Watch, WatchConfig
 from edge.policy import Policy as Model
-from edge.policy import fit_frame
 from edge.pose_history import PoseHistory, StampedPose
-from edge.reasoning_loop import Mode, SemanticSlot
+from edge.reasoning_loop import Mode
 from edge.ring import TokenRing
-from edge.semantic import SemanticState
+from edge.semantic import SemanticSlot, SemanticState
 from edge.supervisor import Supervisor
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.config import RobotConfig

@@ -19,10 +19,10 @@ from edge.language import ContextOverflowError, Generation, LanguageModel
 from edge.path_memory import Way
 from edge.policy import Policy
 from edge.prompt import told_before
-from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_S, Mode, SemanticSlot
+from edge.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DRIVE_S, Mode
 from edge.reasoning_text import parse_waypoints
 from edge.ring import EncodedFrame, TokenRing
-from edge.semantic import SemanticState
+from edge.semantic import SemanticSlot, SemanticState
 from edge.sync_halt import seen_standing
 from edge.text_guide import NOTHING_KNOWN, Known, TextGuide
 from sim_hil.benchmark.latency import Timing

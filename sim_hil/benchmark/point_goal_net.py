@@ -14,8 +14,8 @@ import numpy as np
 import onnxruntime as ort
 
 from edge.controller import Controller, ControllerConfig, ControllerInputs
+from edge.frame import fit_frame
 from edge.geometry import SE2
-from edge.policy import fit_frame
 from firmware_bridge.config import RobotConfig
 from sim_hil.benchmark.conditions import ConditionsError
 from sim_hil.benchmark.episode import Episode

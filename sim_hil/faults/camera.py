@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sim_hil.faults.commands import CLEAR, FaultCommand, FaultCommandError, parse
 from sim_hil.unitree.service import Received, ServiceServer
-from sim_hil.unitree.videohub import VideoHub, encode_jpeg
+from sim_hil.unitree.video_service import VideoHub, encode_jpeg
 
 _HISTORY_NS: Final = 5_000_000_000
 _NOISE_LEVELS: Final = 4  # grey levels of noise in a covered or blinded picture: its pixels differ every time

@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
-from sim_hil.scene import Scene, scene_to_toml
+from sim_hil.scene import Scene
 from sim_hil.scene_map import draw_map
+from sim_hil.scene_write import scene_to_toml
 from sim_hil.textures import write_png
 
 _EXAMPLES = f"""examples:

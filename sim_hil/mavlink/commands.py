@@ -6,17 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite, isnan
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import common
 
 from sim_hil.mavlink.modes import find_mode
-from sim_hil.mavlink.telemetry import STREAMS, autopilot_version
-from sim_hil.mavlink.vehicle import ACCEPTED, DENIED, Station
+from sim_hil.mavlink.telemetry import STREAMS, Picture, Schedule, autopilot_version
+from sim_hil.mavlink.vehicle import ACCEPTED, DENIED, Station, Vehicle
 from sim_hil.mavlink.wire import Message
-
-if TYPE_CHECKING:
-    from sim_hil.mavlink.node import MavlinkNode
 
 FORCE: Final = 21196  # param2 of an arm or disarm command that overlooks checks: mavlink.io, MAV_CMD 400
 UNSUPPORTED: Final = int(common.MAV_RESULT_UNSUPPORTED)
@@ -51,10 +48,30 @@ class Command:
         return self.number == common.MAV_CMD_COMPONENT_ARM_DISARM and p1 == 0 and p2 == FORCE
 
 
-Handler = Callable[["MavlinkNode", Station, Command, float], int]
+class Commanded(Protocol):
+    """The component that commands act on."""
+
+    vehicle: Vehicle
+    schedule: Schedule
+
+    @property
+    def system(self) -> int:
+        """Its MAVLink number."""
+        ...
+
+    def send_after_ack(self, message: Message) -> None:
+        """Send what a command asks for, behind its acknowledgement."""
+        ...
+
+    def picture(self) -> Picture:
+        """What reports are made of, as of the latest reading."""
+        ...
 
 
-def _arm_disarm(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+Handler = Callable[[Commanded, Station, Command, float], int]
+
+
+def _arm_disarm(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     arm, force = command.params[:2]
     if arm not in (0, 1) or force not in (0, FORCE):
         return int(DENIED)
@@ -65,27 +82,27 @@ def _arm_disarm(node: MavlinkNode, station: Station, command: Command, now_s: fl
     return node.vehicle.disarm(station, now_s)
 
 
-def _terminate(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _terminate(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     if command.is_emergency_stop:
         return node.vehicle.emergency_stop(f"termination by station {station.system}")
     return int(DENIED)
 
 
-def _set_mode(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _set_mode(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     base, main, sub = command.params[:3]
     if not all(map(isfinite, (base, main, sub))) or not int(base) & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return node.vehicle.set_mode(station, None, now_s)
     return node.vehicle.set_mode(station, find_mode(int(main), int(sub)), now_s)
 
 
-def _set_interval(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _set_interval(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     number, interval_us = command.params[:2]
     if not (isfinite(number) and isfinite(interval_us)) or not node.vehicle.may_change(station, now_s):
         return int(DENIED)
     return int(ACCEPTED if node.schedule.set_interval(int(number), interval_us, now_s) else DENIED)
 
 
-def _get_interval(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _get_interval(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     number = command.params[0]
     interval_us = node.schedule.interval_us(int(number)) if isfinite(number) else None
     if interval_us is None:
@@ -94,12 +111,12 @@ def _get_interval(node: MavlinkNode, station: Station, command: Command, now_s: 
     return int(ACCEPTED)
 
 
-def _request(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _request(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     number = command.params[0]
     return _send(node, int(number)) if isfinite(number) else int(DENIED)
 
 
-def _send(node: MavlinkNode, number: int) -> int:
+def _send(node: Commanded, number: int) -> int:
     if number == common.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
         node.send_after_ack(autopilot_version(node.system))
     elif number in STREAMS:
@@ -109,11 +126,11 @@ def _send(node: MavlinkNode, number: int) -> int:
     return int(ACCEPTED)
 
 
-def _capabilities(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _capabilities(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     return _send(node, common.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
 
-def _home(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def _home(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     return _send(node, common.MAVLINK_MSG_ID_HOME_POSITION)
 
 
@@ -132,7 +149,7 @@ HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
 """Every other command is acknowledged as unsupported."""
 
 
-def obey(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+def obey(node: Commanded, station: Station, command: Command, now_s: float) -> int:
     """Do it; MAV_RESULT."""
     handler = HANDLERS.get(command.number)
     return UNSUPPORTED if handler is None else int(handler(node, station, command, now_s))

@@ -26,9 +26,10 @@ from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
 from edge.policy import Policy
-from edge.reasoning_loop import ReasoningLoop, SemanticSlot
+from edge.reasoning_loop import ReasoningLoop
 from edge.ring import EncodedFrame, TokenRing
 from edge.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, run_as, schedule_for
+from edge.semantic import SemanticSlot
 from edge.stats import percentiles
 from export.measure import INSTRUCTION
 

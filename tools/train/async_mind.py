@@ -14,14 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.assembly import semantic_config
+from edge.frame import fit_frame
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts
 from edge.monitors.semantic import SemanticMonitor
-from edge.policy import Policy, fit_frame
-from edge.reasoning_loop import Mode, SemanticSlot
+from edge.policy import Policy
+from edge.reasoning_loop import Mode
 from edge.ring import EncodedFrame, TokenRing
-from edge.semantic import Context, SemanticState
+from edge.semantic import Context, SemanticSlot, SemanticState
 from sim_hil.benchmark.artifacts_policy import CONTROL_PERIOD_NS, RING_S
 from sim_hil.benchmark.latency import Timing
 from sim_hil.benchmark.lockstep_reasoner import LockstepReasoner

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge.policy import fit_frame
+from edge.frame import fit_frame
 from export.model.network import TicVla
 from tools.train import checkpoint
 from tools.train.augment import augmented

@@ -15,7 +15,7 @@ from sim_hil.benchmark.jobs import RunWatcher
 from sim_hil.benchmark.latency import LatencyProfile
 from sim_hil.benchmark.results import EpisodeResult
 from sim_hil.benchmark.summary import summarise
-from sim_hil.scene import scene_to_toml
+from sim_hil.scene_write import scene_to_toml
 from tools.benchmark_runs import run_episodes
 from tools.train.config_evaluate import EvaluateConfig
 from tools.train.config_scenes import SHARES

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge.cli import write_whole
-from edge.policy import fit_frame
+from edge.frame import fit_frame
 from export.model.vision import VisionEncoder
 from tools.train.distributed import SINGLE, Ranks
 from tools.train.drive import Dataset, Drive, Entry
