@@ -1,26 +1,21 @@
-"""What `edge-hil`'s loop and a protocol's robot half agree on, and which robot speaks which protocol.
+"""What `edge-hil`'s loop and a protocol's robot half agree on; `sim_hil.front_ends` lists the protocols.
 
-A protocol is a package sim_hil/NAME whose module `front_end` has `open_front_end(simulation, options) -> FrontEnd`; the
-loop (`hil_loop.py`) knows nothing else of it. It commands the robot and reads its truth through the simulation. It
-keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that `publish` is given, so
-that it can be tested without waiting; only `received_ns` is the real monotonic clock.
+The loop (`hil_loop.py`) knows nothing else of a protocol. The robot half commands the robot and reads its truth through
+the simulation. It keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that
+`publish` is given, so that it can be tested without waiting; only `received_ns` is the real monotonic clock.
 """
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from sim_hil.scene import Scene
-    from sim_hil.simulation import Simulation
+from sim_hil.scene import Scene
 
 
 class FrontEndError(ValueError):
@@ -106,50 +101,3 @@ class FrontEnd(Protocol):
         `states`: odometry reports sent.
         """
         ...
-
-
-_FOLDER: Final = Path(__file__).parent
-Opener = Callable[["Simulation", FrontEndOptions], FrontEnd]
-
-_SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",)}
-)
-
-FLAGS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"--domain": ("unitree",), "--interface": ("unitree",), "--link": ("mavlink", "can")}
-)
-"""Options of the command line that only some protocols have."""
-
-
-def protocols() -> tuple[str, ...]:
-    """The protocols that are there."""
-    return tuple(name for name in _SPOKEN_BY if (_FOLDER / name / "front_end.py").is_file())
-
-
-def robots() -> tuple[str, ...]:
-    """The robots that speak one of them."""
-    return tuple(dict.fromkeys(robot for name in protocols() for robot in _SPOKEN_BY[name]))
-
-
-def check_combination(robot: str, protocol: str) -> None:
-    """Raises FrontEndError unless `robot` speaks `protocol`."""
-    if robot not in _SPOKEN_BY[protocol]:
-        spoken = [name for name in protocols() if robot in _SPOKEN_BY[name]]
-        raise FrontEndError(
-            f"--robot {robot} --protocol {protocol}: expected a protocol that this robot speaks, {' or '.join(spoken)}"
-        )
-
-
-def check_flags(protocol: str, given: Sequence[str]) -> None:
-    """Raises FrontEndError for the first of the `given` FLAGS that `protocol` does not have."""
-    for flag in given:
-        if protocol not in FLAGS[flag]:
-            own = " and ".join(name for name, speakers in FLAGS.items() if protocol in speakers)
-            others = " or ".join(FLAGS[flag])
-            raise FrontEndError(f"{flag}: is for --protocol {others}, {protocol} is reached by {own}; leave it out")
-
-
-def open_front_end(protocol: str, simulation: Simulation, options: FrontEndOptions) -> FrontEnd:
-    """Raises FrontEndError, or what the protocol's own library raises for an address that cannot be opened."""
-    opener: Opener = importlib.import_module(f"sim_hil.{protocol}.front_end").open_front_end
-    return opener(simulation, options)

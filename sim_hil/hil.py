@@ -21,16 +21,8 @@ from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_
 from firmware_bridge.config import ConfigError
 from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
 from sim_hil.display import check_display
-from sim_hil.front_end import (
-    FLAGS,
-    FrontEndError,
-    FrontEndOptions,
-    check_combination,
-    check_flags,
-    open_front_end,
-    protocols,
-    robots,
-)
+from sim_hil.front_end import FrontEndError, FrontEndOptions
+from sim_hil.front_ends import FLAGS, check_combination, check_flags, open_front_end, protocols, robots
 from sim_hil.hil_loop import POSE_HZ, STEPS_PER_S, HilLoop
 from sim_hil.odometry_noise import LEVELS
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names

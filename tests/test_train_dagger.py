@@ -21,7 +21,7 @@ from sim_hil.benchmark.world import EpisodeWorld
 from sim_hil.scene import load_scene
 from tests.benchmark_episodes import corridor_episode
 from tests.training_drives import dataset, drive
-from tools.train import collection, dagger, own_drives
+from tools.train import dagger, own_drives
 from tools.train.collection import CollectError, Collection
 from tools.train.config_collect import CollectConfig, DaggerConfig
 from tools.train.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
@@ -111,7 +111,7 @@ def test_other_artifacts_than_the_rounds_are_refused(artifacts: Artifacts) -> No
 def filled(monkeypatch: pytest.MonkeyPatch) -> list[Collection]:
     """What would have been collected."""
     asked: list[Collection] = []
-    monkeypatch.setattr(collection, "fill", lambda writer, what, jobs, **rest: asked.append(what))
+    monkeypatch.setattr(dagger, "fill", lambda writer, what, jobs, **rest: asked.append(what))
     return asked
 
 

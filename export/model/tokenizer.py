@@ -15,6 +15,8 @@ from pathlib import Path
 
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 
+from export.model.config import PRESETS
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -105,8 +107,6 @@ def _pieces(text: str) -> list[str]:
 
 def main() -> None:
     """Write the tokenizer file of preset `nano`."""
-    from export.model.config import PRESETS
-
     train(PRESETS["nano"].language.vocab).save(str(NANO_TOKENIZER), pretty=False)
 
 

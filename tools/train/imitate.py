@@ -17,6 +17,7 @@ import torch
 
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
+from tools.train.config_collect import PLANNED_DRIVE_S
 from tools.train.config_imitate import (
     POINT_GOAL,
     TIC_VLA,
@@ -64,8 +65,6 @@ _START: Final = 0x1A14
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """(what, how many, which measured rate) before there are drives: they are planned as for fine-tuning."""
-    from tools.train.config_collect import PLANNED_DRIVE_S
-
     config = recipe.imitate or ImitateConfig()
     seconds = round(PLANNED_DRIVE_S * recipe.collect.episodes) if recipe.collect is not None else 0
     states = [("semantic states", seconds * config.states.draws, "kv")] if config.policy == TIC_VLA else []
