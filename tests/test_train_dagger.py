@@ -29,6 +29,7 @@ from tools.train.distributed import Ranks
 from tools.train.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
 from tools.train.job import QuietProgress
 from tools.train.record import DrivePlan, Look, record
+from tools.train.run_dir import RunDir
 from tools.train.steering import Velocity
 
 # -- delays -----------------------------------------------------------------------------------------------------------
@@ -116,13 +117,9 @@ def filled(monkeypatch: pytest.MonkeyPatch) -> list[Collection]:
 
 
 def _job(folder: Path, ranks: Ranks | None = None) -> Any:
-    def stage(name: str) -> Path:
-        (folder / name).mkdir(exist_ok=True)
-        return folder / name
-
     return SimpleNamespace(
         recipe=SimpleNamespace(collect=CollectConfig(), dagger=DaggerConfig(rounds=2, episodes=30, latency_mean_s=1.5)),
-        run_dir=SimpleNamespace(stage=stage),
+        run_dir=RunDir(folder),
         seed=5,
         ranks=ranks if ranks is not None else Ranks(),
         progress=QuietProgress(),
@@ -183,7 +180,8 @@ def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
 ) -> None:
     job = _job(tmp_path)
     job.recipe.dagger = DaggerConfig(newest_only=newest_only)
-    job.run_dir.begun = lambda name: name in ("sft-0", "sft-1")
+    for number in (0, 1):
+        job.run_dir.finish(f"sft-{number}", {})
     dataset(tmp_path / "collect", *(drive(name, frames=20) for name in ("e0", "d1-0", "d2-0", "n2-0")))
     assert own_drives.drives_after(job, "sft").ids == seen
     assert len(own_drives.drives_after(job, "imitate").ids) == 4  # no round has come before it
@@ -192,7 +190,7 @@ def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
 def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
     job = _job(tmp_path)
     job.recipe.dagger = DaggerConfig(newest_only=True)
-    job.run_dir.begun = lambda name: name == "sft-0"
+    job.run_dir.finish("sft-0", {})
     dataset(tmp_path / "collect", drive("e0", frames=20))
     with pytest.raises(DriveError, match="d1- or n1-"):
         own_drives.drives_after(job, "sft")
