@@ -89,7 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CIDR",
-        help="the robot's network, may be repeated (default: that of the robot file's interface, and its peers)",
+        help="the robot's network, IPv4, at most a /16, may be repeated (default: that of the robot file's interface, and "
+        "its peers)",
     )
     parser.add_argument(
         "--arm-at-start",
@@ -238,14 +239,16 @@ def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
 def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
     """Where the robot may be: the networks given, else that of the robot file's interface and its peers.
 
-    Raises UnitError when the file alone does not tell.
+    Raises UnitError when the file alone does not tell, or when a network is too wide to filter anything.
     """
     networks: set[IPv4Network] = set()
     for text in given:
         try:
-            networks.add(IPv4Network(text))
+            network = IPv4Network(text)
         except (AddressValueError, NetmaskValueError, ValueError) as error:
             raise UnitError(f"--network {text}: {error}; expected for example 192.168.123.0/24") from None
+        units.check_network(network, f"--network {text}")
+        networks.add(network)
     if networks:
         return tuple(sorted(networks))
     own = addresses().get(dds.interface, ())
@@ -255,6 +258,8 @@ def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[],
             f"known: bring it up or give --network, e.g. 192.168.123.0/24"
         )
     networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
+    for network in networks:
+        units.check_network(network, f"the robot file's interface {dds.interface}")
     for peer in dds.peers:
         try:
             address = IPv4Address(peer)

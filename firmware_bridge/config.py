@@ -23,6 +23,7 @@ PROTOCOLS: Final = ("unitree",)
 VELOCITY_FRAMES: Final = ("odom", "body")
 OPERATOR_SUFFIX: Final = ".operator"  # of the second socket, for `edge-bridge stop`, `arm` and `status`
 SERVICE_SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")  # where `edge-install units` lets the service listen
+BRIDGE_PRIORITY: Final = 60  # real-time priority of that service; no thread of the runner may reach it
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 import firmware_bridge
-from edge.units import BRIDGE_PRIORITY
+from firmware_bridge.config import BRIDGE_PRIORITY
 from sim_hil.faults.client import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
