@@ -166,12 +166,11 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
         robot, options = _read(args)
         trust = None if args.trust is None else Trust(args.trust, args.state / "release.json")
         artifacts = load_artifacts(args.artifacts.absolute(), trust)
-        if engines.needed(artifacts):
-            # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
-            folder = args.engines or engines.default_directory(artifacts.directory)
-            engines.check(artifacts, folder)
-            artifacts = engines.with_engines(artifacts, folder)
-        session = RunSession(artifacts, robot, options, say)
+        # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
+        folder = args.engines or engines.default_directory(artifacts.directory)
+        verified = engines.check(artifacts, folder)
+        session = RunSession(engines.with_engines(artifacts, folder), robot, options, say)
+        verified.check_unchanged()
     except (ConfigError, InstructionError, ReleaseDelayError, KeyFileError) as error:
         say(str(error))
         return EXIT_BAD_INPUT
