@@ -89,8 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CIDR",
-        help="the robot's network, IPv4, at most a /16, may be repeated (default: that of the robot file's interface, and "
-        "its peers)",
+        help="the robot's network, IPv4, at most a /16, may be repeated (default: that of the robot file's interface, "
+        "and its peers)",
     )
     parser.add_argument(
         "--arm-at-start",
