@@ -20,8 +20,8 @@ from edge import engines, units
 from edge.artifact_files import ArtifactError, read_manifest, read_manifest_bytes
 from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.device_nodes import device_nodes
+from edge.instructions import check_first_instruction
 from edge.manifest import Artifacts, load_artifacts
-from edge.prompt import check_instruction
 from edge.signature import STATE_DIRECTORY, Trust
 from edge.target_facts import TargetFacts, target_facts
 from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
@@ -192,7 +192,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         artifacts=artifacts.directory,
         engines=folder,
         trust=None if args.trust is None else args.trust.resolve(),
-        instruction=check_instruction(_instruction(args)),
+        instruction=check_first_instruction(_instruction(args)),
         user=args.user,
         networks=robot_networks(robot.dds, args.network, host.addresses),
         over_loopback=robot.dds.interface == "lo",
