@@ -16,6 +16,7 @@ from edge.artifact_files import ArtifactError
 from edge.assembly import Engines, Loops, RunOptions, assemble
 from edge.command_tap import CommandTap
 from edge.deadline import Deadline
+from edge.faults import FAULTS
 from edge.findings import Finding
 from edge.graph import GraphError
 from edge.instructions import InstructionSocket
@@ -46,7 +47,7 @@ JOIN_S = 3.0
 """Of it, the most for both loops' threads: a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
 """Of it, the most for the bridge's word that the robot has been told to stand."""
-STOP_PHRASE = "a stop phrase has stopped the robot; `edge-bridge arm`, then start a new run"
+STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
 """Fault that ends a run when the instruction channel brings a stop phrase."""
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
