@@ -163,12 +163,12 @@ def test_a_file_that_differs_is_replaced_only_by_force(
     units()
     before = (tmp_path / "units" / RUNNER_UNIT).read_text()
     (tmp_path / "units" / BRIDGE_UNIT).unlink()
-    code, _ = units(text="stop")
+    code, _ = units(text="turn left")
     assert code == EXIT_BAD_INPUT
     assert "--force" in capsys.readouterr().err
     assert (tmp_path / "units" / RUNNER_UNIT).read_text() == before
     assert not (tmp_path / "units" / BRIDGE_UNIT).exists(), "nothing is written when one file is in the way"
-    assert units("--force", text="stop")[0] == EXIT_DONE
+    assert units("--force", text="turn left")[0] == EXIT_DONE
     assert (tmp_path / "units" / RUNNER_UNIT).read_text() != before
 
 
