@@ -1,4 +1,7 @@
-"""Arming: asks the bridge until the robot stands, however long an operator takes where the robot file wants one."""
+"""Arming: asks the bridge until the robot stands, however long an operator takes where the robot file wants one.
+
+And its opposite: asks the bridge until it confirms that the robot was stopped.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,10 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from firmware_bridge.client import BridgeStatus
+from firmware_bridge.client import BridgeStatus, BridgeUnavailable
 
 POLL_S: Final = 0.05
+CONFIRM_POLL_S: Final = 0.01
 ASK_AGAIN_S: Final = 1.0
 """How often the bridge is asked again while it waits for an operator."""
 ANSWER_NS: Final = 200_000_000
@@ -35,6 +39,16 @@ class Bridge(Protocol):
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
         """One command."""
+
+    def poll(self) -> BridgeStatus | None:
+        """Newest status; raises BridgeUnavailable."""
+
+
+class StoppableBridge(Protocol):
+    """What stopping needs of a `BridgeClient`."""
+
+    def stop(self) -> bool:
+        """Ask it to stop the robot."""
 
     def poll(self) -> BridgeStatus | None:
         """Newest status; raises BridgeUnavailable."""
@@ -125,6 +139,27 @@ def arm(
         if waited:
             on_wait(ARMING if not waits else WAITING if clear else f"{WAITING} ({gate.why})")
         sleep(POLL_S)
+
+
+def disarm(
+    bridge: StoppableBridge,
+    *,
+    limit_s: float,
+    clock: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+) -> bool:
+    """Stop the robot; whether the bridge confirms within `limit_s` that nothing but zero went out since."""
+    asked_ns = clock()
+    while clock() - asked_ns < limit_s * 1e9:
+        bridge.stop()  # again and again: once more changes nothing, and one may get lost in a full queue
+        try:
+            status = bridge.poll()
+        except BridgeUnavailable:
+            return False  # the end of the connection stops the robot, but nobody confirms it
+        if status is not None and status.stamp_ns >= asked_ns and status.state in ("stopped", "disarmed"):
+            return status.zero_after_stop
+        sleep(CONFIRM_POLL_S)
+    return False
 
 
 def _ask(bridge: Bridge, clock: Callable[[], int]) -> int:

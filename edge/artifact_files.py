@@ -38,12 +38,17 @@ class ArtifactError(ValueError):
 
 @dataclass(frozen=True)
 class FileIdentity:
-    """What tells whether a file is still the one that was hashed."""
+    """What tells whether a file is still the one that was hashed.
+
+    Anybody who may write a file can set its time of modification. The kernel alone sets its time of change: a write, a
+    rename and that setting itself all advance it.
+    """
 
     device: int
     inode: int
     size: int
     modified_ns: int
+    changed_ns: int
 
     @classmethod
     def of(cls, path: Path) -> FileIdentity:
@@ -53,7 +58,7 @@ class FileIdentity:
     @classmethod
     def from_stat(cls, found: os.stat_result) -> FileIdentity:
         """Identity of a file that has been looked at."""
-        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
+        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
 def seal(manifest: Mapping[str, Any]) -> dict[str, Any]:

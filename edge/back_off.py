@@ -31,9 +31,12 @@ _REACH_S: Final = 0.5  # in which it would have turned, but for the limits
 
 @dataclass(frozen=True)
 class BackOffConfig:
-    """When and how far. `vx_min_mps` is the robot file's limit: where it is 0 the robot never reverses."""
+    """When and how far. `vx_min_mps` and `wz_max_radps` are the robot file's limits: where `vx_min_mps` is 0 the robot
+    never reverses.
+    """
 
     vx_min_mps: float
+    wz_max_radps: float
     after_s: float = 2.0
     told_m: float = 0.3
     """So long it must have been told to drive on, and so far, before its not having come on is a wedge."""
@@ -55,8 +58,7 @@ class BackOffConfig:
     def __post_init__(self) -> None:
         numbers = (
             self.after_s, self.told_m, self.share, self.speed_mps, self.turn_radps, self.distance_m, self.at_most_s,
-            self.stands_s, self.further, self.vain,
-            self.apart_m,
+            self.stands_s, self.further, self.vain, self.apart_m, self.wz_max_radps,
         )  # fmt: skip
         if self.vx_min_mps > 0 or min(numbers) <= 0 or self.share >= 1:
             raise ValueError(f"back-off: expected vx_min_mps of 0 or below, share below 1, all above 0, found {self}")
@@ -166,7 +168,7 @@ class BackOff:
         if not self._trail or far_m(back.start, pose) >= back.times * config.distance_m:
             return None
         turn_rad = wrap_angle(self._behind(pose).theta_rad - pose.theta_rad)
-        most = config.turn_radps * scale
+        most = min(config.turn_radps, config.wz_max_radps) * scale
         wz_radps = min(max(turn_rad / _REACH_S, -most), most)
         return VelocityCommand(
             -speed_mps if abs(turn_rad) < _TURN_RAD else 0.0, 0.0, wz_radps, wanted.target, BACKING_OFF

@@ -102,7 +102,7 @@ class ControlLoop:
         self._policy = policy
         self._controller = controller
         limits = controller.config.limits
-        self._back_off = BackOff(BackOffConfig(limits.vx_min_mps))
+        self._back_off = BackOff(BackOffConfig(limits.vx_min_mps, limits.wz_max_radps))
         self._stalemate = Stalemate(StalemateConfig(limits.wz_max_radps))
         self._newest_frame = newest_frame
         self._history = history

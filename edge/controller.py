@@ -86,11 +86,20 @@ def target_of(trajectory: npt.NDArray[np.float32], step_s: float) -> SE2:
     return SE2(x_m, y_m, theta_rad)
 
 
-def limit_share(speed_mps: float, yaw_rate_radps: float, limits: LimitsConfig, speed_scale: float) -> float:
-    """Factor 0..1 for both velocities that keeps them within `speed_scale` of the limits: slower on the same arc."""
+def scale_to_limits(
+    speed_mps: float, yaw_rate_radps: float, limits: LimitsConfig, speed_scale: float
+) -> tuple[float, float]:
+    """Both velocities reduced by one factor until they are within `speed_scale` of the limits: slower on the same arc.
+
+    `speed_mps` is 0 or more. The result never exceeds a limit, not even by a rounding error.
+    """
     # A comparison with NaN is false: a scale that is no number gives no speed.
     scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
-    return scale / max(scale, speed_mps / limits.vx_max_mps, abs(yaw_rate_radps) / limits.wz_max_radps, 1e-9)
+    vx_max_mps, wz_max_radps = limits.vx_max_mps * scale, limits.wz_max_radps * scale
+    share = scale / max(scale, speed_mps / limits.vx_max_mps, abs(yaw_rate_radps) / limits.wz_max_radps, 1e-9)
+    # The rounded product can lie one bit above the limit that the factor was computed from.
+    wz_radps = min(max(yaw_rate_radps * share, -wz_max_radps), wz_max_radps)
+    return min(speed_mps * share, vx_max_mps), wz_radps
 
 
 def grown(value: float, goal: float, step: float) -> float:
@@ -123,9 +132,9 @@ class Controller:
         target = target_of(inputs.trajectory, self._config.step_s)
         speed, yaw_rate = arc_to(target, TARGET_TIME_S)
         limits = self._config.limits
-        share = limit_share(speed, yaw_rate, limits, inputs.speed_scale)
-        self._vx_mps = grown(self._vx_mps, speed * share, limits.accel_mps2 * elapsed_s)
-        self._wz_radps = grown(self._wz_radps, yaw_rate * share, limits.alpha_radps2 * elapsed_s)
+        vx_mps, wz_radps = scale_to_limits(speed, yaw_rate, limits, inputs.speed_scale)
+        self._vx_mps = grown(self._vx_mps, vx_mps, limits.accel_mps2 * elapsed_s)
+        self._wz_radps = grown(self._wz_radps, wz_radps, limits.alpha_radps2 * elapsed_s)
         return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
 
     def halt(self, reason: str) -> VelocityCommand:

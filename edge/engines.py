@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from edge.artifact_files import HASH_BLOCK_BYTES, ArtifactError, read_manifest
+from edge.artifact_files import HASH_BLOCK_BYTES, ArtifactError, FileIdentity, read_manifest
 from edge.cli import write_whole
 from edge.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
 from edge.graph import DTYPES, Array, Graph, GraphError
@@ -61,6 +61,22 @@ class Machine:
     providers: Callable[[], list[str]] = available_providers
     open_graph: Callable[[Artifacts, str], Runnable] = Graph
     now_ns: Callable[[], int] = time.monotonic_ns
+
+
+@dataclass(frozen=True)
+class VerifiedEngines:
+    """Engine files as they were before their hashes were compared; empty where no graph needs an engine."""
+
+    identities: Mapping[Path, Mapping[str, FileIdentity]]
+    """Files of each engine's folder."""
+
+    def check_unchanged(self) -> None:
+        """Raise EngineError if a file is not the verified one any more: call it when the graphs have been opened."""
+        for folder, before in self.identities.items():
+            after = _identities(folder)
+            for file in sorted({*before, *after}):
+                if before.get(file) != after.get(file):
+                    raise EngineError(f"{folder / file}: changed while the engines were opened; start again")
 
 
 def default_directory(artifacts: Path) -> Path:
@@ -110,12 +126,16 @@ def key_of(inputs: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
-def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None) -> None:
-    """Raise EngineError, naming the command that helps, unless every engine needed is there and this device's own."""
+def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None) -> VerifiedEngines:
+    """Verify every engine needed; returns what tells whether a file changes afterwards.
+
+    Raises EngineError, naming the command that helps, unless every engine is there and this device's own.
+    """
     machine = machine or Machine()
     names = needed(artifacts)
     if not names:
-        return
+        return VerifiedEngines({})
+    identities = {directory / name: _identities(directory / name) for name in names}
     _check_profiles(artifacts, names)
     entries = _read(directory)
     for name in names:
@@ -125,6 +145,7 @@ def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None)
                 f"{name}: {wrong}; build it first: edge-install engines --artifacts {artifacts.directory} "
                 f"--engines {directory}"
             )
+    return VerifiedEngines(identities)
 
 
 def _wrong(artifacts: Artifacts, name: str, directory: Path, entry: Any, machine: Machine) -> str | None:
@@ -177,10 +198,10 @@ def _hashes(folder: Path) -> dict[str, str]:
     return hashes
 
 
-def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
-    """What changes when a compiled file is written again, even with the same bytes."""
+def _identities(folder: Path) -> dict[str, FileIdentity]:
+    """What changes when a compiled file is written again, even with the same bytes; none without the folder."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix not in (TIMING_SUFFIX, ".profile"))
-    return {path.relative_to(folder).as_posix(): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+    return {path.relative_to(folder).as_posix(): FileIdentity.from_stat(path.stat()) for path in files}
 
 
 def build(artifacts: Artifacts, directory: Path, say: Progress, machine: Machine | None = None) -> dict[str, Any]:
@@ -244,11 +265,11 @@ def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machin
         partial.rename(final)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    stamps = _stamps(final)
+    identities = _identities(final)
     _open_and_run(artifacts, name, final, machine)
     after = _hashes(final)
-    # Compiling again may give the very same bytes: the time of writing tells.
-    rewritten = {file for file, stamp in _stamps(final).items() if stamps.get(file) != stamp}
+    # Compiling again may give the very same bytes: the file's identity tells.
+    rewritten = {file for file, found in _identities(final).items() if identities.get(file) != found}
     changed = sorted(rewritten | {file for file in {*built, *after} if built.get(file) != after.get(file)})
     if changed:
         raise EngineError(

@@ -228,6 +228,13 @@ MODEL: tuple[Fault, ...] = (
         _LOOP + "a_thousand_texts_leave_every_limit_as_it_is",
     ),
     Fault(
+        "stop-phrase", 47, Action.STOP, 300, _HERE,
+        "A stop phrase came by the instruction channel.",
+        "Find out why, then edge-bridge arm, then start a new run.",
+        "tests/test_stop_phrase_process.py::"
+        "test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_itself",
+    ),
+    Fault(
         "semantic-delay-invalid", 21, Action.ZERO, 100, _HERE,
         "The reasoning's answer carries a time that has not come yet.",
         "Restart the runner; if it stays, report it with the flight log.",

@@ -20,8 +20,8 @@ from edge import engines, units
 from edge.artifact_files import ArtifactError, read_manifest, read_manifest_bytes
 from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.device_nodes import device_nodes
+from edge.instructions import check_first_instruction
 from edge.manifest import Artifacts, load_artifacts
-from edge.prompt import check_instruction
 from edge.target_facts import TargetFacts, target_facts
 from edge.trust import STATE_DIRECTORY, Trust
 from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
@@ -89,7 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CIDR",
-        help="the robot's network, may be repeated (default: that of the robot file's interface, and its peers)",
+        help="the robot's network, IPv4, at most a /16, may be repeated (default: that of the robot file's interface, "
+        "and its peers)",
     )
     parser.add_argument(
         "--arm-at-start",
@@ -191,7 +192,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         artifacts=artifacts.directory,
         engines=folder,
         trust=None if args.trust is None else args.trust.resolve(),
-        instruction=check_instruction(_instruction(args)),
+        instruction=check_first_instruction(_instruction(args)),
         user=args.user,
         networks=robot_networks(robot.dds, args.network, host.addresses),
         over_loopback=robot.dds.interface == "lo",
@@ -238,14 +239,16 @@ def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
 def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
     """Where the robot may be: the networks given, else that of the robot file's interface and its peers.
 
-    Raises UnitError when the file alone does not tell.
+    Raises UnitError when the file alone does not tell, or when a network is too wide to filter anything.
     """
     networks: set[IPv4Network] = set()
     for text in given:
         try:
-            networks.add(IPv4Network(text))
+            network = IPv4Network(text)
         except (AddressValueError, NetmaskValueError, ValueError) as error:
             raise UnitError(f"--network {text}: {error}; expected for example 192.168.123.0/24") from None
+        units.check_network(network, f"--network {text}")
+        networks.add(network)
     if networks:
         return tuple(sorted(networks))
     own = addresses().get(dds.interface, ())
@@ -255,6 +258,8 @@ def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[],
             f"known: bring it up or give --network, e.g. 192.168.123.0/24"
         )
     networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
+    for network in networks:
+        units.check_network(network, f"the robot file's interface {dds.interface}")
     for peer in dds.peers:
         try:
             address = IPv4Address(peer)

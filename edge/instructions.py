@@ -1,4 +1,7 @@
-"""New instructions for a runner that drives: a local socket, one JSON object a datagram, never waited for."""
+"""New instructions for a runner that drives: a local socket, one JSON object a datagram, never waited for.
+
+A stop phrase is no instruction: it stops the robot, and no instruction is accepted after it.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.prompt import InstructionError, check_instruction
+from edge.stop_phrase import is_stop_phrase
 
 MAX_BYTES: Final = 4096
 """Of a datagram: 400 characters of an instruction, each in the longest form that JSON has for it."""
@@ -19,16 +23,25 @@ MAX_A_POLL: Final = 4
 
 
 class InstructionSocket:
-    """Takes `{"instruction": TEXT}` and answers `{"accepted": TEXT}` or `{"error": WHY}` to whoever has an address.
+    """Takes `{"instruction": TEXT}` and answers `{"accepted": TEXT}` or `{"error": WHY}` to a sender with an address.
+
+    The answer to a stop phrase is `{"stopped": TEXT, "confirmed": BOOL, "bridge": PATH}`.
 
     Only the user whose process this is may write to it (mode 0600). Raises OSError when the path is taken or cannot be
     made.
     """
 
-    def __init__(self, path: Path, check: Callable[[str], None] = lambda text: None) -> None:
-        """`check` raises InstructionError for a text that the model has no room for."""
+    def __init__(self, path: Path, check: Callable[[str], None], stop: Callable[[], bool], bridge: Path) -> None:
+        """`check` raises InstructionError for a text that the model has no room for.
+
+        `stop` stops the robot and returns whether its bridge, which listens at `bridge`, has confirmed it.
+        """
+        self.stopped = False
+        """Whether a stop phrase has come."""
         self._path = path
         self._check = check
+        self._stop = stop
+        self._bridge = bridge
         with contextlib.suppress(OSError):
             if stat.S_ISSOCK(path.lstat().st_mode) and not _answers(path):
                 path.unlink()  # of a runner that was killed
@@ -44,7 +57,7 @@ class InstructionSocket:
         self._socket.setblocking(False)
 
     def poll(self) -> str | None:
-        """The newest good instruction that has come since the last poll, in one line; None without one."""
+        """The newest good instruction since the last poll, in one line; None without one, and after a stop phrase."""
         newest: str | None = None
         for _ in range(MAX_A_POLL):
             try:
@@ -53,6 +66,13 @@ class InstructionSocket:
                 break
             try:
                 text = parse(data)
+                if is_stop_phrase(text):
+                    self.stopped, newest = True, None
+                    confirmed = self._stop()
+                    self._answer(sender, {"stopped": text, "confirmed": confirmed, "bridge": str(self._bridge)})
+                    continue
+                if self.stopped:
+                    raise InstructionError("a stop phrase has ended this run: `edge-bridge arm` and start a new one")
                 self._check(text)
             except InstructionError as error:
                 self._answer(sender, {"error": str(error)})
@@ -66,10 +86,18 @@ class InstructionSocket:
         self._socket.close()
         self._path.unlink(missing_ok=True)
 
-    def _answer(self, sender: str | None, answer: dict[str, str]) -> None:
+    def _answer(self, sender: str | None, answer: dict[str, str | bool]) -> None:
         if sender:  # one that is not bound has no address
             with contextlib.suppress(OSError):  # it has gone or does not read
                 self._socket.sendto(json.dumps(answer).encode(), sender)
+
+
+def check_first_instruction(text: str) -> str:
+    """The instruction to begin a run with, in one line; raises InstructionError, also for a stop phrase."""
+    line = check_instruction(text)
+    if is_stop_phrase(line):
+        raise InstructionError(f"instruction {line!r} is a stop phrase: expected what the robot is to do")
+    return line
 
 
 def parse(data: bytes) -> str:

@@ -23,6 +23,7 @@ from edge.external_data import ExternalDataError, external_data
 from edge.provider_options import wrong_option
 from edge.reasoning_text import WAYPOINT_TIMES_S
 from edge.trust import Trust
+from firmware_bridge.config import BRIDGE_PRIORITY
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
@@ -116,7 +117,7 @@ class RuntimeConfig:
     """Processor cores of the control thread; empty: the runner decides by those it finds."""
     reasoning_cores: tuple[int, ...]
     control_priority: int
-    """Real-time priority of the control thread, 1 to 99; 0: none."""
+    """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -124,8 +125,12 @@ class RuntimeConfig:
                 raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {value}")
         if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
             raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
-        if self.control_priority > 99:
-            raise ArtifactError(f"{MANIFEST_NAME}: runtime.control_priority {self.control_priority}, expected 0 to 99")
+        if self.control_priority >= BRIDGE_PRIORITY:
+            raise ArtifactError(
+                f"{MANIFEST_NAME}: runtime.control_priority {self.control_priority}, expected 0 to "
+                f"{BRIDGE_PRIORITY - 1}, below the bridge's {BRIDGE_PRIORITY}: export again with "
+                f"--set runtime.control_priority=50"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,37 @@
-"""The result of a run as JSON values (design §9: other tools rely on these keys)."""
+"""The begin and the result of a run as JSON values (design §9: other tools rely on these keys)."""
 
 from __future__ import annotations
 
 import math
 import resource
+from dataclasses import asdict
 from typing import Any
 
+from edge.assembly import RunOptions
 from edge.control_loop import ControlLoop
+from edge.manifest import Artifacts
 from edge.reasoning_loop import ReasoningLoop
 from edge.robot_inputs import RobotInputs
 from edge.stats import percentiles
 from firmware_bridge.client import BridgeStatus
+from firmware_bridge.config import RobotConfig
+
+
+def run_record(artifacts: Artifacts, robot: RobotConfig, options: RunOptions, started_ns: int) -> dict[str, Any]:
+    """What the flight log says of a run at its begin."""
+    delay = options.release_delay
+    return {
+        "instruction": options.instruction,
+        "mode": options.mode.value,
+        "artifacts": str(artifacts.directory),
+        "manifest_sha256": artifacts.manifest_sha256,
+        "robot": robot.name,
+        "release": artifacts.release,
+        "limits": asdict(robot.limits),
+        "release_delay": {"mean_s": delay.mean_s, "sd_s": delay.sd_s, "seed": delay.seed},
+        "started_ns": started_ns,
+        "tick_period_ms": artifacts.runtime.tick_period_ms,
+    }
 
 
 def run_result(

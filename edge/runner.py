@@ -27,9 +27,10 @@ from edge.cli import (
     check_result_target,
     write_result,
 )
+from edge.instructions import check_first_instruction
 from edge.manifest import load_artifacts
 from edge.odometry_calibration import CalibrationError
-from edge.prompt import InstructionError, check_instruction
+from edge.prompt import InstructionError
 from edge.reasoning_loop import Mode
 from edge.recording import parts
 from edge.release import ReleaseDelayError, parse_release_delay
@@ -46,6 +47,7 @@ EXAMPLES = """examples:
            --release-delay 2 --record flight.mcap --json - --instruction "go down the corridor"
   edge-run --artifacts out/nano --robot go2.toml --instructions say.sock --instruction "go down the corridor"
   edge-say "stop at the second door" --to say.sock      # while it drives; its own user only
+  edge-say stop --to say.sock                           # a stop phrase: stops the robot and ends the run
 
 edge-bridge must be running; where the robot file says operator_arm, the robot stays where it is until
 `edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
@@ -126,7 +128,7 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     options = RunOptions(
-        instruction=check_instruction(args.instruction),
+        instruction=check_first_instruction(args.instruction),
         mode=Mode(args.mode),
         duration_s=args.duration,
         release_delay=parse_release_delay(args.release_delay),
@@ -166,12 +168,11 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
         robot, options = _read(args)
         trust = None if args.trust is None else Trust(args.trust, args.state / "release.json")
         artifacts = load_artifacts(args.artifacts.absolute(), trust)
-        if engines.needed(artifacts):
-            # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
-            folder = args.engines or engines.default_directory(artifacts.directory)
-            engines.check(artifacts, folder)
-            artifacts = engines.with_engines(artifacts, folder)
-        session = RunSession(artifacts, robot, options, say)
+        # Before anything moves: a provider without its engine would compile for minutes while the robot drives.
+        folder = args.engines or engines.default_directory(artifacts.directory)
+        verified = engines.check(artifacts, folder)
+        session = RunSession(engines.with_engines(artifacts, folder), robot, options, say)
+        verified.check_unchanged()
     except (ConfigError, InstructionError, ReleaseDelayError, KeyFileError) as error:
         say(str(error))
         return EXIT_BAD_INPUT

@@ -7,16 +7,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import psutil
 
-from edge.arming import POLL_S, RefusedError, StoppedEarlyError, arm
+from edge.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.artifact_files import ArtifactError
 from edge.assembly import Engines, Loops, RunOptions, assemble
 from edge.command_tap import CommandTap
 from edge.deadline import Deadline
+from edge.faults import FAULTS
 from edge.findings import Finding
 from edge.graph import GraphError
 from edge.instructions import InstructionSocket
@@ -28,7 +28,7 @@ from edge.reasoning_loop import Mode
 from edge.reasoning_watch import Hang, ReasoningWatch
 from edge.recorder import Recorder, space_refusal
 from edge.robot_inputs import RobotInputs
-from edge.run_result import run_result
+from edge.run_result import run_record, run_result
 from edge.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
 from edge.service import ServiceReporter
 from edge.warm_up import check_tick, warm_up
@@ -47,6 +47,8 @@ JOIN_S = 3.0
 """Of it, the most for both loops' threads: a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
 """Of it, the most for the bridge's word that the robot has been told to stand."""
+STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
+"""Fault that ends a run when the instruction channel brings a stop phrase."""
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
 
@@ -94,18 +96,37 @@ class RunSession:
         self.hung = False
         """Whether reasoning hangs in a call that nothing but the end of the process ends."""
 
-    def _open_instructions(self) -> InstructionSocket | None:
+    def _open_instructions(self, bridge: BridgeClient) -> InstructionSocket | None:
         if self._options.instructions is None:
             return None
         try:
             return InstructionSocket(
-                self._options.instructions, lambda text: self._check_instruction(self._engines.language, text)
+                self._options.instructions,
+                check=lambda text: self._check_instruction(self._engines.language, text),
+                stop=lambda: self._stop_by_phrase(bridge),
+                bridge=self._robot.bridge.socket,
             )
         except OSError as error:
             raise RefusedError(str(error)) from error
 
     def _check_instruction(self, language: LanguageModel, text: str) -> None:
         language.check_instruction(text, len(self._artifacts.runtime.frame_offsets_s))
+
+    def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
+        """Stop the robot and end the run; whether the bridge confirms the stop within STOP_CONFIRM_S."""
+        bridge.stop()
+        if STOP_PHRASE not in self._faults:
+            self._faults.append(STOP_PHRASE)
+        self._stop_requested = True
+        self._stop.set()
+        return disarm(bridge, limit_s=STOP_CONFIRM_S)
+
+    def _take_instructions(self, told: InstructionSocket | None, loops: Loops) -> None:
+        """Hand a new instruction on to reasoning; a stop phrase has stopped the robot when this returns."""
+        instruction = None if told is None else told.poll()
+        if instruction is not None:
+            loops.reasoning.submit(instruction)
+            self._print(f"new instruction: {instruction}")
 
     def request_stop(self) -> None:
         """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
@@ -154,21 +175,21 @@ class RunSession:
                 say=self._lines.append,
                 on_tick=self._reporter.on_tick,
             )
-            told = self._open_instructions()
+            told = self._open_instructions(bridge)
             loops.power.start()
             # After everything that lives as long as the process has been made.
             refused = lock_memory()
             if refused is not None:
                 self._lines.append(refused)
             freeze_garbage()
-            loops.control.last_seq = self._arm(bridge, loops)
+            loops.control.last_seq = self._arm(bridge, loops, told)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()
             process = psutil.Process()
             process.cpu_percent()
             self._began = True
             if recorder is not None:
-                recorder.put("/run", started_ns, self._run_record(started_ns))
+                recorder.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
                 inputs.recorder = recorder
             end = self._drive(loops, inputs, bridge, told)
             status = self._halt(bridge, end)
@@ -234,8 +255,17 @@ class RunSession:
                     self._print(f"waiting for the robot: no {missing} yet, is it on?")
             time.sleep(POLL_S)
 
-    def _arm(self, bridge: BridgeClient, loops: Loops) -> int:
-        """Arm, after an operator where the robot file wants one; returns the last sequence number used."""
+    def _arm(self, bridge: BridgeClient, loops: Loops, told: InstructionSocket | None) -> int:
+        """Arm, after an operator where the robot file wants one; returns the last sequence number used.
+
+        Raises RefusedError after a stop phrase, StoppedEarlyError after another request to stop.
+        """
+
+        def stop_requested() -> bool:
+            self._take_instructions(told, loops)
+            if told is not None and told.stopped:
+                raise RefusedError(f"not armed: {STOP_PHRASE}")
+            return self._stop_requested
 
         def on_wait(text: str) -> None:
             self._reporter.on_wait(text)
@@ -249,7 +279,7 @@ class RunSession:
         return arm(
             bridge,
             limit_s=self._robot.bridge.arm_timeout_s + 2.0,
-            stop_requested=lambda: self._stop_requested,
+            stop_requested=stop_requested,
             say=self._print,
             on_wait=on_wait,
             in_the_way=in_the_way,
@@ -325,10 +355,7 @@ class RunSession:
                 says = loops.control.supervision.says
                 self._print(says or "all faults have cleared")
             self._print_lines()
-            instruction = None if told is None else told.poll()
-            if instruction is not None:
-                reasoning.submit(instruction)
-                self._print(f"new instruction: {instruction}")
+            self._take_instructions(told, loops)
             hang = watch.step(reasoning.last_progress_ns, reasoning.generation_ms.quantile(1.0), time.monotonic_ns())
             if hang is Hang.INTERRUPT:
                 self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")
@@ -365,21 +392,6 @@ class RunSession:
             self._print(f"the flight log is incomplete: {recorder.error}")
         elif dropped:
             self._print(f"the flight log lacks {dropped} records: writing was slower than the run")
-
-    def _run_record(self, started_ns: int) -> dict[str, Any]:
-        delay = self._options.release_delay
-        return {
-            "instruction": self._options.instruction,
-            "mode": self._options.mode.value,
-            "artifacts": str(self._artifacts.directory),
-            "manifest_sha256": self._artifacts.manifest_sha256,
-            "robot": self._robot.name,
-            "release": self._artifacts.release,
-            "limits": asdict(self._robot.limits),
-            "release_delay": {"mean_s": delay.mean_s, "sd_s": delay.sd_s, "seed": delay.seed},
-            "started_ns": started_ns,
-            "tick_period_ms": self._artifacts.runtime.tick_period_ms,
-        }
 
     def _print_lines(self) -> None:
         while self._lines:

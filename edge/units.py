@@ -11,13 +11,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from ipaddress import IPv4Network
+from ipaddress import IPv4Network, collapse_addresses
 from pathlib import Path
 from typing import Final
 
 from edge.device import CUDA, OPENVINO, TENSORRT
 from edge.trust import STATE_DIRECTORY
 from edge.unit_text import Setting, UnitError, argument, bound, render, word
+from firmware_bridge.config import BRIDGE_PRIORITY
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
 RUNNER_UNIT: Final = "tic-vla-edge-runner.service"
@@ -26,13 +27,13 @@ DEFAULT_USER: Final = "tic-vla-edge"
 SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
 FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
 """systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
-BRIDGE_PRIORITY: Final = 60
-"""Above every priority that a target may give the control thread by default (50): the stop comes first."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
 """Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
 MULTICAST: Final = IPv4Network("239.255.0.1/32")
 """Where DDS participants announce themselves (RTPS 2.5, section 9.6.1.4.1)."""
+WIDEST_PREFIX: Final = 16
+"""Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Folders that a hardened service does not see: what it needs from there is shown to it, nothing else."""
 
@@ -92,6 +93,8 @@ class ServiceInputs:
             raise UnitError(f"--user {self.user}: expected the name of an ordinary user, such as {DEFAULT_USER}")
         if not self.networks:
             raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
+        for network in collapse_addresses(self.networks):
+            check_network(network, "networks")
         if (self.memory_bytes is not None and self.memory_bytes <= 0) or not 0 <= self.control_priority <= 99:
             raise UnitError(
                 f"memory {self.memory_bytes} bytes, priority {self.control_priority}: expected > 0, 0 to 99"
@@ -101,6 +104,15 @@ class ServiceInputs:
                 f"the target's control_priority {self.control_priority} must be below the bridge's {BRIDGE_PRIORITY}: "
                 f"export again with --set runtime.control_priority=50"
             )
+
+
+def check_network(network: IPv4Network, source: str) -> None:
+    """Raise UnitError for a network so wide that the filter would mean nothing; loopback never leaves the machine."""
+    if network.prefixlen < WIDEST_PREFIX and not network.is_loopback:
+        raise UnitError(
+            f"{source}: {network} has {network.num_addresses} addresses, expected a prefix of /{WIDEST_PREFIX} or "
+            f"longer: give the robot's own network with --network, e.g. 192.168.123.0/24"
+        )
 
 
 def bridge_unit(inputs: ServiceInputs) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from export.precision import PRECISIONS, Precision, block_size
 from export.typed import near
+from firmware_bridge.config import BRIDGE_PRIORITY
 
 MODELLED, MEASURED = "modelled", "measured"
 FORMS = ("fused", "plain")
@@ -307,7 +308,7 @@ class RuntimePolicy:
     """Processor cores of the control thread; empty: the runner decides by those it finds."""
     reasoning_cores: tuple[int, ...] = ()
     control_priority: int = 50
-    """Real-time priority of the control thread, 1 to 99; 0: none. The bridge's is above it."""
+    """Real-time priority of the control thread, 1 to 59; 0: none. The bridge's is above it."""
 
     def __post_init__(self) -> None:
         for name, most in RUNTIME_MOST.items():
@@ -322,7 +323,11 @@ class RuntimePolicy:
             _require(all(0 <= core < MAX_CORES for core in cores), f"{name} {list(cores)} must be 0 to {MAX_CORES - 1}")
         both = sorted(set(self.control_cores) & set(self.reasoning_cores))
         _require(not both, f"cores {both} are in control_cores and in reasoning_cores")
-        _require(0 <= self.control_priority <= 99, f"control_priority {self.control_priority} must be 0 to 99")
+        _require(
+            0 <= self.control_priority < BRIDGE_PRIORITY,
+            f"control_priority {self.control_priority} must be 0 to {BRIDGE_PRIORITY - 1}, below the bridge's "
+            f"{BRIDGE_PRIORITY}",
+        )
         _require(0 < self.max_delay_s <= 600, f"max_delay_s {self.max_delay_s} must be 0 to 600 s")
 
 

@@ -6,6 +6,7 @@ and `go2.toml` only the `[dds]` addresses differ.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -20,9 +21,24 @@ else:
     import tomli as tomllib
 
 PROTOCOLS: Final = ("unitree",)
+# Largest magnitude of each limit by protocol: with people nearby, and with safety.above_walking_speed. The second value
+# of each velocity is the documented range of a Go2's Move (protocol facts, "Move"). A Go2's accelerations are not
+# documented: 8 m/s² needs a friction coefficient of 0.8, and 20 rad/s² reaches the full yaw rate in 0.2 s. The first
+# values are our choice: 1.5 m/s is a brisk human walk.
+FASTEST: Final[dict[str, dict[str, tuple[float, float]]]] = {
+    "unitree": {
+        "vx_min_mps": (1.0, 2.5),
+        "vx_max_mps": (1.5, 3.8),
+        "vy_max_mps": (0.5, 1.0),
+        "wz_max_radps": (2.0, 4.0),
+        "accel_mps2": (4.0, 8.0),
+        "alpha_radps2": (10.0, 20.0),
+    }
+}
 VELOCITY_FRAMES: Final = ("odom", "body")
 OPERATOR_SUFFIX: Final = ".operator"  # of the second socket, for `edge-bridge stop`, `arm` and `status`
 SERVICE_SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")  # where `edge-install units` lets the service listen
+BRIDGE_PRIORITY: Final = 60  # real-time priority of that service; no thread of the runner may reach it
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
 
 
@@ -33,6 +49,11 @@ class ConfigError(ValueError):
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ConfigError(message)
+
+
+def _speed_hint(key: str, value: float) -> str:
+    """The end of a complaint about a speed that is too high: what the value is if it was given in km/h."""
+    return f"; if it is in km/h, write {value / 3.6:.2f}" if key.endswith("_mps") and abs(value) > 2 else ""
 
 
 def _within(low: float, high: float, default: Any = MISSING, *, above: bool = False) -> Any:
@@ -49,7 +70,7 @@ class _Section:
             (low, high, above), value = each.metadata["range"], getattr(self, each.name)
             inside = low <= value <= high and not (above and value == low)
             key = f"{type(self).__name__.removesuffix('Config').lower()}.{each.name}"
-            _require(inside, f"{key}: expected {low:g}..{high:g}, found {value}")
+            _require(inside, f"{key}: expected {low:g}..{high:g}, found {value}{_speed_hint(each.name, value)}")
 
 
 @dataclass(frozen=True)
@@ -93,7 +114,8 @@ class SafetyConfig(_Section):
     `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
     reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
     `remote_deadband`: share of a stick's travel that is not yet a hand on it. `operator_arm`: every arming needs an
-    operator's `edge-bridge arm` before it.
+    operator's `edge-bridge arm` before it. `above_walking_speed`: permits limits above those that FASTEST has for
+    people nearby.
     """
 
     sport_version: str = "1.0.0.1"
@@ -103,6 +125,7 @@ class SafetyConfig(_Section):
     remote_deadband: float = _within(0.01, 0.5, 0.1)
     estop_file: Path | None = None
     operator_arm: bool = False
+    above_walking_speed: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -182,6 +205,18 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         _require(self.protocol in PROTOCOLS, f"protocol: expected one of {PROTOCOLS}, found {self.protocol!r}")
+        for key, (walking, fastest) in FASTEST[self.protocol].items():
+            value: float = getattr(self.limits, key)
+            permitted = fastest if self.safety.above_walking_speed else walking
+            if abs(value) > permitted:
+                advice = "lower it"
+                if abs(value) <= fastest:
+                    advice += (
+                        f", or write safety.above_walking_speed = true to permit {math.copysign(fastest, value):g}"
+                    )
+                expected = f"{math.copysign(permitted, value):g} at most"
+                hint = _speed_hint(key, value)
+                raise ConfigError(f"limits.{key}: expected {expected}, found {value}; {advice}{hint}")
 
 
 _SECTIONS: Final = {kind.__name__.removesuffix("Config").lower(): kind for kind in _Section.__subclasses__()}

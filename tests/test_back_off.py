@@ -7,14 +7,14 @@ from dataclasses import replace
 from math import hypot
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.back_off import BACKING_OFF, BackOff, BackOffConfig
 from edge.controller import VelocityCommand
 from edge.geometry import SE2
 
-CONFIG = BackOffConfig(vx_min_mps=-0.4)
+CONFIG = BackOffConfig(vx_min_mps=-0.4, wz_max_radps=1.0)
 TICK_NS = 100_000_000
 ON = VelocityCommand(0.4, 0.0, 0.2, SE2(0.4, 0.0, 0.0), "ok")
 Moves = Callable[[SE2, VelocityCommand], SE2]
@@ -200,9 +200,29 @@ def test_it_keeps_to_the_share_of_speed_that_the_supervisor_leaves() -> None:
     assert run.go(1, STRAIGHT, speed_scale=float("nan")) is STRAIGHT
 
 
+@settings(derandomize=True)
+@given(st.floats(0.01, 1.0), st.floats(-0.8, -0.01), st.floats(0.01, 1.0))
+def test_the_way_back_never_leaves_the_robot_files_limits(
+    wz_max_radps: float, vx_min_mps: float, speed_scale: float
+) -> None:
+    def corner(pose: SE2, command: VelocityCommand) -> SE2:
+        return pose if pose.y_m > 0.25 and command.vx_mps > 0 else glide(pose, command)
+
+    run, turning = (
+        Run(corner, replace(CONFIG, wz_max_radps=wz_max_radps, vx_min_mps=vx_min_mps)),
+        replace(ON, vx_mps=0.3, wz_radps=0.6),
+    )
+    for _ in range(120):
+        command = run.go(1, turning, speed_scale)
+        if command.reason == BACKING_OFF:
+            assert vx_min_mps * speed_scale <= command.vx_mps <= 0.0
+            assert abs(command.wz_radps) <= wz_max_radps * speed_scale
+    assert BACKING_OFF in run.said
+
+
 def test_a_robot_that_may_not_reverse_never_does() -> None:
-    assert set(held(BackOffConfig(vx_min_mps=0.0)).said) == {"ok"}
-    run = held(BackOffConfig(vx_min_mps=-0.05))
+    assert set(held(replace(CONFIG, vx_min_mps=0.0)).said) == {"ok"}
+    run = held(replace(CONFIG, vx_min_mps=-0.05))
     assert -0.05 <= run.go(1, STRAIGHT).vx_mps <= 0.0
 
 

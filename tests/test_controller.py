@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from edge.controller import Controller, ControllerConfig, ControllerInputs, arc_to
+from edge.controller import Controller, ControllerConfig, ControllerInputs, arc_to, scale_to_limits
 from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 
@@ -82,6 +82,7 @@ def test_a_plan_that_stays_in_place_only_turns() -> None:
 finite = st.floats(-1e6, 1e6, width=32)
 
 
+@settings(derandomize=True, max_examples=500)
 @given(
     st.lists(st.tuples(finite, finite, finite), min_size=30, max_size=30), st.lists(st.integers(0, 10**9), max_size=5)
 )
@@ -94,6 +95,24 @@ def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], 
         assert LIMITS.vx_min_mps <= command.vx_mps <= LIMITS.vx_max_mps
         assert abs(command.wz_radps) <= LIMITS.wz_max_radps
         assert command.vy_mps == 0.0
+
+
+@settings(derandomize=True, max_examples=2000)
+@given(
+    st.floats(0.0, 1e6),
+    st.floats(-1e6, 1e6),
+    st.floats(0.01, 3.8),
+    st.floats(0.01, 4.0),
+    st.floats(1e-6, 1.0),
+)
+@example(speed=3.2254540894089683, yaw_rate=0.0, vx_max_mps=0.8, wz_max_radps=1.0, speed_scale=1.0)
+def test_no_velocity_leaves_a_limit_by_a_single_bit(
+    speed: float, yaw_rate: float, vx_max_mps: float, wz_max_radps: float, speed_scale: float
+) -> None:
+    limits = replace(LIMITS, vx_max_mps=vx_max_mps, wz_max_radps=wz_max_radps)
+    vx_mps, wz_radps = scale_to_limits(speed, yaw_rate, limits, speed_scale)
+    assert 0.0 <= vx_mps <= vx_max_mps * speed_scale
+    assert abs(wz_radps) <= wz_max_radps * speed_scale
 
 
 def test_speed_rises_no_faster_than_the_slew_limit() -> None:

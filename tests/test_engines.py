@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -123,8 +124,44 @@ def test_only_graphs_of_a_provider_that_compiles_need_an_engine(orin: Artifacts,
     assert needed(artifacts) == []
 
 
+def engine_file(engines: Path) -> Path:
+    return next((engines / "vision_encoder").glob("*.engine"))
+
+
+def test_an_engine_that_stays_is_accepted_after_it_was_opened(orin: Artifacts, engines: Path) -> None:
+    fake = FakeTensorRt()
+    build(orin, engines, silent, fake.machine())
+    check(orin, engines, fake.machine()).check_unchanged()
+
+
+def test_an_engine_rewritten_after_its_hash_was_checked_with_its_time_restored_is_refused(
+    orin: Artifacts, engines: Path
+) -> None:
+    fake = FakeTensorRt()
+    build(orin, engines, silent, fake.machine())
+    verified, path = check(orin, engines, fake.machine()), engine_file(engines)
+    before = path.stat()
+    path.write_bytes(bytes(before.st_size))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(EngineError, match=r"\.engine: changed while"):
+        verified.check_unchanged()
+
+
+def test_an_engine_swapped_by_renames_while_it_was_opened_is_refused_although_the_first_is_back(
+    orin: Artifacts, engines: Path, tmp_path: Path
+) -> None:
+    fake = FakeTensorRt()
+    build(orin, engines, silent, fake.machine())
+    verified, path = check(orin, engines, fake.machine()), engine_file(engines)
+    aside = path.rename(tmp_path / "aside")
+    path.write_bytes(b"another engine")
+    aside.replace(path)
+    with pytest.raises(EngineError, match=r"\.engine: changed while"):
+        verified.check_unchanged()
+
+
 def test_nothing_is_asked_of_artifacts_without_engines(artifacts: Artifacts, engines: Path) -> None:
-    check(artifacts, engines)
+    check(artifacts, engines).check_unchanged()
     assert build(artifacts, engines, silent) == {}
 
 

@@ -163,12 +163,12 @@ def test_a_file_that_differs_is_replaced_only_by_force(
     units()
     before = (tmp_path / "units" / RUNNER_UNIT).read_text()
     (tmp_path / "units" / BRIDGE_UNIT).unlink()
-    code, _ = units(text="stop")
+    code, _ = units(text="turn left")
     assert code == EXIT_BAD_INPUT
     assert "--force" in capsys.readouterr().err
     assert (tmp_path / "units" / RUNNER_UNIT).read_text() == before
     assert not (tmp_path / "units" / BRIDGE_UNIT).exists(), "nothing is written when one file is in the way"
-    assert units("--force", text="stop")[0] == EXIT_DONE
+    assert units("--force", text="turn left")[0] == EXIT_DONE
     assert (tmp_path / "units" / RUNNER_UNIT).read_text() != before
 
 
@@ -308,6 +308,36 @@ def test_a_peer_outside_of_it_is_let_through_too() -> None:
 
 def test_a_network_that_is_given_replaces_what_was_found() -> None:
     assert networks(DdsConfig(0, "wlan0", ("robot.local",)), "10.1.0.0/30") == ["10.1.0.0/30"]
+
+
+@pytest.mark.parametrize("network", ["0.0.0.0/0", "0.0.0.0/1", "192.0.0.0/8", "10.0.0.0/15", "::/0", "fe80::/64"])
+def test_a_network_that_would_let_everything_through_is_refused_in_one_line(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str], network: str
+) -> None:
+    assert units("--network", "192.168.123.0/24", "--network", network) == (EXIT_BAD_INPUT, None)
+    error = capsys.readouterr().err
+    assert f"--network {network}: " in error and "expected" in error and error.count("\n") == 1
+    assert not (tmp_path / "units").exists()
+
+
+def test_a_wide_network_of_the_robot_files_interface_has_to_be_narrowed() -> None:
+    with pytest.raises(UnitError, match=r"eth0.*10\.0\.0\.0/8.*--network"):
+        robot_networks(DdsConfig(0, "eth0"), (), lambda: {"eth0": [("10.1.2.3", "255.0.0.0")]})
+
+
+def test_the_loopback_network_never_leaves_the_machine_and_may_be_wide() -> None:
+    assert networks(DdsConfig(0, "eth0"), "127.0.0.0/8") == ["127.0.0.0/8"]
+
+
+def test_artifacts_whose_runner_would_run_before_the_bridge_are_refused(
+    units: Units, artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "artifacts"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["runtime"]["control_priority"] = 60
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    assert units(artifacts=copy) == (EXIT_REFUSED, None)
+    assert "control_priority 60, expected 0 to 59, below the bridge's 60" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +22,13 @@ def refuse_long(text: str) -> None:
         raise InstructionError("too long for the model")
 
 
+BRIDGE = Path("/nowhere/bridge.sock")
+
+
+def open_socket(path: Path, stop: Callable[[], bool] = lambda: True) -> InstructionSocket:
+    return InstructionSocket(path, refuse_long, stop, BRIDGE)
+
+
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "say"
@@ -29,7 +36,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def told(path: Path) -> Iterator[InstructionSocket]:
-    one = InstructionSocket(path, refuse_long)
+    one = open_socket(path)
     yield one
     one.close()
 
@@ -80,24 +87,24 @@ def test_markup_of_the_prompt_stays_text() -> None:
 
 def test_a_path_that_somebody_holds_is_refused(told: InstructionSocket, path: Path) -> None:
     with pytest.raises(OSError, match="expected a free path"):
-        InstructionSocket(path)
+        open_socket(path)
 
 
 def test_what_a_killed_runner_left_is_taken_over(path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))
-    InstructionSocket(path).close()
+    open_socket(path).close()
 
 
 def test_a_file_of_somebody_is_left_alone(path: Path) -> None:
     path.write_text("mine", encoding="utf-8")
     with pytest.raises(OSError, match="expected a free path"):
-        InstructionSocket(path)
+        open_socket(path)
     assert path.read_text(encoding="utf-8") == "mine"
 
 
 def test_closed_it_leaves_nothing(path: Path) -> None:
-    InstructionSocket(path).close()
+    open_socket(path).close()
     assert not path.exists()
 
 
@@ -108,7 +115,7 @@ def runner(path: Path) -> Iterator[list[str]]:
     end = threading.Event()
 
     def poll() -> None:
-        one = InstructionSocket(path, refuse_long)
+        one = open_socket(path)
         while not end.is_set():
             text = one.poll()
             heard.extend([] if text is None else [text])

@@ -159,6 +159,7 @@ def test_widths_that_do_not_fit_one_another_are_refused(copy: Path) -> None:
         {"frame_offsets_s": [1e5]},
         {"control_cores": 3},
         {"reasoning_cores": [-1]},
+        {"control_priority": 60},  # the bridge's
         {"control_priority": 100},
         {"max_context": 0},
         {"max_new_tokens": -1},
@@ -295,6 +296,30 @@ def test_a_data_file_that_was_replaced_after_its_hash_was_checked_is_refused(map
     other.replace(mapped_copy / DATA)
     with pytest.raises(ArtifactError, match=rf"{DATA}: changed while"):
         Graph(artifacts, "vision_encoder", threads=1)
+
+
+def test_a_data_file_rewritten_in_place_with_its_time_of_writing_restored_is_refused(mapped_copy: Path) -> None:
+    artifacts, path = load_artifacts(mapped_copy), mapped_copy / DATA
+    before, data = path.stat(), bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    with path.open("r+b") as file:
+        file.write(data)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    after = path.stat()
+    assert (after.st_ino, after.st_size, after.st_mtime_ns) == (before.st_ino, before.st_size, before.st_mtime_ns)
+    with pytest.raises(ArtifactError, match=rf"{DATA}: changed while"):
+        Graph(artifacts, "vision_encoder", threads=1)
+
+
+def test_a_data_file_swapped_by_renames_while_it_was_opened_is_refused_although_the_first_is_back(
+    mapped_copy: Path,
+) -> None:
+    artifacts, path = load_artifacts(mapped_copy), mapped_copy / DATA
+    aside = path.rename(mapped_copy.parent / "aside")
+    path.write_bytes(bytes(aside.stat().st_size))  # what a session would be opened on
+    aside.replace(path)
+    with pytest.raises(ArtifactError, match=rf"{DATA}: changed while"):
+        artifacts.check_unchanged([DATA])
 
 
 def test_a_data_file_with_a_second_name_is_refused(mapped_copy: Path, tmp_path: Path) -> None:

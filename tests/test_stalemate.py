@@ -71,7 +71,7 @@ def test_it_turns_the_short_way_within_the_limits(bearing_rad: float, wz_max_rad
     run = Run(far, StalemateConfig(wz_max_radps=wz_max_radps))
     run.go(80, speed_scale=0.5)
     turned = [rate for rate, reason in zip(run.rates, run.said, strict=True) if reason == TURNING]
-    assert all(abs(rate) <= min(0.5, wz_max_radps) * 0.5 + 1e-9 and rate * bearing_rad >= 0 for rate in turned)
+    assert all(abs(rate) <= min(0.5, wz_max_radps) * 0.5 and rate * bearing_rad >= 0 for rate in turned)
     assert bool(turned) == (abs(bearing_rad) >= CONFIG.aside_rad)
 
 

@@ -123,7 +123,11 @@ def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
         (lambda t: t["runtime"].update(prefill_chunk_tokens=99999999), "tokens 99999999 must be 1 to 8192"),
         (lambda t: t["runtime"].update(max_new_tokens=8193), "max_new_tokens 8193 must be 1 to 8192"),
         (lambda t: t["runtime"].update(tick_period_ms=0), "tick_period_ms 0 must be 1 to 60000"),
-        (lambda t: t["runtime"].update(control_priority=100), "control_priority 100 must be 0 to 99"),
+        (lambda t: t["runtime"].update(control_priority=100), "control_priority 100 must be 0 to 59"),
+        (
+            lambda t: t["runtime"].update(control_priority=60),
+            "control_priority 60 must be 0 to 59, below the bridge's 60",
+        ),
         (lambda t: t["runtime"].update(control_cores=[-1]), r"control_cores \[-1\] must be 0 to 1023"),
         (
             lambda t: t["runtime"].update(control_cores=[1, 2], reasoning_cores=[2]),

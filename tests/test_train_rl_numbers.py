@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from edge.controller import arc_to, limit_share
+from edge.controller import arc_to, scale_to_limits
 from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.policies import robot_config
@@ -59,11 +59,11 @@ def test_the_mean_command_is_the_controllers_own_arc_within_its_limits(x: float,
     trajectory[0, 9] = torch.tensor([x, y, theta])
     bounds = CommandLimits(limits.vx_max_mps, limits.wz_max_radps)
     speed, turn = arc_to(SE2(x, y, theta), 1.0)
-    share = limit_share(speed, turn, limits, 1.0)
+    expected = scale_to_limits(speed, turn, limits, 1.0)
     found = command_mean(trajectory, 0.1, bounds)[0]
     # Where a target lies on the border between two rules, rounding may choose the other one.
     if abs(math.hypot(x, y) - 0.05) > 1e-6 and abs(abs(math.atan2(y, x)) - math.pi / 2) > 1e-6:
-        assert found.tolist() == pytest.approx([speed * share, turn * share], abs=2e-5)
+        assert found.tolist() == pytest.approx(expected, abs=2e-5)
 
 
 def test_the_gradient_of_the_mean_is_finite_wherever_the_target_is() -> None:

@@ -246,6 +246,8 @@ def test_the_bridge_gets_the_cores_that_the_target_leaves_it() -> None:
         ({"programs": Path("/opt/it's")}, "quote"),
         ({"memory_bytes": 0}, "memory"),
         ({"control_priority": 60}, "below the bridge's"),
+        ({"networks": (IPv4Network("0.0.0.0/0"),)}, "expected a prefix of /16 or longer"),
+        ({"networks": (IPv4Network("10.0.0.0/16"), IPv4Network("10.1.0.0/16"))}, "10.0.0.0/15 has 131072 addresses"),
     ],
 )
 def test_inputs_that_make_no_service_are_refused(changes: dict[str, object], says: str) -> None:

@@ -20,6 +20,19 @@ matrix. *Bound* runs from the fault's effect at our input to the velocity on the
 * **zero**: zero velocity until the fault has been gone for its clear time.
 * **stop**: zero velocity until the robot is armed again.
 
+Emergency stops; the bridge refuses to arm until `edge-bridge arm`:
+
+* L2 and B on the robot's remote, or the GPIO switch: they need neither a runner nor a terminal.
+* `edge-bridge stop`: it needs no runner.
+* `edge-say stop --to PATH`, also "halt", "freeze", "emergency stop" or "stop now": the bridge stops the robot and the
+  runner ends its run. Exit code 0 means that the bridge has confirmed the stop. Where no bridge admits this user, the
+  runner stops the robot alone: then a new run may arm without `edge-bridge arm`, and edge-say says so.
+
+No emergency stops:
+
+* `edge-say "stop at the door"`, or any longer text: **the robot drives on**. The text is an instruction for the model.
+* The end of the runner (Ctrl-C, SIGTERM, SIGKILL): the bridge stops the robot, but a new run may arm by itself.
+
 | row | fault | where | done | bound | ends | says | next |
 |---:|---|---|---|---:|---|---|---|
 """

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from edge.controller import TARGET_TIME_S, arc_to, is_plan, limit_share, target_of
+from edge.controller import TARGET_TIME_S, arc_to, is_plan, scale_to_limits, target_of
 from edge.findings import Finding
 from firmware_bridge.config import LimitsConfig
 
@@ -65,8 +65,7 @@ class OutputMonitor:
         speed, yaw_rate = arc_to(target_of(trajectory, config.step_s), TARGET_TIME_S)
         if speed > OUT_OF_RANGE * limits.vx_max_mps or abs(yaw_rate) > OUT_OF_RANGE * limits.wz_max_radps:
             findings.append(Finding("output-out-of-range", f"{speed:.1f} m/s, {yaw_rate:.1f} rad/s"))
-        share = limit_share(speed, yaw_rate, limits, 1.0)
-        velocity = (speed * share, yaw_rate * share)
+        velocity = scale_to_limits(speed, yaw_rate, limits, 1.0)
         if self._velocity is not None:
             change = (velocity[0] - self._velocity[0], velocity[1] - self._velocity[1])
             # More than the slew limit lets through in a tick, and back again: an ordinary start is a limited change

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 import firmware_bridge
-from edge.units import BRIDGE_PRIORITY
+from firmware_bridge.config import BRIDGE_PRIORITY
 from sim_hil.faults.client import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
@@ -62,8 +62,8 @@ class StackOptions:
     """Poses a second in the trace, in place of edge-hil's default."""
 
     def __post_init__(self) -> None:
-        if self.speed_limit_mps is not None and not 0.01 <= self.speed_limit_mps <= 5.0:
-            raise ValueError(f"speed limit: expected 0.01 to 5 m/s, found {self.speed_limit_mps}")
+        if self.speed_limit_mps is not None and not 0.01 <= self.speed_limit_mps <= 1.5:
+            raise ValueError(f"speed limit: expected 0.01 to 1.5 m/s, found {self.speed_limit_mps}")
         if self.people < 0 or self.seed < 0 or not all(map(math.isfinite, self.start)):
             raise ValueError(f"stack: expected people and seed of 0 or more and a finite start, found {self}")
 

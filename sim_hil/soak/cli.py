@@ -141,8 +141,8 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
     limit_mps = args.speed_limit
     if limit_mps is None and not artifacts.trained:
         limit_mps = UNTRAINED_MPS
-    if limit_mps is not None and not 0.02 <= limit_mps <= 2.0:
-        raise SoakInputError(f"--speed-limit: expected 0.02 to 2 m/s, found {limit_mps}")
+    if limit_mps is not None and not 0.02 <= limit_mps <= 1.5:
+        raise SoakInputError(f"--speed-limit: expected 0.02 to 1.5 m/s, found {limit_mps}")
     return SoakOptions(
         artifacts=args.artifacts.absolute(),
         manifest_sha256=artifacts.manifest_sha256,

@@ -108,6 +108,7 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "reasoning-hung": "the robot stands by then: its semantic state has expired, which is injected",
         "semantic-delay-invalid": "needs a defect in our own stamps; test on a fake clock",
         "instruction-injected": "changes nothing by construction; test over a thousand texts",
+        "stop-phrase": "to the robot the same as a runner that ends, which is injected; test with edge-say",
         "tick-overrun": "a tick that takes so long ends the bridge's patience too (commands-late), which is injected",
         "suspended": "would suspend this machine; test on a fake clock",
         "clock-backwards": "the kernel does not let a process move the monotonic clock; test on a fake clock",

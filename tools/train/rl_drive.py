@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from edge.controller import grown, limit_share
+from edge.controller import grown, scale_to_limits
 from edge.geometry import SE2
 from firmware_bridge.config import LimitsConfig
 from sim_hil.benchmark.gym_env import DynaNavEnv
@@ -135,8 +135,7 @@ class _Wheel:
         limits = self._limits
         vx_mps = min(max(vx_mps, 0.0), limits.vx_max_mps)
         wz_radps = min(max(wz_radps, -limits.wz_max_radps), limits.wz_max_radps)
-        share = limit_share(vx_mps, wz_radps, limits, speed_scale)
-        vx_mps, wz_radps = vx_mps * share, wz_radps * share
+        vx_mps, wz_radps = scale_to_limits(vx_mps, wz_radps, limits, speed_scale)
         vx_mps = grown(self._last[0], vx_mps, limits.accel_mps2 * CONTROL_S)
         wz_radps = grown(self._last[1], wz_radps, limits.alpha_radps2 * CONTROL_S)
         self._last = (vx_mps, wz_radps)
