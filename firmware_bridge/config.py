@@ -93,7 +93,8 @@ class SafetyConfig(_Section):
     `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
     reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
     `remote_deadband`: share of a stick's travel that is not yet a hand on it. `operator_arm`: every arming needs an
-    operator's `edge-bridge arm` before it.
+    operator's `edge-bridge arm` before it. `robot_lowcmd_publishers`: how many publishers of rt/lowcmd belong to the
+    robot itself; one more is a second commander.
     """
 
     sport_version: str = "1.0.0.1"
@@ -103,6 +104,7 @@ class SafetyConfig(_Section):
     remote_deadband: float = _within(0.01, 0.5, 0.1)
     estop_file: Path | None = None
     operator_arm: bool = False
+    robot_lowcmd_publishers: int = _within(0, 4, 0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
