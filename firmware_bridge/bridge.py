@@ -24,10 +24,12 @@ from typing import Final
 
 from firmware_bridge.client_link import ClientLink, SocketTakenError
 from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
-from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs
+from firmware_bridge.core import BridgeCore
+from firmware_bridge.latch_file import LatchFile, read_latch
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
+from firmware_bridge.step_types import Call, Inputs, Move, Outputs
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DdsError
 from firmware_bridge.unitree.robot_link import RobotLink
@@ -40,29 +42,35 @@ _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE,
 
 EPILOG: Final = """examples:
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
-  edge-bridge stop --robot go2.toml      emergency stop: every running bridge stops the robot and refuses to arm
-  edge-bridge arm --robot go2.toml       takes that stop back, and one by the remote or the GPIO file that has ended a
-                                         drive, so that the runner may arm again; where the robot file says
-                                         operator_arm, no runner arms without it, and it serves one arming
+  edge-bridge stop --robot go2.toml      emergency stop: every running bridge stops the robot and refuses to arm, also
+                                         after a restart of the bridge; done when the robot itself reports that it
+                                         stands still
+  edge-bridge arm --robot go2.toml       permit the runner that waits now to arm once, within 10 s: after an emergency
+                                         stop (operator, remote, GPIO file), and before every arming where the robot
+                                         file says operator_arm
+  edge-bridge release --robot go2.toml   after a stop: send nothing to the robot, so that a person can use its remote
   edge-bridge status --robot go2.toml    what the running bridge is doing
-stop, arm and status look for a bridge at the installed service's socket (run them with sudo then) and at the robot
-file's, or at --socket only.
-exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, status: done); 1 internal failure, robot stopped
-(stop: not confirmed by every bridge); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop,
-arm, status: no bridge is running, or none that this user may reach; arm: more than one)"""
+stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then) and at the
+robot file's, or at --socket only.
+exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, release, status: done); 1 internal failure, robot
+stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot file; 3
+refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this user may
+reach; arm: no runner waits, or more than one bridge)"""
 
 
 class Bridge:
     """Shell around BridgeCore: joins sockets, robot and clock. Raises DdsError, ConfigError, SocketTakenError."""
 
-    def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier) -> None:
+    def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier, latch_path: Path) -> None:
         self._log = log
         self._notifier = notifier
         self._robot = RobotLink(config, log.say)
         self._link = ClientLink(config.bridge.socket)
         self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), places=_OPERATORS)
         self._estop_file = config.safety.estop_file
-        self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns())
+        latch = read_latch(latch_path)
+        self._latch_file = LatchFile(latch_path, log.say)
+        self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
         self._said, self._ready = "", False
@@ -87,6 +95,7 @@ class Bridge:
         finally:
             self._link.close()
             self._operators.close()
+            self._latch_file.close(_LOG_TIMEOUT_S)
 
     def result(self) -> dict[str, object]:
         """The JSON result."""
@@ -115,6 +124,7 @@ class Bridge:
         outputs = self._core.step(inputs, time.monotonic_ns())
         for request in outputs.requests:
             self._robot.write(request)
+        self._latch_file.keep(outputs.latch)
         self._link.tell(outputs.status)
         self._operators.tell(outputs.status)
         self._report_progress(outputs.status)
@@ -169,12 +179,12 @@ def signals_to_socket() -> Iterator[socket.socket]:
             signal.set_wakeup_fd(-1)
 
 
-def serve(config: RobotConfig) -> dict[str, object]:
+def serve(config: RobotConfig, latch_path: Path) -> dict[str, object]:
     """Be the bridge until a signal; the JSON result. Raises what `Bridge` raises."""
     with signals_to_socket() as wakeup:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
-        bridge = Bridge(config, log, notifier)
+        bridge = Bridge(config, log, notifier, latch_path)
         where = f"domain {config.dds.domain} on {config.dds.interface}, socket {config.bridge.socket}"
         log.say(f"ready, robot {config.name}, {where}")
         gc.collect()
@@ -197,17 +207,20 @@ def main(argv: list[str] | None = None) -> int:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands = ("serve", "stop", "arm", "status")
+    commands = ("serve", "stop", "arm", "release", "status")
     parser.add_argument("command", nargs="?", choices=commands, default="serve", help="default: serve")
     parser.add_argument("--robot", required=True, metavar="FILE.toml", help="robot file")
     parser.add_argument("--socket", type=Path, metavar="PATH", help="socket of the bridge, instead of the robot file's")
+    parser.add_argument(
+        "--latch", type=Path, metavar="PATH", help="file that keeps an emergency stop; default: SOCKET.latch"
+    )
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain, instead of the robot file's")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
-            code, result = 0, serve(config)
+            code, result = 0, serve(config, args.latch or Path(f"{config.bridge.socket}.latch"))
         else:
             from firmware_bridge.operate import operate  # never part of the process that serves
 

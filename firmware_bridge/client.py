@@ -17,6 +17,7 @@ from firmware_bridge.link import (
     BridgeStatus,
     LinkError,
     Message,
+    Release,
     Stop,
     Velocity,
     decode,
@@ -87,6 +88,10 @@ class BridgeClient:
     def stop(self) -> bool:
         """Stop the robot now; the bridge stays stopped until the next `arm()`. False when it could not be sent."""
         return self._send(Stop())
+
+    def release(self) -> bool:
+        """Operator's socket only: let the bridge send nothing until the next arming. False when it was not sent."""
+        return self._send(Release())
 
     def poll(self) -> BridgeStatus | None:
         """Newest status known, None before the first; raises BridgeUnavailable when the bridge has gone."""

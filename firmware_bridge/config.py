@@ -115,7 +115,8 @@ class SafetyConfig(_Section):
     reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
     `remote_deadband`: share of a stick's travel that is not yet a hand on it. `operator_arm`: every arming needs an
     operator's `edge-bridge arm` before it. `above_walking_speed`: permits limits above those that FASTEST has for
-    people nearby.
+    people nearby. `robot_lowcmd_publishers`: how many publishers of rt/lowcmd belong to the robot itself; one more is
+    a second commander.
     """
 
     sport_version: str = "1.0.0.1"
@@ -126,6 +127,7 @@ class SafetyConfig(_Section):
     estop_file: Path | None = None
     operator_arm: bool = False
     above_walking_speed: bool = False
+    robot_lowcmd_publishers: int = _within(0, 4, 0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,9 +4,10 @@ Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
   1 arm       empty
   2 stop      empty
   3 velocity  seq u64, stamp_ns i64 (time.monotonic_ns of the command), vx, vy m/s, wz rad/s as f64
-  4 status    stamp_ns i64, state u8, zero_after_stop u8, cause u8, blocked_by u8, last_seq u64, commands u64,
-              rejected u64, last command 3 x f64, then the reason as UTF-8
-Version 1 had neither cause nor blocked_by.
+  4 status    stamp_ns i64, state u8, zero_after_stop u8, cause u8, blocked_by u8, permit u8, motion u8, last_seq u64,
+              commands u64, rejected u64, last command 3 x f64, speed f64, then the reason as UTF-8
+  5 release   empty; operator's socket only
+Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release.
 """
 
 from __future__ import annotations
@@ -16,32 +17,37 @@ from dataclasses import dataclass
 from typing import Final
 
 MAGIC: Final = b"TVEB"
-VERSION: Final = 2
+VERSION: Final = 3
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
 CAUSES: Final = (
     *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
-    *("estop", "remote_takeover", "second_commander", "link_down"),
+    *("estop", "remote_takeover", "second_commander", "second_publisher", "link_down"),
     *("state_silent", "wrong_mode", "robot_error", "tipped", "robot_moving"),
     *("not_standing", "battery_low", "wrong_robot", "operator"),
 )
 """Why the bridge has stopped or would refuse to arm.
 
 client_stop: the runner asked for it; client_lost: its connection has closed; deadman: no good command in time;
-shutdown: the bridge was told to end; suspended: the machine slept; estop: an operator, the local input or the remote's
-emergency keys; remote_takeover: a stick or key of the robot's remote; second_commander: motion or mode requests that
-are not ours; link_down: the network does not take our commands; state_silent: no usable report from the robot;
+shutdown: the bridge ends; suspended: the machine slept; estop: an operator, the local input or the remote's emergency
+keys; remote_takeover: a stick or key of the robot's remote; second_commander: motion or mode requests of another
+client, or a denied request of ours; second_publisher: an input topic has more than one publisher, or motor commands
+have one; link_down: the network does not take our commands; state_silent: no usable report from the robot;
 wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
 robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
 than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or does not say;
 operator: the robot file asks for an operator's `edge-bridge arm`, which has not come yet.
 """
+PERMITS: Final = ("not needed", "needed", "given")
+"""Whether the next arming needs an operator's `edge-bridge arm`, and whether it was given."""
+MOTIONS: Final = ("unknown", "still", "moving")
+"""The robot's own report: still means slower than 0.05 m/s, in a report received after the last stop."""
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512
 
-_ARM, _STOP, _VELOCITY, _STATUS = 1, 2, 3, 4
+_ARM, _STOP, _VELOCITY, _STATUS, _RELEASE = 1, 2, 3, 4, 5
 _HEADER: Final = struct.Struct("<4sBBH")
 _VELOCITY_BODY: Final = struct.Struct("<Qq3d")
-_STATUS_BODY: Final = struct.Struct("<qBBBBQQQ3d")
+_STATUS_BODY: Final = struct.Struct("<qBBBBBBQQQ4d")
 
 
 class LinkError(ValueError):
@@ -56,6 +62,11 @@ class Arm:
 @dataclass(frozen=True)
 class Stop:
     """Stop now and stay stopped."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """Operator's wish that the bridge sends nothing, so that a person can use the robot's remote."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +86,8 @@ class BridgeStatus:
 
     `zero_after_stop`: stopped, and a zero velocity has been written since, and nothing else. It is True too when the
     bridge never commanded the robot at all. `cause` (of CAUSES) says why it last stopped or refused to arm, `reason`
-    the same in words; `blocked_by` (of CAUSES) says what would make it refuse to arm now.
+    the same in words; `blocked_by` (of CAUSES) says what would make it refuse to arm now. `permit` is one of PERMITS,
+    `motion` one of MOTIONS, `speed_mps` the robot's own speed, -1 without a fresh report.
     """
 
     stamp_ns: int
@@ -88,9 +100,12 @@ class BridgeStatus:
     zero_after_stop: bool
     cause: str = "none"
     blocked_by: str = "none"
+    permit: str = "not needed"
+    motion: str = "unknown"
+    speed_mps: float = -1.0
 
 
-Message = Arm | Stop | Velocity | BridgeStatus
+Message = Arm | Stop | Release | Velocity | BridgeStatus
 
 
 def encode(message: Message) -> bytes:
@@ -99,6 +114,8 @@ def encode(message: Message) -> bytes:
         return _frame(_ARM, b"")
     if isinstance(message, Stop):
         return _frame(_STOP, b"")
+    if isinstance(message, Release):
+        return _frame(_RELEASE, b"")
     if isinstance(message, Velocity):
         velocity = (message.vx_mps, message.vy_mps, message.wz_radps)
         return _frame(_VELOCITY, _VELOCITY_BODY.pack(message.seq, message.stamp_ns, *velocity))
@@ -106,7 +123,10 @@ def encode(message: Message) -> bytes:
     counters = (message.last_seq, message.commands, message.rejected)
     flags = (STATES.index(message.state), message.zero_after_stop)
     causes = (CAUSES.index(message.cause), CAUSES.index(message.blocked_by))
-    body = _STATUS_BODY.pack(message.stamp_ns, *flags, *causes, *counters, *message.last_command)
+    robot = (PERMITS.index(message.permit), MOTIONS.index(message.motion))
+    body = _STATUS_BODY.pack(
+        message.stamp_ns, *flags, *causes, *robot, *counters, *message.last_command, message.speed_mps
+    )
     return _frame(_STATUS, body + reason)
 
 
@@ -122,6 +142,8 @@ def decode(data: bytes) -> Message:
         return Arm()
     if kind == _STOP and not body:
         return Stop()
+    if kind == _RELEASE and not body:
+        return Release()
     if kind == _VELOCITY and len(body) == _VELOCITY_BODY.size:
         return Velocity(*_VELOCITY_BODY.unpack(body))
     if kind == _STATUS and _STATUS_BODY.size <= len(body) <= _STATUS_BODY.size + MAX_REASON_BYTES:
@@ -130,16 +152,17 @@ def decode(data: bytes) -> Message:
 
 
 def _decode_status(body: bytes) -> BridgeStatus:
-    stamp_ns, state, zero, cause, blocked_by, *counters, vx, vy, wz = _STATUS_BODY.unpack_from(body)
-    if state >= len(STATES) or zero > 1 or max(cause, blocked_by) >= len(CAUSES):
-        raise LinkError(f"state {state}, flag {zero}, causes {cause} and {blocked_by}")
+    stamp_ns, state, zero, cause, blocked, permit, motion, *counters, vx, vy, wz, speed = _STATUS_BODY.unpack_from(body)
+    known = state < len(STATES) and zero <= 1 and permit < len(PERMITS) and motion < len(MOTIONS)
+    if not known or max(cause, blocked) >= len(CAUSES):
+        raise LinkError(f"state {state}, flag {zero}, causes {cause} and {blocked}, permit {permit}, motion {motion}")
     try:
         reason = body[_STATUS_BODY.size :].decode("utf-8")
     except UnicodeDecodeError as error:
         raise LinkError("reason is not UTF-8") from error
     last_seq, commands, rejected = counters
     head = (stamp_ns, STATES[state], reason, last_seq, commands, rejected, (vx, vy, wz), zero == 1)
-    return BridgeStatus(*head, CAUSES[cause], CAUSES[blocked_by])
+    return BridgeStatus(*head, CAUSES[cause], CAUSES[blocked], PERMITS[permit], MOTIONS[motion], speed)
 
 
 def _frame(kind: int, body: bytes) -> bytes:

@@ -1,7 +1,7 @@
-"""`edge-bridge stop`, `arm` and `status`: an operator's connection to a running bridge, which may only stop or ask.
+"""`edge-bridge stop`, `arm`, `release` and `status`: an operator's connection to a running bridge.
 
-It is a second socket, so the runner need not let go of its own, and a newer operator replaces the oldest of several, so
-nobody can be in the way of an emergency stop.
+It uses a second socket, so the runner keeps its own, and a newer operator replaces the oldest of several, so no idle
+operator can block an emergency stop. A stop is confirmed by the robot's own speed and by nothing else.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import functools
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -19,17 +20,28 @@ from firmware_bridge.config import OPERATOR_SUFFIX
 from firmware_bridge.link import BridgeStatus
 
 CONFIRM_S: Final = 1.0
+_STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again
+_MOVES_ON_S: Final = 0.5  # a robot that still moves this long after a stop: the operator must know now
 _POLL_S: Final = 0.005
+_USE_REMOTE: Final = "press L2 and B on its remote, or switch it off"
 
-Answer = BridgeStatus | BridgeUnavailable | None
-"""Of one socket: the status that shows the command done, why there is no bridge, or None: not confirmed in time."""
+
+@dataclass(frozen=True)
+class Unconfirmed:
+    """A bridge that answered but did not show the command done; `status` is its newest, None without one."""
+
+    status: BridgeStatus | None
+
+
+Answer = BridgeStatus | BridgeUnavailable | Unconfirmed
+"""Of one socket: the status that shows the command done, why there is no bridge, or that it was not confirmed."""
 
 
 def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
     """Do `command` at every bridge that listens at one of `sockets`, say on stderr what they are doing then.
 
-    Returns the exit code (0 done, 1 not confirmed by all in time, 3 no bridge) and a status as JSON values. `arm` is
-    done at one bridge only: where several answer, the operator has to say which.
+    Returns the exit code (0 done, 1 not confirmed by all in time, 3 refused or no bridge) and a status as JSON values.
+    `arm` is done at one bridge only: where several answer, the operator has to say which.
     """
     answers = _at_each("status" if command == "arm" else command, *sockets)
     reached = [socket for socket, answer in answers.items() if not isinstance(answer, BridgeUnavailable)]
@@ -37,21 +49,34 @@ def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
         return _refuse(f"bridges answer at {' and '.join(map(str, reached))}; say which with --socket")
     if command == "arm":
         answers |= _at_each(command, *reached)
-    missing = {socket: answer for socket, answer in answers.items() if isinstance(answer, BridgeUnavailable)}
-    hidden = [answer for answer in missing.values() if _is_hidden(answer)]
+    missing = [answer for answer in answers.values() if isinstance(answer, BridgeUnavailable)]
+    hidden = [answer for answer in missing if _is_hidden(answer)]
+    unconfirmed = [answer for answer in answers.values() if isinstance(answer, Unconfirmed)]
     statuses = [answer for answer in answers.values() if isinstance(answer, BridgeStatus)]
     if len(missing) == len(answers):
-        return _refuse("; ".join(map(str, hidden or missing.values())))
-    for status in statuses:
+        return _refuse("; ".join(map(str, hidden or missing)))
+    for status in (*statuses, *(answer.status for answer in unconfirmed if answer.status is not None)):
         blocked = "" if status.blocked_by == "none" else f"; arming is refused: {status.blocked_by}"
         sys.stderr.write(f"edge-bridge: {status.state}: {status.reason}{blocked}\n")
     for error in hidden:
         sys.stderr.write(f"edge-bridge: {error}\n")
-    unconfirmed = len(statuses) < len(answers) - len(missing)
-    if unconfirmed:
-        sys.stderr.write(f"edge-bridge: the bridge did not confirm within {CONFIRM_S:g} s; switch the robot off\n")
-    failed = unconfirmed or (command == "stop" and len(hidden) > 0)
-    return int(failed), asdict(statuses[0]) if statuses else {"error": "not confirmed"}
+    for answer in unconfirmed:
+        sys.stderr.write(f"edge-bridge: {_why_unconfirmed(command, answer.status)}\n")
+    values = statuses[0] if statuses else next((answer.status for answer in unconfirmed if answer.status), None)
+    result: dict[str, object] = {"error": "not confirmed"} if values is None else asdict(values)
+    if command == "arm" and unconfirmed and unconfirmed[0].status is not None:
+        return 3, result
+    return int(bool(unconfirmed) or (command == "stop" and bool(hidden))), result
+
+
+def _why_unconfirmed(command: str, status: BridgeStatus | None) -> str:
+    if status is None:
+        return f"the bridge did not confirm within {CONFIRM_S:g} s: {_USE_REMOTE}"
+    if command == "stop" and status.motion == "moving":
+        return f"STOPPED, BUT THE ROBOT STILL MOVES at {status.speed_mps:.2f} m/s: {_USE_REMOTE}"
+    if command == "stop":
+        return f"the bridge has stopped, but the robot does not report whether it stands still: look, or {_USE_REMOTE}"
+    return f"{command} was not confirmed within {CONFIRM_S:g} s"
 
 
 def _refuse(why: str) -> tuple[int, dict[str, object]]:
@@ -80,7 +105,7 @@ def _operate(command: str, socket: Path) -> Answer:
         try:
             client = BridgeClient(f"{socket}{OPERATOR_SUFFIX}")
             try:
-                return _ask(command, client)
+                return _stop(client) if command == "stop" else _ask(command, client)
             finally:
                 client.close()
         except BridgeUnavailable as error:
@@ -90,24 +115,61 @@ def _operate(command: str, socket: Path) -> Answer:
             time.sleep(_POLL_S)
 
 
-def _ask(command: str, client: BridgeClient) -> BridgeStatus | None:
-    """The status that shows the command done; None when none has come in time."""
+def _stop(client: BridgeClient) -> BridgeStatus | Unconfirmed:
+    """Stop, and follow the robot until it reports that it stands still; warn as soon as it does not obey."""
+    asked_ns = time.monotonic_ns()
+    latched = _follow(client, asked_ns, CONFIRM_S, _is_latched, again=client.stop)
+    if isinstance(latched, Unconfirmed):
+        return latched
+    answer = _follow(client, asked_ns, _MOVES_ON_S, lambda status: _is_latched(status) and status.motion == "still")
+    if isinstance(answer, Unconfirmed):
+        moves = answer.status is not None and answer.status.motion == "moving"
+        state = "the robot still moves" if moves else "no report that the robot stands still yet"
+        sys.stderr.write(f"edge-bridge: stop sent; {state}: be ready to {_USE_REMOTE}\n")
+        sys.stderr.flush()
+        answer = _follow(client, asked_ns, _STAND_S, lambda status: _is_latched(status) and status.motion == "still")
+    return answer
+
+
+def _ask(command: str, client: BridgeClient) -> BridgeStatus | Unconfirmed:
+    """The status that shows the command done."""
     asked_ns = 0 if command == "status" else time.monotonic_ns()
     if command == "arm":
         client.arm()
-    deadline_ns = time.monotonic_ns() + round(CONFIRM_S * 1e9)
+    elif command == "release":
+        client.release()
+    return _follow(client, asked_ns, CONFIRM_S, functools.partial(_is_done, command))
+
+
+def _follow(
+    client: BridgeClient,
+    since_ns: int,
+    limit_s: float,
+    done: Callable[[BridgeStatus], bool],
+    again: Callable[[], object] = lambda: None,
+) -> BridgeStatus | Unconfirmed:
+    """The first status made after `since_ns` for which `done` is true, within `limit_s` of `since_ns` or of now.
+
+    `again` is called before every look: a repeated stop changes nothing, a lost one would.
+    """
+    deadline_ns = (since_ns or time.monotonic_ns()) + round(limit_s * 1e9)
+    status = None
     while time.monotonic_ns() < deadline_ns:
-        if command == "stop":
-            client.stop()  # again and again: once more changes nothing, a lost one would
+        again()
         status = client.poll()
-        if status is not None and status.stamp_ns >= asked_ns and _is_done(command, status):
+        if status is not None and status.stamp_ns >= since_ns and done(status):
             return status
         time.sleep(_POLL_S)
-    return None
+    return Unconfirmed(status)
+
+
+def _is_latched(status: BridgeStatus) -> bool:
+    """A stop shows as the reason not to arm, with the robot stopped or never driven."""
+    return status.blocked_by == "estop" and status.state in ("stopped", "disarmed")
 
 
 def _is_done(command: str, status: BridgeStatus) -> bool:
-    """A stop shows as the reason not to arm, with the robot stopped or never driven; an arm as that reason's end."""
-    if command == "stop":
-        return status.blocked_by == "estop" and status.state in ("stopped", "disarmed")
-    return command != "arm" or status.blocked_by != "operator"
+    """An arm shows as a permission, a release as the end of the zeros."""
+    if command == "arm":
+        return status.permit != "needed" or status.state in ("arming", "armed")
+    return command != "release" or (status.state in ("stopped", "disarmed") and not status.zero_after_stop)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from firmware_bridge.config import BridgeConfig, LimitsConfig, SafetyConfig
-from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs, Report
+from firmware_bridge.core import BridgeCore
 from firmware_bridge.link import Arm, BridgeStatus, Velocity
+from firmware_bridge.step_types import Call, Inputs, Move, Outputs, Report
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.state import RobotState
 
@@ -42,10 +43,11 @@ class Bench:
     estop: bool = False
     asleep_ns: int = 0
     safety: SafetyConfig = SAFETY
+    latch: str = ""
     written: list[tuple[int, Move | Call]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.core = BridgeCore(BRIDGE, LIMITS, self.safety, self.now_ns)
+        self.core = BridgeCore(BRIDGE, LIMITS, self.safety, self.now_ns, latch=self.latch)
         self.asked = False
 
     def step(
@@ -94,6 +96,12 @@ class Bench:
         """Arm, and the step in which the robot's answer about itself arrives."""
         self.step(Arm())
         self.step()
+
+    def permit(self) -> Bench:
+        """A runner asks to arm and an operator's `edge-bridge arm` permits it."""
+        self.step(Arm())
+        self.step(operator=(Arm(),))
+        return self
 
     @property
     def status(self) -> BridgeStatus:

@@ -13,11 +13,13 @@ from firmware_bridge.client import BridgeClient
 
 def main() -> None:
     client = BridgeClient(sys.argv[1])
-    client.arm()
-    seq = 0
+    seq, driven = 0, False
     while True:
+        if seq % 10 == 0 and not driven:  # as edge-run asks while it waits for an operator
+            client.arm()
         status = client.poll()
         armed = status is not None and status.state == "armed"
+        driven = driven or armed
         seq += 1
         client.send_velocity(seq, time.monotonic_ns(), float(sys.argv[2]) if armed else 0.0, 0.0, 0.0)
         if seq == 1:

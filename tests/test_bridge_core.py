@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_bridge.core import Call, Move
 from firmware_bridge.link import Arm, Stop, Velocity
+from firmware_bridge.step_types import Call, Move
 from firmware_bridge.unitree import ids
 from tests.bridge_bench import BRIDGE, LIMITS, MS, ZERO, Bench
 

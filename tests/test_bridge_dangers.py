@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_bridge.core import Call, Move
 from firmware_bridge.link import Arm, Stop, Velocity
+from firmware_bridge.step_types import Call, Move
 from firmware_bridge.unitree import ids
 from tests.bridge_bench import MS, SAFETY, ZERO, Bench
 
@@ -56,6 +56,14 @@ def _writes_fail(bench: Bench) -> None:
     bench.step(writes_fail=True)
 
 
+def _denied(bench: Bench) -> None:
+    bench.step(denied="StopMove")
+
+
+def _second_publisher(bench: Bench) -> None:
+    bench.step(publishers="2 publishers of rt/sportmodestate")
+
+
 DANGERS = [
     (_foreign, "second_commander"),
     (_stick, "remote_takeover"),
@@ -66,7 +74,10 @@ DANGERS = [
     (_rolled, "tipped"),
     (_error, "robot_error"),
     (_writes_fail, "link_down"),
+    (_denied, "second_commander"),
+    (_second_publisher, "second_publisher"),
 ]
+LATCHING = (_remote_estop, _local_estop, _operator)
 
 
 @pytest.mark.parametrize(("danger", "cause"), DANGERS)
@@ -85,7 +96,8 @@ class TestEveryDanger:
         assert bench.status.blocked_by == cause
         bench.step(Arm())
         danger(bench)
-        assert (bench.status.state, bench.status.cause) == ("disarmed", cause)
+        latched = danger in LATCHING
+        assert (bench.status.state, bench.status.cause) == ("disarmed", "operator" if latched else cause)
         assert bench.status.reason.startswith("arm refused: ")
         assert bench.written == []
 
@@ -101,7 +113,7 @@ class TestEveryDanger:
         """A runner that asked must be able to tell a refusal from the state before it asked."""
         bench = Bench()
         danger(bench)
-        assert bench.step(Arm()).status.state == "arming"
+        assert bench.step(Arm()).status.state == ("disarmed" if danger in LATCHING else "arming")
 
 
 def test_an_armed_robot_is_not_blocked() -> None:
@@ -201,23 +213,16 @@ class TestSecondCommander:
 
 
 class TestRemote:
-    def test_a_person_who_steers_has_the_robot_alone_after_the_first_zeros(self) -> None:
+    def test_sticks_never_end_the_zeros(self) -> None:
+        """Stick messages are not authenticated: a forged one must not silence the bridge."""
         bench = Bench().arm()
         bench.drive(500)
-        start_ns = bench.now_ns
+        _stick(bench)
+        bench.written.clear()
         for _ in range(100):
             _stick(bench)
             bench.wait(20)
-        assert 5 <= sum(t > start_ns for t, _ in bench.written) <= 25
-        assert max(t for t, _ in bench.written) - start_ns <= 250 * MS
-
-    def test_the_zeros_come_back_when_the_remote_is_put_down(self) -> None:
-        bench = Bench().arm()
-        _stick(bench)
-        bench.wait(1100)
-        bench.written.clear()
-        bench.wait(1000)
-        assert len(bench.moves()) == pytest.approx(50, abs=2) and set(bench.moves()) == {ZERO}
+        assert set(bench.moves()) == {ZERO} and len(bench.moves()) == pytest.approx(100, abs=3)
 
     def test_an_untouched_remote_changes_nothing(self) -> None:
         bench = Bench().arm()
@@ -302,11 +307,10 @@ class TestFoundMoving:
         bench.wait(1000)
         assert set(bench.moves()) == {ZERO} and len(bench.moves()) == pytest.approx(50, abs=2)
 
-    def test_a_robot_that_a_person_steers_is_left_alone(self) -> None:
+    def test_a_stick_message_does_not_prevent_it(self) -> None:
         bench = Bench(client=False, robot={"vx_mps": 0.3})
         bench.step(remote_in_use=True)
-        bench.wait(500)
-        assert bench.written == []
+        assert [request for _, request in bench.written] == [ZERO, STOP_MOVE]
 
     def test_a_robot_that_begins_to_move_later_is_somebody_elses(self) -> None:
         bench = Bench(client=False)

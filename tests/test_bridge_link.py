@@ -12,12 +12,15 @@ from hypothesis import strategies as st
 from firmware_bridge.link import (
     CAUSES,
     MAX_DATAGRAM_BYTES,
+    MOTIONS,
+    PERMITS,
     STATES,
     VERSION,
     Arm,
     BridgeStatus,
     LinkError,
     Message,
+    Release,
     Stop,
     Velocity,
     decode,
@@ -31,9 +34,9 @@ velocities = st.builds(Velocity, u64, i64, f64, f64, f64)
 reasons = st.text(max_size=90)
 statuses = st.builds(
     BridgeStatus, i64, st.sampled_from(STATES), reasons, u64, u64, u64, st.tuples(f64, f64, f64), st.booleans(),
-    st.sampled_from(CAUSES), st.sampled_from(CAUSES),
+    st.sampled_from(CAUSES), st.sampled_from(CAUSES), st.sampled_from(PERMITS), st.sampled_from(MOTIONS), f64,
 )  # fmt: skip
-messages = st.one_of(st.just(Arm()), st.just(Stop()), velocities, statuses)
+messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), velocities, statuses)
 
 
 @given(messages)
@@ -67,20 +70,20 @@ def test_a_changed_header_or_length_never_decodes_to_another_kind_of_message(mes
         decode(b"XXXX" + good[4:])
 
 
-@pytest.mark.parametrize("version", [0, 1, 3, 255])
+@pytest.mark.parametrize("version", [0, 1, 2, 255])
 def test_another_version_is_refused(version: int) -> None:
     with pytest.raises(LinkError, match="version"):
         decode(struct.pack("<4sBBH", b"TVEB", version, 1, 0))
 
 
-@pytest.mark.parametrize("kind", [0, 5, 255])
+@pytest.mark.parametrize("kind", [0, 6, 255])
 def test_an_unknown_kind_is_refused(kind: int) -> None:
     with pytest.raises(LinkError, match="kind"):
         decode(struct.pack("<4sBBH", b"TVEB", VERSION, kind, 0))
 
 
-@pytest.mark.parametrize("offset", [8, 9, 10, 11])
-def test_a_status_with_an_unknown_state_flag_or_cause_is_refused(offset: int) -> None:
+@pytest.mark.parametrize("offset", [8, 9, 10, 11, 12, 13])
+def test_a_status_with_an_unknown_state_flag_cause_permit_or_motion_is_refused(offset: int) -> None:
     good = bytearray(encode(BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), False)))
     good[8 + offset] = 200  # header of 8 bytes, then the stamp
     with pytest.raises(LinkError, match="200"):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from firmware_bridge.config import DdsConfig, load_robot_config
-from firmware_bridge.core import Report
+from firmware_bridge.step_types import Report
 from firmware_bridge.unitree import ids, robot_link
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
 from firmware_bridge.unitree.idl import (

@@ -164,7 +164,9 @@ class Answering:
             stopped = "estop" if Stop() in self.heard else "none"
             stamp_ns += 10**9
             zero = (0.0, 0.0, 0.0)
-            self._link.tell(BridgeStatus(stamp_ns, "stopped", "as said", 0, 0, 0, zero, True, stopped, stopped))
+            self._link.tell(
+                BridgeStatus(stamp_ns, "stopped", "as said", 0, 0, 0, zero, True, stopped, stopped, motion="still")
+            )
 
     def close(self) -> None:
         self._closing.set()

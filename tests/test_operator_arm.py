@@ -20,10 +20,8 @@ def bench_of(**changes: object) -> Bench:
 
 
 def permitted() -> Bench:
-    """An operator has said arm, nobody has armed."""
-    bench = bench_of()
-    bench.step(operator=(Arm(),))
-    return bench
+    """An operator has permitted the waiting runner to arm; it has not armed yet."""
+    return bench_of().permit()
 
 
 def refused(bench: Bench) -> bool:
@@ -60,12 +58,10 @@ class TestBridge:
         bench.arm()
 
     def test_it_is_answered_in_words_after_a_refusal(self) -> None:
-        bench = bench_of()
-        bench.step(Arm())
-        bench.step(operator=(Arm(),))
+        bench = bench_of().permit()
         assert (bench.status.cause, bench.status.reason) == (
             "none",
-            "permitted by an operator, waiting for a client to arm",
+            "permitted by an operator, waiting for the runner to arm",
         )
 
     @pytest.mark.parametrize("end", ["client stops", "client goes", "deadman", "robot falls silent"])
@@ -113,7 +109,8 @@ class TestBridge:
         bench.step()
         assert bench.status.blocked_by == "estop"
         bench.estop = False
-        assert refused(bench)
+        bench.step(Arm())
+        assert (bench.status.cause, bench.status.blocked_by) == ("operator", "estop")
 
     def test_a_robot_found_moving_needs_an_operator_who_has_seen_that(self) -> None:
         bench = bench_of(mode=None)
@@ -229,11 +226,11 @@ class TestRunner:
         runner.run()
         assert runner.bench.status.state == "armed"
 
-    def test_what_is_in_the_way_after_the_operators_arm_is_a_refusal(self) -> None:
+    def test_a_danger_during_the_operators_arm_voids_it_and_the_runner_waits_on(self) -> None:
         runner = Runner(bench_of(robot={"pitch_rad": 1.0}))
-        runner.at_ms[5_000] = runner.permit
-        with pytest.raises(RefusedError, match="tipped over or carried"):
-            runner.run()
+        runner.at_ms = {5_000: runner.permit, 9_000: lambda: setattr(runner.bench, "robot", {}), 20_000: runner.permit}
+        runner.run()
+        assert runner.now_ms >= 20_000
 
     def test_a_robot_that_does_not_stand_up_in_time_is_a_refusal_after_any_wait(self) -> None:
         runner = Runner(bench_of(mode=ids.MODE_LIE_DOWN))
@@ -290,12 +287,24 @@ class TestInTheWay:
         assert runner.bench.status.state == "armed"
         assert runner.waited[0] == f"{WAITING} (dark)"
 
-    def test_an_operators_word_is_not_kept_until_it_goes(self) -> None:
+    def test_an_operators_arm_is_not_kept_until_it_goes(self) -> None:
         runner = Runner()
-        runner.at_ms = {60_000: lambda: setattr(runner, "in_the_way", "dark"), 90_000: runner.permit}
-        with pytest.raises(RefusedError, match="not armed: dark"):
-            runner.run()
-        assert runner.now_ms <= 97_000 and runner.bench.written == []
+        runner.at_ms = {
+            60_000: lambda: setattr(runner, "in_the_way", "dark"),
+            90_000: runner.permit,
+            95_000: runner.clear,
+            120_000: runner.permit,
+        }
+        runner.run()
+        assert runner.now_ms >= 120_000
+
+    def test_after_an_emergency_stop_the_runner_waits_for_an_operator_whatever_the_robot_file_says(self) -> None:
+        bench = Bench()
+        bench.step(operator=(Stop(),))
+        runner = Runner(bench)
+        runner.at_ms[60_000] = runner.permit
+        runner.run()
+        assert runner.now_ms >= 60_000 and runner.said == ["waiting for `edge-bridge arm`"]
 
     def test_a_signal_ends_the_waiting_for_it(self) -> None:
         runner = Runner(in_the_way="dark")

@@ -16,6 +16,7 @@ OBSTACLES_AVOID_SERVICE: Final = "obstacles_avoid"
 SPORT_STATE_TOPIC: Final = "rt/sportmodestate"
 LOW_STATE_TOPIC: Final = "rt/lowstate"
 LF_LOW_STATE_TOPIC: Final = "rt/lf/lowstate"  # the same at a low frequency
+LOW_COMMAND_TOPIC: Final = "rt/lowcmd"  # motor commands, past the sport service
 REMOTE_TOPIC: Final = "rt/wirelesscontroller"
 
 API_VERSION: Final = 1  # every service answers it with its version as bare text
@@ -46,6 +47,7 @@ BRIDGE_ALLOWED: Final = frozenset({API_VERSION, MOVE, STOP_MOVE, STAND_UP, RECOV
 # that is not ours is a second commander's.
 COMMANDING_SERVICES: Final = {
     SPORT_SERVICE: frozenset({API_VERSION, 2055}),  # AutoRecoveryGet
+    f"{SPORT_SERVICE}_lease": frozenset({API_VERSION}),  # its holder shuts every other client out
     MOTION_SWITCHER_SERVICE: frozenset({API_VERSION, 1001, 1005}),  # CheckMode, GetSilent
     ROBOT_STATE_SERVICE: frozenset({API_VERSION, 1002, 1003}),  # SetReportFreq, ServiceList
     OBSTACLES_AVOID_SERVICE: frozenset({API_VERSION, 1002}),  # SwitchGet
@@ -59,6 +61,7 @@ REMOTE_KEYS: Final = (
 OK: Final = 0
 ERROR_NOT_IMPLEMENTED: Final = 3203
 ERROR_PARAMETER: Final = 3204
+LEASE_ERRORS: Final = frozenset({3205, 3206, 3207})  # denied, does not exist, exists: another client holds the lease
 
 # SportModeState_.mode
 MODE_IDLE: Final = 0

@@ -9,11 +9,13 @@ from typing import Any, Final
 from cyclonedds.sub import DataReader
 
 from firmware_bridge.config import RobotConfig
-from firmware_bridge.core import Call, Move, Report
+from firmware_bridge.step_types import Call, Move, Report
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.idl import Request_, SportModeState_, WirelessController_
 from firmware_bridge.unitree.idl_low import LowState_
+from firmware_bridge.unitree.publishers import PublisherWatch
+from firmware_bridge.unitree.remote import StopKeys
 from firmware_bridge.unitree.requests import Requester, move_parameter
 from firmware_bridge.unitree.state import RobotState, StampOrder, battery_state, robot_state, within
 
@@ -24,7 +26,7 @@ _BATTERY_PERIOD_NS: Final = 1_000_000_000  # decoding a low state costs as much 
 _MAX_STICK: Final = 1.5  # full travel is 1
 _FEW: Final = 4  # samples of one topic a step: 200 a second, and none of them takes long
 _MAX_BYTES: Final = 4096  # a low state, the largest of what is read here, has 1180
-_MAX_KEPT_BYTES: Final = 1024 * 1024  # times 43, the depth of all readers: far below the service's MemoryMax
+_MAX_KEPT_BYTES: Final = 1024 * 1024  # times 51, the depth of all readers: far below the service's MemoryMax
 
 
 class RobotLink:
@@ -35,7 +37,7 @@ class RobotLink:
         self._say = say
         self._velocity_frame = config.odometry.velocity_frame
         self._deadband = config.safety.remote_deadband
-        self._estop_keys = sum(1 << ids.REMOTE_KEYS.index(key) for key in config.safety.remote_estop_keys)
+        self._stop_keys = StopKeys(config.safety.remote_estop_keys)
         self._bus = bus = Bus(config.dds, max_sample_bytes=_MAX_KEPT_BYTES)
         self._sport = Requester(bus, ids.SPORT_SERVICE, allowed=ids.BRIDGE_ALLOWED)
         self._states = bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_)
@@ -45,6 +47,7 @@ class RobotLink:
             (service, harmless, bus.reader(ids.request_topic(service), Request_, depth=8, foreign=True))
             for service, harmless in ids.COMMANDING_SERVICES.items()
         ]
+        self._publishers = PublisherWatch(bus, config.safety.robot_lowcmd_publishers)
         self._order = StampOrder()
         self._battery_due_ns = 0
         self._sent: dict[int, int] = {}  # request id -> api id, of what has not been answered
@@ -56,10 +59,12 @@ class RobotLink:
 
     def read(self, now_ns: int) -> Report:
         """Everything that has arrived since the last call."""
-        in_use, estop = self._remote()
+        in_use, estop = self._remote(now_ns)
         state, foreign, battery_percent = self._newest_state(), self._foreign(), self._battery_percent(now_ns)
+        version, denied = self._answers()
         failing = self._sport.failing >= _FAILING_WRITES
-        return Report(state, in_use, estop, foreign, battery_percent, self._answers(), failing)
+        publishers = self._publishers.surplus()
+        return Report(state, in_use, estop, foreign, denied, publishers, battery_percent, version, failing)
 
     def write(self, request: Move | Call) -> None:
         """Send one request and wait for nothing; what the network does not take is counted."""
@@ -81,14 +86,14 @@ class RobotLink:
                 newest = state
         return newest
 
-    def _remote(self) -> tuple[bool, bool]:
-        """Whether a stick or key is in use, whether the emergency-stop keys are held."""
+    def _remote(self, now_ns: int) -> tuple[bool, bool]:
+        """Whether a stick or key is in use, whether the emergency-stop keys were pressed together."""
         in_use = estop = False
         for sample in _few(self._remotes):
             if sample is None:
                 self._malformed += 1
                 continue
-            estop |= sample.keys & self._estop_keys == self._estop_keys  # whatever the sticks say
+            estop |= self._stop_keys.press(sample.keys, now_ns)  # whatever the sticks say
             if within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
                 in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
             else:
@@ -115,16 +120,17 @@ class RobotLink:
             self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
         return percent
 
-    def _answers(self) -> str | None:
-        """The version the sport service has told us, if it has; errors go to the operator."""
-        version = None
+    def _answers(self) -> tuple[str | None, str | None]:
+        """The sport service's version, and the request that it has denied; errors go to the operator."""
+        version = denied = None
         for answer in self._sport.responses(_FEW, _MAX_BYTES):
             api_id = self._sent.pop(answer.request_id, None)
             if api_id is not None and answer.code != ids.OK:
+                denied = ids.SPORT_API_NAMES[api_id] if answer.code in ids.LEASE_ERRORS else denied
                 self._say(f"the robot answered {ids.SPORT_API_NAMES[api_id]} with error {answer.code}")
             elif api_id == ids.API_VERSION:
                 version = answer.data[:_MAX_VERSION_CHARS] or "nothing"
-        return version
+        return version, denied
 
 
 def _few(reader: DataReader[Any]) -> Iterator[Any]:

@@ -1,0 +1,59 @@
+"""Publishers of the topics that the bridge trusts, counted by DDS discovery.
+
+DDS of the robot is not authenticated: a second publisher of an input topic is another robot or a forger, and a
+publisher of motor commands moves the robot beside the sport service. Both are seen before their first sample.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import Any, Final
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+from firmware_bridge.unitree import ids
+from firmware_bridge.unitree.dds import DDS_ERRORS, DECODE_ERRORS, Bus
+
+_FEW: Final = 16  # announcements a step
+INPUT_TOPICS: Final = (
+    *(ids.SPORT_STATE_TOPIC, ids.LF_LOW_STATE_TOPIC, ids.REMOTE_TOPIC),
+    ids.response_topic(ids.SPORT_SERVICE),
+)
+
+
+class PublisherWatch:
+    """Counts the publishers of `INPUT_TOPICS` and of the motor commands, those of this process left out."""
+
+    def __init__(self, bus: Bus, own_motor_publishers: int) -> None:
+        """`own_motor_publishers`: how many publishers of motor commands belong to the robot itself."""
+        self._own = str(bus.participant.guid)
+        self._allowed: Mapping[str, int] = {
+            **dict.fromkeys(INPUT_TOPICS, 1),
+            ids.LOW_COMMAND_TOPIC: own_motor_publishers,
+        }
+        self._topics: dict[str, str] = {}  # GUID of a publisher -> topic
+        self._reader: Any = BuiltinDataReader(bus.participant, BuiltinTopicDcpsPublication)
+
+    def surplus(self) -> str | None:
+        """Take the announcements that wait; which topic has more publishers than it should have."""
+        for _ in range(_FEW):
+            samples: list[Any] = []
+            with contextlib.suppress(*DECODE_ERRORS, *DDS_ERRORS):
+                samples = self._reader.take(1)
+            if not samples:
+                break
+            self._note(samples[0])
+        counts = dict.fromkeys(self._allowed, 0)
+        for topic in self._topics.values():
+            counts[topic] += 1
+        for topic, allowed in self._allowed.items():
+            if counts[topic] > allowed:
+                return f"{counts[topic]} publishers of {topic}, expected {allowed}"
+        return None
+
+    def _note(self, sample: Any) -> None:
+        if not sample.sample_info.valid_data:  # this publisher has left
+            self._topics.pop(str(sample.key), None)
+        elif str(sample.participant_key) != self._own and sample.topic_name in self._allowed:
+            self._topics[str(sample.key)] = sample.topic_name

@@ -1,0 +1,28 @@
+"""The emergency-stop keys of the robot's remote. Pure: samples in, one answer out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from firmware_bridge.unitree.ids import REMOTE_KEYS
+
+TOGETHER_NS: Final = 500_000_000
+"""Keys pressed within this time of each other count as one combination: nobody presses two keys in one 20 ms sample,
+and a sample with both of them can be lost."""
+_NEVER_NS: Final = -(2**62)
+
+
+class StopKeys:
+    """Notices the emergency-stop combination in any order of its keys."""
+
+    def __init__(self, keys: Sequence[str]) -> None:
+        """`keys`: names of `REMOTE_KEYS`, all of them needed."""
+        self._pressed_ns = {1 << REMOTE_KEYS.index(key): _NEVER_NS for key in keys}
+
+    def press(self, keys: int, now_ns: int) -> bool:
+        """Take the key bits of one sample; whether the combination is complete now."""
+        for bit in self._pressed_ns:
+            if keys & bit:
+                self._pressed_ns[bit] = now_ns
+        return keys != 0 and all(now_ns - pressed_ns <= TOGETHER_NS for pressed_ns in self._pressed_ns.values())
