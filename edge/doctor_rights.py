@@ -64,7 +64,7 @@ def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
     if not nodes:
         return Check(name, Level.FAIL, "none", "those of " + ", ".join(providers), "install the device's driver")
     files = {node: root / node.path.relative_to("/") for node in nodes}
-    closed = [node for node in nodes if not whom.may(files[node], write=True)]
+    closed = [node for node in nodes if not whom.may(files[node], write=_is_for_writing(files[node]))]
     if closed:
         groups = sorted({node.group for node in closed if node.group}) or ["video", "render"]
         found = f"{closed[0].path} and {len(closed) - 1} more are closed to {whom.name}"
@@ -73,6 +73,11 @@ def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
             return Check(name, Level.WARN, found, "all open", f"{FROM_UNIT}; without it: {advice}")
         return Check(name, Level.FAIL, found, "all open", advice)
     return Check(name, Level.OK, f"{len(nodes)} found, all open to {whom.name}", "all open")
+
+
+def _is_for_writing(node: Path) -> bool:
+    """Whether the driver lets anybody but root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
 
 
 def socket_folder(socket: Path, whom: Whom) -> Check:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import os
 import resource
 from dataclasses import replace
@@ -45,9 +46,25 @@ def test_device_nodes_must_be_there_and_open(tmp_path: Path) -> None:
     assert (closed.level, "usermod" in closed.advice, other.name in closed.found) == (Level.FAIL, True, True)
 
 
+def chgrp_to_a_group_of_no_power(node: Path) -> None:
+    """Root's own group never counts as a device's group; tests may run as root."""
+    if os.geteuid() == 0:
+        os.chown(node, -1, max(entry.gr_gid for entry in grp.getgrall()))
+
+
+def test_a_device_that_its_group_may_only_read_is_open_to_that_group(tmp_path: Path) -> None:
+    node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
+    node.chmod(0o440)  # as on the Orin of NVIDIA/NemoClaw #4231
+    chgrp_to_a_group_of_no_power(node)
+    member = Whom("service", 4242, frozenset({node.stat().st_gid}), other=True)
+    assert device_access([CUDA], tmp_path, member).level is Level.OK
+    assert device_access([CUDA], tmp_path, replace(member, groups=frozenset())).level is Level.WARN
+
+
 def test_a_device_that_the_units_groups_open_only_warns_for_the_services_user(tmp_path: Path) -> None:
     node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
     node.chmod(0o660)
+    chgrp_to_a_group_of_no_power(node)
     service = Whom("service", 4242, frozenset({4242}), other=True)
     assert device_access([CUDA], tmp_path, service).level is Level.WARN
     member = replace(service, groups=frozenset({node.stat().st_gid}))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import grp
 import json
+import os
 import shutil
+import stat
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +16,8 @@ import pytest
 
 from edge.artifact_files import seal
 from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
-from edge.device_nodes import device_nodes
+from edge.device import CUDA, TENSORRT
+from edge.device_nodes import PATTERNS, device_nodes, group_of
 from edge.install import main
 from edge.install_units import Host, robot_networks, unreadable
 from edge.signature import keygen
@@ -230,7 +234,8 @@ def orin_dir(artifacts_dir: Path, tmp_path: Path) -> Path:
 def jetson(host: Host) -> Host:
     nodes = host.root / "dev"
     (nodes / "nvgpu" / "igpu0").mkdir(parents=True)
-    for name in ("nvmap", "nvhost-ctrl", "nvgpu/igpu0/as", "sda"):
+    for name in ("nvmap", "nvhost-ctrl", "nvgpu/igpu0/as", "sda", "host1x-fence", "dri/renderD128", "dri/card0"):
+        (nodes / name).parent.mkdir(exist_ok=True)
         (nodes / name).touch()
         (nodes / name).chmod(0o666)
     return host
@@ -243,6 +248,8 @@ def test_the_jetsons_runner_gets_its_nodes_and_its_engines(
     text = (tmp_path / "units" / RUNNER_UNIT).read_text()
     assert code == EXIT_DONE
     assert [line for line in text.splitlines() if line.startswith("DeviceAllow")] == [
+        'DeviceAllow="/dev/dri/renderD128" rw',
+        'DeviceAllow="/dev/host1x-fence" rw',
         'DeviceAllow="/dev/nvgpu/igpu0/as" rw',
         'DeviceAllow="/dev/nvhost-ctrl" rw',
         'DeviceAllow="/dev/nvmap" rw',
@@ -262,9 +269,44 @@ def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> 
     (tmp_path / "dev").mkdir()
     (tmp_path / "dev" / "nvmap").touch()
     (tmp_path / "dev" / "nvmap").chmod(0o660)
-    (node,) = device_nodes(("CUDAExecutionProvider",), tmp_path)
+    if os.geteuid() == 0:
+        os.chown(tmp_path / "dev" / "nvmap", -1, max(entry.gr_gid for entry in grp.getgrall()))
+    (node,) = device_nodes((CUDA,), tmp_path)
     assert node.path == Path("/dev/nvmap")
-    assert node.group is not None
+    assert node.group == grp.getgrgid((tmp_path / "dev" / "nvmap").stat().st_gid).gr_name
+
+
+def test_a_node_of_the_root_group_does_not_put_the_runner_into_that_group() -> None:
+    assert group_of(os.stat_result((stat.S_IFCHR | 0o660, 0, 0, 1, 0, 0, 0, 0, 0, 0))) is None
+
+
+TRACED_CUDA_OPENS = (
+    *("nvmap", "host1x-fence", "dri/renderD128", "dri/renderD129", "nvsciipc", "nvidia0", "nvidiactl"),
+    *(f"nvgpu/igpu0/{name}" for name in ("as", "channel", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
+    *(f"nvhost-{name}-gpu" for name in ("as", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
+)
+"""Nodes that public traces of CUDA on an Orin name; not tried on a board by this project."""
+
+
+@pytest.mark.parametrize("provider", [CUDA, TENSORRT])
+@pytest.mark.parametrize("name", TRACED_CUDA_OPENS)
+def test_a_node_that_cuda_opens_on_an_orin_is_let_through(tmp_path: Path, provider: str, name: str) -> None:
+    node = tmp_path / "dev" / name
+    node.parent.mkdir(parents=True)
+    node.touch()
+    assert [found.path for found in device_nodes((provider,), tmp_path)] == [Path("/dev") / name]
+
+
+def test_every_pattern_of_device_nodes_names_its_source() -> None:
+    assert all(pattern.source for patterns in PATTERNS.values() for pattern in patterns)
+
+
+@pytest.mark.parametrize("name", ["dri/card0", "sda", "video0", "mem", "nvme0n1"])
+def test_other_nodes_stay_closed(tmp_path: Path, name: str) -> None:
+    node = tmp_path / "dev" / name
+    node.parent.mkdir(parents=True)
+    node.touch()
+    assert device_nodes((CUDA, TENSORRT), tmp_path) == []
 
 
 def test_what_the_services_user_could_not_read_is_named(tmp_path: Path) -> None:
