@@ -18,13 +18,14 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
 from firmware_bridge.client_link import ClientLink, SocketTakenError
 from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs
+from firmware_bridge.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
@@ -36,6 +37,8 @@ _OPERATORS: Final = 4  # at a time
 _LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
+_STARTING_S: Final = 20.0  # the unit's TimeoutStartSec, which moves on while the bridge waits for its interface
+_EXTEND_NS: Final = 5_000_000_000
 _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
 
 EPILOG: Final = """examples:
@@ -58,14 +61,25 @@ class Bridge:
     def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier) -> None:
         self._log = log
         self._notifier = notifier
-        self._robot = RobotLink(config, log.say)
+        self._config = config
+        self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
+        self._join_robot()
         self._link = ClientLink(config.bridge.socket)
         self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), places=_OPERATORS)
         self._estop_file = config.safety.estop_file
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns())
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
-        self._said, self._ready = "", False
+        self._said, self._ready, self._extended_ns = "", False, -_EXTEND_NS
+
+    @property
+    def greeting(self) -> str:
+        """What this bridge serves, or what it waits for, in one line."""
+        dds, socket_path = self._config.dds, self._config.bridge.socket
+        if isinstance(self._robot, AbsentRobot):
+            return f"{self._robot.reason}; plug in the robot's cable, or correct dds.interface in the robot file"
+        where = f"domain {dds.domain} on {dds.interface}, socket {socket_path}"
+        return f"ready, robot {self._config.name}, {where}"
 
     def run(self, wakeup: socket.socket) -> None:
         """Serve until a byte arrives on `wakeup`; leave with the robot stopped, whatever happens."""
@@ -106,7 +120,17 @@ class Bridge:
         ready = poller.poll(max(-(-left_ns // 1_000_000), 0))
         return any(fd == wakeup.fileno() for fd, _ in ready)
 
+    def _join_robot(self) -> bool:
+        """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
+        if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
+            return False
+        self._robot = RobotLink(self._config, self._log.say)
+        settle_memory()
+        return True
+
     def _step(self, *, shutdown: bool = False) -> Outputs:
+        if self._join_robot():
+            self._log.say(self.greeting)
         asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
         messages, operator = self._link.receive(), self._operators.receive()
         robot = self._robot.read(time.monotonic_ns())
@@ -115,14 +139,24 @@ class Bridge:
         outputs = self._core.step(inputs, time.monotonic_ns())
         for request in outputs.requests:
             self._robot.write(request)
+        if isinstance(self._robot, AbsentRobot):
+            outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
         self._link.tell(outputs.status)
         self._operators.tell(outputs.status)
         self._report_progress(outputs.status)
         return outputs
 
+    def _report_start(self, said: str, now_ns: int) -> None:
+        if not isinstance(self._robot, AbsentRobot):
+            self._ready = self._notifier.ready(said)  # again until the manager has taken it
+        elif now_ns - self._extended_ns >= _EXTEND_NS and self._notifier.extend(_STARTING_S):
+            # Not ready: a runner that starts after this bridge would end at once without the interface.
+            self._extended_ns = now_ns
+
     def _report_progress(self, status: BridgeStatus) -> None:
         said = f"{status.state}: {status.reason}"
-        self._ready = self._ready or self._notifier.ready(said)  # again until the manager has taken it
+        if not self._ready:
+            self._report_start(said, status.stamp_ns)
         if said != self._said:
             self._said = said
             self._log.say(said)
@@ -143,6 +177,12 @@ def is_pressed(path: Path) -> bool:
             os.close(file)
     except OSError:
         return True
+
+
+def settle_memory() -> None:
+    """Let the garbage collector pass over everything that exists now: later collections look at a step's objects."""
+    gc.collect()
+    gc.freeze()
 
 
 def lock_memory() -> str | None:
@@ -175,10 +215,8 @@ def serve(config: RobotConfig) -> dict[str, object]:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
         bridge = Bridge(config, log, notifier)
-        where = f"domain {config.dds.domain} on {config.dds.interface}, socket {config.bridge.socket}"
-        log.say(f"ready, robot {config.name}, {where}")
-        gc.collect()
-        gc.freeze()  # what exists now stays; collections look at a step's objects only
+        log.say(bridge.greeting)
+        settle_memory()
         if (unlocked := lock_memory()) is not None:
             log.say(unlocked)
         try:
