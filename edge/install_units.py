@@ -24,7 +24,7 @@ from edge.manifest import Artifacts, load_artifacts
 from edge.prompt import check_instruction
 from edge.signature import STATE_DIRECTORY, Trust
 from edge.target_facts import TargetFacts, target_facts
-from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
+from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.unit_text import UnitError
 from firmware_bridge.config import DdsConfig, load_robot_config
 
@@ -61,6 +61,7 @@ class Host:
     addresses: Callable[[], Addresses] = interface_addresses
     user_exists: Callable[[str], bool] = user_exists
     check: Callable[[Sequence[Path]], UnitVerdict] = check_units
+    systemd: Callable[[], int | None] = systemd_version
     programs: Path = field(default_factory=lambda: Path(sys.executable).parent)
     python: Path = field(default_factory=lambda: Path(sys.executable))
     prefixes: tuple[Path, ...] = field(
@@ -202,6 +203,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         control_priority=artifacts.runtime.control_priority,
         operator_arm=robot.safety.operator_arm,
         bridge_cores=_bridge_cores(artifacts, facts),
+        systemd=host.systemd(),
     )
 
 

@@ -1,9 +1,9 @@
 """systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
 
 Two services of one user. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
-at once and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot. systemd
-restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that keeps the
-promise in milliseconds.
+without end and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot.
+systemd restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that
+keeps the promise in milliseconds.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
 """systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
 BRIDGE_PRIORITY: Final = 60
 """Above every priority that a target may give the control thread by default (50): the stop comes first."""
+RESTART_STEPS_SINCE: Final = 254
+"""First version of systemd with RestartSteps= (its NEWS file)."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
 """Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
@@ -79,6 +81,8 @@ class ServiceInputs:
     """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
     bridge_cores: tuple[int, ...]
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
+    systemd: int | None
+    """Version of the machine's systemd; None: unknown, and only keys that version 249 knows are written."""
 
     def __post_init__(self) -> None:
         for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
@@ -115,7 +119,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         *_ending(watchdog_s=1, start_s=20, stop_s=2),
         "Always, also after a clean exit: without it the robot has nobody that can stop it.",
         ("Restart", "always"),
-        ("RestartSec", "100ms"),
+        *_back_off(inputs.systemd),
         "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
         ("CPUSchedulingPolicy", "fifo"),
         ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
@@ -140,10 +144,11 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("SystemCallFilter", "@system-service"),
         ("SystemCallFilter", "~@privileged @resources"),
     ]
-    unit = [
+    unit: list[Setting | str] = [
         ("Description", "tic-vla-edge bridge: the only process that commands the robot"),
-        *_network(inputs),
-        *_restarts(60),
+        "Ordered after no network: the bridge itself waits for its interface, and takes an emergency stop meanwhile.",
+        "No limit of starts: a robot must not be left without a bridge.",
+        ("StartLimitIntervalSec", "0"),
     ]
     return _render("bridge", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
 
@@ -199,6 +204,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
         "connection ends with the old bridge. After: at shutdown the runner stops first.",
         ("Wants", BRIDGE_UNIT),
         ("After", BRIDGE_UNIT),
+        *_network(inputs),
         # A start that fails slowly must be counted too, so the window holds several of the longest starts.
         *_restarts(900),
     ]
@@ -233,6 +239,13 @@ def _network(inputs: ServiceInputs) -> list[Setting | str]:
     if inputs.over_loopback:
         return []
     return [("Wants", "network-online.target"), ("After", "network-online.target")]
+
+
+def _back_off(systemd: int | None) -> list[Setting | str]:
+    """Delays between restarts of the bridge: short after a crash, longer while something persistent is wrong."""
+    if systemd is None or systemd < RESTART_STEPS_SINCE:
+        return [("RestartSec", "1s")]
+    return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
 
 
 def _restarts(window_s: int) -> list[Setting | str]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from edge.device import CUDA
 from edge.graph import CPU_PROVIDER
-from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
+from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.unit_text import UnitError, argument, bound, word
 from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SOCKET, ServiceInputs, bridge_unit, runner_unit, sysusers
 
@@ -43,6 +43,7 @@ def inputs(**changes: object) -> ServiceInputs:
         control_priority=50,
         operator_arm=True,
         bridge_cores=(),
+        systemd=252,
     )
     return dataclasses.replace(defaults, **changes)
 
@@ -182,7 +183,34 @@ def test_a_stopped_process_cannot_hold_up_its_own_end(unit) -> None:
     assert found["WatchdogSignal"] == ["SIGKILL"]
     assert int(found["WatchdogSec"][0]) <= 3
     assert {"TimeoutAbortSec", "TimeoutStopSec", "TimeoutStartSec"} <= set(found)
-    assert found["StartLimitBurst"] == ["5"]
+
+
+def test_a_runner_that_keeps_failing_is_given_up() -> None:
+    assert settings(runner_unit(inputs()))["StartLimitBurst"] == ["5"]
+
+
+@pytest.mark.parametrize("version", [None, 249, 252, 254, 257])
+def test_a_bridge_that_keeps_failing_is_started_again_without_end(version: int | None) -> None:
+    found = settings(bridge_unit(inputs(systemd=version)))
+    assert (found["StartLimitIntervalSec"], found["Restart"]) == (["0"], ["always"])
+    assert "StartLimitBurst" not in found
+
+
+@pytest.mark.parametrize("version", [None, 249, 253])
+def test_an_older_systemd_restarts_the_bridge_every_second(version: int | None) -> None:
+    found = settings(bridge_unit(inputs(systemd=version)))
+    assert found["RestartSec"] == ["1s"]
+    assert not {"RestartSteps", "RestartMaxDelaySec"} & set(found)
+
+
+def test_a_newer_systemd_restarts_the_bridge_at_once_and_then_backs_off() -> None:
+    found = settings(bridge_unit(inputs(systemd=254)))
+    assert (found["RestartSec"], found["RestartSteps"], found["RestartMaxDelaySec"]) == (["100ms"], ["5"], ["5s"])
+
+
+def test_the_bridge_waits_for_no_network_so_that_it_can_latch_a_stop_before_the_cable_is_in() -> None:
+    assert "network-online.target" not in bridge_unit(inputs())
+    assert "network-online.target" in runner_unit(inputs())
 
 
 def test_slow_failing_starts_of_the_runner_are_counted_within_one_window() -> None:
@@ -198,8 +226,7 @@ def test_only_the_robots_network_is_let_through() -> None:
 
 
 def test_a_simulated_robot_needs_no_network_to_be_up() -> None:
-    assert "network-online.target" in bridge_unit(inputs())
-    assert "network-online.target" not in bridge_unit(inputs(over_loopback=True))
+    assert "network-online.target" not in runner_unit(inputs(over_loopback=True))
 
 
 def test_what_lies_in_a_home_folder_is_shown_and_nothing_else() -> None:
@@ -307,6 +334,29 @@ def test_a_service_that_gives_nothing_up_is_too_exposed(tmp_path: Path) -> None:
     verdict = check_units([path])
     assert verdict.exposure[BRIDGE_UNIT] > MAX_EXPOSURE
     assert not verdict.good
+
+
+@needs_systemd
+def test_this_machines_systemd_knows_every_key_of_the_bridges_back_off(tmp_path: Path) -> None:
+    service = inputs(programs=programs(tmp_path / "bin"), systemd=systemd_version())
+    assert check_units(written(tmp_path, service)).complaints == ()
+
+
+@pytest.mark.parametrize(
+    ("answer", "version"),
+    [
+        ((0, "systemd 252 (252.38-1~deb12u1)\n+PAM"), 252),
+        ((0, "systemd 255.4 (255.4-1ubuntu8)\n"), 255),
+        ((1, ""), None),
+        ((0, "nothing of the kind"), None),
+    ],
+)
+def test_systemds_version_is_read(answer: tuple[int, str], version: int | None) -> None:
+    assert systemd_version(run=lambda _command: answer, which=lambda name: name) == version
+
+
+def test_without_systemd_there_is_no_version() -> None:
+    assert systemd_version(which=lambda _name: None) is None
 
 
 def test_without_systemd_the_verdict_says_that_nothing_was_checked(tmp_path: Path) -> None:
