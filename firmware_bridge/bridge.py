@@ -22,7 +22,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.client_link import ClientLink, SocketTakenError
+from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
 from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs
 from firmware_bridge.late_interface import AbsentRobot, is_interface_up
@@ -48,8 +48,8 @@ EPILOG: Final = """examples:
                                          drive, so that the runner may arm again; where the robot file says
                                          operator_arm, no runner arms without it, and it serves one arming
   edge-bridge status --robot go2.toml    what the running bridge is doing
-stop, arm and status look for a bridge at the installed service's socket (run them with sudo then) and at the robot
-file's, or at --socket only.
+stop, arm and status look for a bridge at the installed service's socket (run them with sudo then, or as a member of
+tic-vla-operators) and at the robot file's, or at --socket only.
 exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, status: done); 1 internal failure, robot stopped
 (stop: not confirmed by every bridge); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop,
 arm, status: no bridge is running, or none that this user may reach; arm: more than one)"""
@@ -58,14 +58,15 @@ arm, status: no bridge is running, or none that this user may reach; arm: more t
 class Bridge:
     """Shell around BridgeCore: joins sockets, robot and clock. Raises DdsError, ConfigError, SocketTakenError."""
 
-    def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier) -> None:
+    def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier, groups: SocketGroups = USER_ONLY) -> None:
         self._log = log
         self._notifier = notifier
         self._config = config
         self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
         self._join_robot()
-        self._link = ClientLink(config.bridge.socket)
-        self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), places=_OPERATORS)
+        self._link = ClientLink(config.bridge.socket, group=groups.runner)
+        operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
+        self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
         self._estop_file = config.safety.estop_file
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns())
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
@@ -209,12 +210,12 @@ def signals_to_socket() -> Iterator[socket.socket]:
             signal.set_wakeup_fd(-1)
 
 
-def serve(config: RobotConfig) -> dict[str, object]:
+def serve(config: RobotConfig, groups: SocketGroups) -> dict[str, object]:
     """Be the bridge until a signal; the JSON result. Raises what `Bridge` raises."""
     with signals_to_socket() as wakeup:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
-        bridge = Bridge(config, log, notifier)
+        bridge = Bridge(config, log, notifier, groups)
         log.say(bridge.greeting)
         settle_memory()
         if (unlocked := lock_memory()) is not None:
@@ -240,12 +241,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--robot", required=True, metavar="FILE.toml", help="robot file")
     parser.add_argument("--socket", type=Path, metavar="PATH", help="socket of the bridge, instead of the robot file's")
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain, instead of the robot file's")
+    parser.add_argument("--runner-group", metavar="NAME", help="serve: group that may command (default: none)")
+    parser.add_argument("--operator-group", metavar="NAME", help="serve: group that may stop and arm (default: none)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
-            code, result = 0, serve(config)
+            code, result = 0, serve(config, SocketGroups(args.runner_group, args.operator_group))
         else:
             from firmware_bridge.operate import operate  # never part of the process that serves
 
