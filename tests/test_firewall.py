@@ -119,7 +119,8 @@ LOOP = """
 import os, socket, struct
 os.setuid(1)
 group = struct.pack("4s4s", socket.inet_aton("239.255.0.1"), socket.inet_aton("192.168.123.99"))
-with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as said:
+udp = (socket.AF_INET, socket.SOCK_DGRAM)
+with socket.socket(*udp) as heard, socket.socket(*udp) as said:
     heard.bind(("", 7400))
     heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
     heard.settimeout(2)

@@ -20,10 +20,11 @@ from edge.device import CUDA, TENSORRT
 from edge.device_nodes import PATTERNS, device_nodes, group_of
 from edge.install import main
 from edge.install_units import Host, robot_networks, unreadable
+from edge.service_users import SYSUSERS_FILE
 from edge.signature import keygen
 from edge.unit_check import UnitVerdict
 from edge.unit_text import UnitError
-from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SOCKET, SYSUSERS_FILE
+from edge.units import BRIDGE_UNIT, FIREWALL_FILE, FIREWALL_UNIT, RUNNER_UNIT, SOCKET
 from export.target import load_target
 from firmware_bridge.config import DdsConfig
 from tests.processes import REPOSITORY
@@ -43,7 +44,8 @@ def host(tmp_path: Path) -> Host:
     return Host(
         root=tmp_path / "root",
         addresses=lambda: ADDRESSES,
-        user_exists=lambda _name: False,
+        nft=lambda: Path("/usr/sbin/nft"),
+        systemd=lambda: 252,
         check=lambda _paths: GOOD,
         programs=programs,
         python=programs / "python",
@@ -79,7 +81,8 @@ def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
 def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Units, tmp_path: Path) -> None:
     code, result = units()
     assert code == EXIT_DONE
-    assert {path.name for path in (tmp_path / "units").iterdir()} == {BRIDGE_UNIT, RUNNER_UNIT, SYSUSERS_FILE}
+    expected = {BRIDGE_UNIT, RUNNER_UNIT, FIREWALL_UNIT, FIREWALL_FILE, SYSUSERS_FILE}
+    assert {path.name for path in (tmp_path / "units").iterdir()} == expected
     assert result is not None
     assert result["exposure"] == GOOD.exposure
     assert result["commands"][-3:-1] == [
@@ -130,9 +133,50 @@ def test_consent_that_the_robot_file_makes_useless_is_said(units: Units, capsys:
     assert "--arm-at-start changes nothing" in capsys.readouterr().err
 
 
-def test_a_user_that_exists_is_not_made_again(units: Units, host: Host, tmp_path: Path) -> None:
-    units(on=replace(host, user_exists=lambda _name: True))
-    assert {path.name for path in (tmp_path / "units").iterdir()} == {BRIDGE_UNIT, RUNNER_UNIT}
+def test_the_users_are_made_before_anything_starts(units: Units) -> None:
+    _, result = units()
+    assert result is not None
+    starts = [index for index, command in enumerate(result["commands"]) if "enable" in command]
+    assert result["commands"].index("sudo systemd-sysusers") < starts[0]
+    assert 'sudo usermod -aG tic-vla-operators "$USER"' in result["commands"]
+    assert FIREWALL_UNIT in result["commands"][starts[0]]
+
+
+def test_names_of_users_and_group_can_be_given(units: Units, tmp_path: Path) -> None:
+    names = ("--bridge-user", "b", "--runner-user", "r", "--operator-group", "o")
+    assert units(*names)[0] == EXIT_DONE
+    text = (tmp_path / "units" / BRIDGE_UNIT).read_text()
+    assert "\nUser=b\n" in text and '"--runner-group" "r" "--operator-group" "o"' in text
+    assert units("--bridge-user", "r", "--runner-user", "r")[0] == EXIT_BAD_INPUT
+
+
+def test_without_nft_the_rules_are_written_and_the_lack_is_said(
+    units: Units, host: Host, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert units(on=replace(host, nft=lambda: None))[0] == EXIT_DONE
+    written = {path.name for path in (tmp_path / "units").iterdir()}
+    assert FIREWALL_FILE in written and FIREWALL_UNIT not in written
+    assert "apt install nftables" in capsys.readouterr().err
+
+
+def test_a_firewall_that_lets_a_whole_network_through_is_said_to(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units()
+    assert "give the robot's own address with --network" in capsys.readouterr().err
+    units("--network", "192.168.123.161/32", "--force")
+    assert "give the robot's own address" not in capsys.readouterr().err
+    assert "elements = { 192.168.123.161 }" in (tmp_path / "units" / FIREWALL_FILE).read_text()
+    # The bridge still notices requests that other programs of this machine publish.
+    assert "IPAddressAllow=192.168.123.161/32 192.168.123.99/32" in (tmp_path / "units" / BRIDGE_UNIT).read_text()
+
+
+def test_a_simulated_robot_gets_no_firewall(units: Units, tmp_path: Path) -> None:
+    robot = tmp_path / "sim.toml"
+    simulated = SHIPPED.with_name("go2_sim.toml").read_text()
+    robot.write_text(simulated.replace("operator_arm = false", "operator_arm = true"))
+    assert units(robot=robot)[0] == EXIT_DONE
+    assert not {FIREWALL_FILE, FIREWALL_UNIT} & {path.name for path in (tmp_path / "units").iterdir()}
 
 
 def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Host) -> None:
@@ -140,6 +184,7 @@ def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Hos
     assert code == EXIT_DONE
     assert (host.root / "etc/systemd/system" / RUNNER_UNIT).stat().st_mode & 0o777 == 0o644
     assert (host.root / "etc/sysusers.d" / SYSUSERS_FILE).is_file()
+    assert (host.root / "etc/tic-vla-edge" / FIREWALL_FILE).is_file()
 
 
 def test_the_runners_memory_is_what_the_target_leaves_it(units: Units, tmp_path: Path) -> None:
