@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 
 from edge.firewall import CableRules, ports, ruleset
+from edge.service_users import BRIDGE_USER, RUNNER_USER
 from edge.unit_text import UnitError
+from tests.processes import REPOSITORY
 
 ROBOT = IPv4Network("192.168.123.161/32")
 NFT = shutil.which("nft", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
@@ -162,3 +164,9 @@ def test_the_kernel_lets_only_the_services_users_send_and_only_to_the_robot(tmp_
     attempts = [f"{sys.executable} {script} {' '.join(attempt)}" for attempt in ATTEMPTS]
     answers = in_a_network_of_its_own(tmp_path, *attempts).split()
     assert dict(zip(ATTEMPTS, answers, strict=True)) == ATTEMPTS
+
+
+def test_the_lines_on_the_page_are_the_generated_ones() -> None:
+    page = (REPOSITORY / "docs" / "robot_network.md").read_text(encoding="utf-8")
+    shown = page.split("```")[1].strip().splitlines()
+    assert shown == chain(ruleset(rules(users=(BRIDGE_USER, RUNNER_USER))), "output")[: len(shown)]
