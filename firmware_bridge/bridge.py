@@ -147,9 +147,9 @@ class Bridge:
         self._report_progress(outputs.status)
         return outputs
 
-    def _report_start(self, said: str, now_ns: int) -> None:
+    def _report_start(self, text: str, now_ns: int) -> None:
         if not isinstance(self._robot, AbsentRobot):
-            self._ready = self._notifier.ready(said)  # again until the manager has taken it
+            self._ready = self._notifier.ready(text)  # again until the manager has taken it
         elif now_ns - self._extended_ns >= _EXTEND_NS and self._notifier.extend(_STARTING_S):
             # Not ready: a runner that starts after this bridge would end at once without the interface.
             self._extended_ns = now_ns
