@@ -146,7 +146,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("MemorySwapMax", "0"),
         ("TasksMax", "64"),
         ("RuntimeDirectory", SOCKET.parent.name),
-        "Other users may pass through to the sockets, whose modes decide, and write nothing here: clients rely on that.",
+        "Other users pass through to the sockets, whose modes decide, and write nothing here: clients rely on that.",
         ("RuntimeDirectoryMode", "0711"),
         ("RuntimeDirectoryPreserve", "restart"),
         *_hardening(inputs, (inputs.robot, *inputs.robot_files)),
