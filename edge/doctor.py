@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
-from edge import doctor_graphs, doctor_machine, doctor_rights, doctor_robot, engines
+from edge import doctor_cable, doctor_graphs, doctor_machine, doctor_rights, doctor_robot, engines
 from edge.artifact_files import MANIFEST_NAME, ArtifactError, read_manifest
 from edge.cli import (
     EXIT_BAD_INPUT,
@@ -42,7 +42,8 @@ from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
 EXAMPLES = """examples:
   edge-doctor --artifacts out/orin --robot go2.toml
   edge-doctor --artifacts out/orin --target orin --json -
-  sudo edge-doctor --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --user tic-vla-edge
+  sudo edge-doctor --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml \\
+       --socket /run/tic-vla-edge/bridge.sock --user tic-vla-runner
   edge-doctor
 
 What is not given is not looked at, and said so. It opens the graphs and runs ticks on a black picture; it asks the
@@ -134,6 +135,7 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     yield from _graphs(args, loaded, plan)
     yield robot_check
     if robot is not None:
+        yield doctor_cable.cable(robot.dds.interface, root)
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
 

@@ -17,9 +17,13 @@ from edge.power.meter import MeterError, PowerMeter, PowerSample
 from edge.power.rapl import ZONES
 from edge.power.thermal import ThermalReader
 from edge.scheduling import Role, enter
+from edge.service_users import RUNNER_USER
 from edge.units import NEED_DEVICES
+from firmware_bridge.config import OPERATOR_SUFFIX
 
 FROM_UNIT = "the service gets it from its unit (edge-install units)"
+SHARED_FOLDER_MODE = 0o711
+"""Of the installed service's folder: the modes of the sockets in it decide."""
 _SETTLE_S = 0.2
 """Between opening a meter and reading it: one that counts energy needs some."""
 
@@ -64,7 +68,7 @@ def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
     if not nodes:
         return Check(name, Level.FAIL, "none", "those of " + ", ".join(providers), "install the device's driver")
     files = {node: root / node.path.relative_to("/") for node in nodes}
-    closed = [node for node in nodes if not whom.may(files[node], write=True)]
+    closed = [node for node in nodes if not whom.may(files[node], write=_is_for_writing(files[node]))]
     if closed:
         groups = sorted({node.group for node in closed if node.group}) or ["video", "render"]
         found = f"{closed[0].path} and {len(closed) - 1} more are closed to {whom.name}"
@@ -75,8 +79,13 @@ def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
     return Check(name, Level.OK, f"{len(nodes)} found, all open to {whom.name}", "all open")
 
 
+def _is_for_writing(node: Path) -> bool:
+    """Whether the driver lets anybody but root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
+
+
 def socket_folder(socket: Path, whom: Whom) -> Check:
-    """That only the robot's user can reach the bridge's socket."""
+    """That only the robot's users can reach the bridge's sockets: one user alone, or the service's groups."""
     name = "socket folder"
     folder = socket.parent
     try:
@@ -85,12 +94,41 @@ def socket_folder(socket: Path, whom: Whom) -> Check:
         return skipped(name, f"{folder}: {error.strerror}; edge-bridge makes it")
     mode = stat.S_IMODE(found.st_mode)
     said = f"{folder}, mode {mode:04o}, user {found.st_uid}"
+    if mode == SHARED_FOLDER_MODE:
+        return _service_sockets(socket, whom, found.st_uid)
     if mode & 0o077:
-        return Check(name, Level.FAIL, said, "mode 0700", f"chmod 0700 {folder}: anybody could command the robot")
+        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: anybody could command the robot"
+        return Check(name, Level.FAIL, said, expected, advice)
     if found.st_uid != whom.uid and whom.uid != 0:
         expected = f"user {whom.uid} ({whom.name})"
         return Check(name, Level.FAIL, said, expected, "run bridge and runner as one user, or name it with --user")
     return Check(name, Level.OK, f"{said} ({whom.name})", "mode 0700")
+
+
+def _service_sockets(socket: Path, whom: Whom, bridge_uid: int) -> Check:
+    """Modes and groups of the installed service's two sockets, as the runner meets them."""
+    name = "bridge sockets"
+    operator = Path(f"{socket}{OPERATOR_SUFFIX}")
+    try:
+        commands, stops = socket.stat(), operator.stat()
+    except OSError as error:
+        return skipped(name, f"{error.filename}: {error.strerror}; start the bridge, which makes it")
+    said = f"{socket} of group {commands.st_gid}, {operator.name} of group {stops.st_gid}"
+    for path, status in ((socket, commands), (operator, stops)):
+        if stat.S_IMODE(status.st_mode) & 0o007:
+            found = f"{path}, mode {stat.S_IMODE(status.st_mode):04o}"
+            return Check(name, Level.FAIL, found, "mode 0660 or less", "restart the bridge, which sets the modes")
+    if whom.uid == 0:
+        return Check(name, Level.OK, f"{said}; closed to other users", "mode 0660")
+    if whom.uid == bridge_uid or stops.st_gid in whom.groups:
+        advice = (
+            "run the runner as a user of its own, outside the operators' group: it could take back an emergency stop"
+        )
+        return Check(name, Level.FAIL, f"{whom.name} reaches {operator}", "a runner that cannot operate", advice)
+    if commands.st_gid not in whom.groups:
+        advice = f"name the runner's user with --user (edge-install units: {RUNNER_USER})"
+        return Check(name, Level.FAIL, f"{whom.name} does not reach {socket}", "the runner's user", advice)
+    return Check(name, Level.OK, f"{said}; {whom.name} reaches the first only", "the command socket only")
 
 
 def power_meter(

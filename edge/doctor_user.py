@@ -38,10 +38,9 @@ class Whom:
         return (stat.S_IMODE(found.st_mode) >> shift) & wanted == wanted
 
     def through_its_group(self, path: Path) -> bool:
-        """Whether the group of a file may read and write it, so that membership would do."""
-        wanted = stat.S_IRGRP | stat.S_IWGRP
+        """Whether the group of a file may read it, so that membership would do."""
         try:
-            return path.stat().st_mode & wanted == wanted
+            return path.stat().st_mode & stat.S_IRGRP != 0
         except OSError:
             return False
 

@@ -162,6 +162,12 @@ START: tuple[Fault, ...] = (
         "tests/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
     ),
     Fault(
+        "interface-absent", 46, Action.STOP, 0, "start",
+        "The robot's network interface is absent or has no address: the bridge waits, and keeps an emergency stop.",
+        "Plug in the robot's cable, or correct dds.interface in the robot file.",
+        "tests/test_bridge_late_interface.py::TestProcess::test_it_serves_once_the_interface_appears",
+    ),
+    Fault(
         "wrong-robot", 58, Action.STOP, 0, "start",
         "The robot file is for another robot or protocol.",
         "Name the file of the robot that is connected.",

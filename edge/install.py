@@ -29,7 +29,7 @@ EXAMPLES = """examples:
   edge-install engines --artifacts out/orin --engines /var/lib/tic-vla/engines --json -
   edge-install units --artifacts out/orin --robot go2.toml --instruction "walk to the vending machine" --out units
   sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
-       --instruction-file /etc/tic-vla/instruction.txt --system
+       --instruction-file /etc/tic-vla/instruction.txt --network 192.168.123.161/32 --system
 
 units wants a robot file with operator_arm = true in [safety], or --arm-at-start.
 
@@ -52,7 +52,9 @@ def parser() -> argparse.ArgumentParser:
         "--engines", type=Path, metavar="DIR", help="where to keep them (default: DIR.engines beside it)"
     )
     build.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
-    service = commands.add_parser("units", help="write the systemd units of bridge and runner, and check them")
+    service = commands.add_parser(
+        "units", help="write systemd units, users and firewall of bridge and runner, and check them"
+    )
     install_units.add_arguments(service)
     return p
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import pwd
 import shlex
+import shutil
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -22,14 +22,16 @@ from edge.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.device_nodes import device_nodes
 from edge.instructions import check_first_instruction
 from edge.manifest import Artifacts, load_artifacts
+from edge.service_users import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER, SYSUSERS_FILE, ServiceUsers, sysusers
 from edge.target_facts import TargetFacts, target_facts
 from edge.trust import STATE_DIRECTORY, Trust
-from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
+from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.unit_text import UnitError
 from firmware_bridge.config import DdsConfig, load_robot_config
 
 SYSTEM_UNITS: Final = Path("etc/systemd/system")
 SYSTEM_USERS: Final = Path("etc/sysusers.d")
+SYSTEM_RULES: Final = units.FIREWALL_FOLDER.relative_to("/")
 _MAX_INSTRUCTION_BYTES: Final = 16_384
 
 Addresses = Mapping[str, Sequence[tuple[str, str]]]
@@ -44,13 +46,10 @@ def interface_addresses() -> Addresses:
     }
 
 
-def user_exists(name: str) -> bool:
-    """Whether this machine has a user of that name."""
-    try:
-        pwd.getpwnam(name)
-    except KeyError:
-        return False
-    return True
+def nft_program() -> Path | None:
+    """Program that loads firewall rules; None: not installed."""
+    found = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
+    return None if found is None else Path(found)
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,9 @@ class Host:
 
     root: Path = Path("/")
     addresses: Callable[[], Addresses] = interface_addresses
-    user_exists: Callable[[str], bool] = user_exists
+    nft: Callable[[], Path | None] = nft_program
     check: Callable[[Sequence[Path]], UnitVerdict] = check_units
+    systemd: Callable[[], int | None] = systemd_version
     programs: Path = field(default_factory=lambda: Path(sys.executable).parent)
     python: Path = field(default_factory=lambda: Path(sys.executable))
     prefixes: tuple[Path, ...] = field(
@@ -81,9 +81,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
     parser.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
     parser.add_argument("--trust", type=Path, metavar="KEY.pub", help="run only artifacts that this key has signed")
-    parser.add_argument(
-        "--user", default=units.DEFAULT_USER, metavar="NAME", help=f"who runs both (default: {units.DEFAULT_USER})"
-    )
+    for option, default, purpose in (
+        ("--bridge-user", BRIDGE_USER, "user of the bridge"),
+        ("--runner-user", RUNNER_USER, "user of the runner"),
+        ("--operator-group", OPERATOR_GROUP, "group of the people that may stop and arm"),
+    ):
+        parser.add_argument(option, default=default, metavar="NAME", help=f"{purpose} (default: {default})")
     parser.add_argument(
         "--network",
         action="append",
@@ -125,7 +128,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{inputs.robot}: says operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
     closed = unreadable(needed)
     for path in closed:
-        say(f"{path}: {inputs.user} cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
+        say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
+    _say_firewall(inputs, say)
     contents = _contents(args, inputs, host)
     written = _write(contents, force=args.force)
     for path in contents:
@@ -193,9 +197,12 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         engines=folder,
         trust=None if args.trust is None else args.trust.resolve(),
         instruction=check_first_instruction(_instruction(args)),
-        user=args.user,
+        users=ServiceUsers(args.bridge_user, args.runner_user, args.operator_group),
+        interface=robot.dds.interface,
+        domain=robot.dds.domain,
         networks=robot_networks(robot.dds, args.network, host.addresses),
-        over_loopback=robot.dds.interface == "lo",
+        own=tuple(IPv4Network(address) for address, _ in host.addresses().get(robot.dds.interface, ())),
+        nft=host.nft(),
         providers=providers,
         devices=tuple(node.path for node in nodes),
         groups=tuple(sorted({node.group for node in nodes if node.group is not None})),
@@ -203,6 +210,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         control_priority=artifacts.runtime.control_priority,
         operator_arm=robot.safety.operator_arm,
         bridge_cores=_bridge_cores(artifacts, facts),
+        systemd=host.systemd(),
     )
 
 
@@ -279,10 +287,27 @@ def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host)
         folder / units.BRIDGE_UNIT: units.bridge_unit(inputs),
         folder / units.RUNNER_UNIT: units.runner_unit(inputs),
     }
-    if not host.user_exists(inputs.user):
-        users = host.root / SYSTEM_USERS if args.system else folder
-        contents[users / units.SYSUSERS_FILE] = units.sysusers(inputs.user)
+    users = host.root / SYSTEM_USERS if args.system else folder
+    contents[users / SYSUSERS_FILE] = sysusers(inputs.users)
+    if not inputs.over_loopback:
+        rules = host.root / SYSTEM_RULES if args.system else folder
+        contents[rules / units.FIREWALL_FILE] = units.firewall_rules(inputs)
+        if inputs.nft is not None:
+            contents[folder / units.FIREWALL_UNIT] = units.firewall_unit(inputs)
     return contents
+
+
+def _say_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) -> None:
+    if inputs.over_loopback:
+        return
+    if inputs.nft is None:
+        say("nft is not on this machine, so nothing loads the firewall: sudo apt install nftables, then run this again")
+    wide = [network for network in inputs.networks if network.prefixlen < 32]
+    if wide:
+        say(
+            f"the firewall lets {', '.join(map(str, wide))} through: give the robot's own address with --network, e.g. "
+            f"192.168.123.161/32, to let only the robot through"
+        )
 
 
 def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
@@ -318,8 +343,11 @@ def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
 
 def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, system: bool) -> list[str]:
     """Commands that make the services run, for the operator to give."""
-    prepare = [] if system else [f"sudo cp {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
-    prepare += ["sudo systemd-sysusers"] if any(path.suffix == ".conf" for path in contents) else []
+    prepare = (
+        [] if system else [f"sudo install -D -m 0644 {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
+    )
+    prepare += ["sudo systemd-sysusers", f'sudo usermod -aG {inputs.users.operators} "$USER"']
+    firewall = [path.name for path in contents if path.name == units.FIREWALL_UNIT]
     # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before somebody has
     # looked at it.
     drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
@@ -328,6 +356,7 @@ def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, syst
     return [
         *prepare,
         "sudo systemctl daemon-reload",
+        *(f"sudo systemctl {command} {unit}" for unit in firewall for command in ("enable", "restart")),
         f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
         *drive,
     ]
@@ -339,4 +368,5 @@ def _bridge_command(word: str, inputs: units.ServiceInputs) -> str:
 
 
 def _home_of(path: Path) -> str:
-    return f"/{SYSTEM_USERS if path.suffix == '.conf' else SYSTEM_UNITS}/"
+    folders = {".conf": SYSTEM_USERS, ".nft": SYSTEM_RULES}
+    return f"/{folders.get(path.suffix, SYSTEM_UNITS) / path.name}"

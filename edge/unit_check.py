@@ -14,6 +14,7 @@ MAX_EXPOSURE: Final = 3.0
 """0 is best, 10 worst; systemd calls up to 4.9 "OK" or better."""
 _TIMEOUT_S: Final = 60.0
 _OVERALL = re.compile(r"Overall exposure level for (\S+): ([\d.]+) ")
+_VERSION = re.compile(r"systemd (\d+)")
 _NAMES_A_UNIT = re.compile(r"(?:^|/)([A-Za-z0-9@:_.\\-]+\.(?:service|socket|target|mount|timer|slice|path))\b")
 
 Runner = Callable[[Sequence[str]], tuple[int, str]]
@@ -45,6 +46,18 @@ def run_command(command: Sequence[str]) -> tuple[int, str]:
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=_TIMEOUT_S
     )
     return done.returncode, done.stdout.decode("utf-8", "replace")
+
+
+def systemd_version(run: Runner = run_command, which: Callable[[str], str | None] = shutil.which) -> int | None:
+    """Version of this machine's systemd; None where there is none or it does not say."""
+    tool = which("systemd-analyze")
+    if tool is None:
+        return None
+    try:
+        found = _VERSION.match(run([tool, "--version"])[1])
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return None if found is None else int(found[1])
 
 
 def check_units(

@@ -1,43 +1,46 @@
 """systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
 
-Two services of one user. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
-at once and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot. systemd
-restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that keeps the
-promise in milliseconds.
+Two services of two users. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
+without end and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot.
+systemd restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that
+keeps the promise in milliseconds.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Network, collapse_addresses
 from pathlib import Path
 from typing import Final
 
+from edge import firewall
 from edge.device import CUDA, OPENVINO, TENSORRT
+from edge.service_users import ServiceUsers
 from edge.trust import STATE_DIRECTORY
 from edge.unit_text import Setting, UnitError, argument, bound, render, word
 from firmware_bridge.config import BRIDGE_PRIORITY
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
 RUNNER_UNIT: Final = "tic-vla-edge-runner.service"
-SYSUSERS_FILE: Final = "tic-vla-edge.conf"
-DEFAULT_USER: Final = "tic-vla-edge"
+FIREWALL_UNIT: Final = "tic-vla-edge-firewall.service"
+FIREWALL_FILE: Final = "tic-vla-edge.nft"
+FIREWALL_FOLDER: Final = Path("/etc/tic-vla-edge")
 SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
+LATCH: Final = Path("/var/lib/tic-vla-edge-bridge/emergency-stop")
+"""An emergency stop survives a restart of the bridge and of the machine."""
 FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
 """systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
+RESTART_STEPS_SINCE: Final = 254
+"""First version of systemd with RestartSteps= (its NEWS file)."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
 """Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
-MULTICAST: Final = IPv4Network("239.255.0.1/32")
-"""Where DDS participants announce themselves (RTPS 2.5, section 9.6.1.4.1)."""
 WIDEST_PREFIX: Final = 16
 """Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Folders that a hardened service does not see: what it needs from there is shown to it, nothing else."""
 
-_USER = re.compile(r"[a-z_][a-z0-9_-]{0,30}", re.ASCII)
 _COMPILES: Final = (CUDA, TENSORRT, OPENVINO)
 NEED_DEVICES: Final = (CUDA, TENSORRT)
 """Providers that compute on something other than the processor."""
@@ -61,11 +64,17 @@ class ServiceInputs:
     trust: Path | None
     """Public key that has to have signed the artifacts."""
     instruction: str
-    user: str
+    users: ServiceUsers
+    interface: str
+    """The robot file's; "lo": the robot is simulated on this machine, no network has to be up and none is filtered."""
+    domain: int
+    """DDS domain."""
     networks: tuple[IPv4Network, ...]
     """Where the robot is."""
-    over_loopback: bool
-    """The robot is simulated on this machine: no network has to be up first."""
+    own: tuple[IPv4Network, ...]
+    """This machine's addresses on that interface: by them the bridge notices requests of other programs here."""
+    nft: Path | None
+    """Program that loads the firewall; None: this machine has none."""
     providers: tuple[str, ...]
     """ONNX Runtime's execution providers that the graphs use."""
     devices: tuple[Path, ...]
@@ -80,6 +89,8 @@ class ServiceInputs:
     """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
     bridge_cores: tuple[int, ...]
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
+    systemd: int | None
+    """Version of the machine's systemd; None: unknown, and only keys that version 249 knows are written."""
 
     def __post_init__(self) -> None:
         for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
@@ -89,8 +100,6 @@ class ServiceInputs:
             if not set(str(program)) & set("'\"\\"):
                 continue
             raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
-        if not _USER.fullmatch(self.user) or self.user == "root":
-            raise UnitError(f"--user {self.user}: expected the name of an ordinary user, such as {DEFAULT_USER}")
         if not self.networks:
             raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
         for network in collapse_addresses(self.networks):
@@ -105,6 +114,11 @@ class ServiceInputs:
                 f"export again with --set runtime.control_priority=50"
             )
 
+    @property
+    def over_loopback(self) -> bool:
+        """The robot is simulated on this machine."""
+        return self.interface == "lo"
+
 
 def check_network(network: IPv4Network, source: str) -> None:
     """Raise UnitError for a network so wide that the filter would mean nothing; loopback never leaves the machine."""
@@ -117,17 +131,22 @@ def check_network(network: IPv4Network, source: str) -> None:
 
 def bridge_unit(inputs: ServiceInputs) -> str:
     """Text of the bridge's unit."""
+    users = inputs.users
     command = [word(str(inputs.programs / "edge-bridge"))]
-    command += [argument(text) for text in ("--robot", str(inputs.robot), "--socket", str(SOCKET))]
+    options = ("--robot", str(inputs.robot), "--socket", str(SOCKET), "--latch", str(LATCH))
+    groups = ("--runner-group", users.runner, "--operator-group", users.operators)
+    command += [argument(text) for text in (*options, *groups)]
     service: list[Setting | str] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),
         ("ExecStart", " ".join(command)),
-        ("User", inputs.user),
+        ("User", users.bridge),
+        "It gives its sockets to these groups; the runner is not in the second, so it can take back no emergency stop.",
+        ("SupplementaryGroups", f"{users.runner} {users.operators}"),
         *_ending(watchdog_s=1, start_s=20, stop_s=2),
         "Always, also after a clean exit: without it the robot has nobody that can stop it.",
         ("Restart", "always"),
-        ("RestartSec", "100ms"),
+        *_back_off(inputs.systemd),
         "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
         ("CPUSchedulingPolicy", "fifo"),
         ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
@@ -142,20 +161,27 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("MemorySwapMax", "0"),
         ("TasksMax", "64"),
         ("RuntimeDirectory", SOCKET.parent.name),
-        ("RuntimeDirectoryMode", "0700"),
+        "Other users pass through to the sockets, whose modes decide, and write nothing here: clients rely on that.",
+        ("RuntimeDirectoryMode", "0711"),
         ("RuntimeDirectoryPreserve", "restart"),
+        "Keeps an emergency stop over restarts and reboots until a person ends it.",
+        ("StateDirectory", LATCH.parent.name),
+        ("StateDirectoryMode", "0700"),
         *_hardening(inputs, (inputs.robot, *inputs.robot_files)),
         ("PrivateDevices", "yes"),
         ("ProcSubset", "pid"),
-        ("PrivateUsers", "yes"),
         ("MemoryDenyWriteExecute", "yes"),
         ("SystemCallFilter", "@system-service"),
         ("SystemCallFilter", "~@privileged @resources"),
+        "For the groups of its sockets; no PrivateUsers, in which those groups do not exist.",
+        ("SystemCallFilter", "chown fchownat"),
     ]
-    unit = [
+    unit: list[Setting | str] = [
         ("Description", "tic-vla-edge bridge: the only process that commands the robot"),
-        *_network(inputs),
-        *_restarts(60),
+        "Ordered after no network: the bridge itself waits for its interface, and takes an emergency stop meanwhile.",
+        "No limit of starts: a robot must not be left without a bridge.",
+        ("StartLimitIntervalSec", "0"),
+        *_behind_firewall(inputs),
     ]
     return _render("bridge", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
 
@@ -184,7 +210,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
         ("ExecStartPre", "-" + " ".join([word(str(inputs.python)), *(argument(text) for text in cleaning)])),
         arms,
         ("ExecStart", " ".join(command)),
-        ("User", inputs.user),
+        ("User", inputs.users.runner),
         "ONNX Runtime 1.29 and later keeps a device id and reports to its maker, unless told not to before it starts.",
         ("Environment", "ORT_DISABLE_TELEMETRY=1"),
         *_ending(watchdog_s=3, start_s=180, stop_s=10),
@@ -211,6 +237,8 @@ def runner_unit(inputs: ServiceInputs) -> str:
         "connection ends with the old bridge. After: at shutdown the runner stops first.",
         ("Wants", BRIDGE_UNIT),
         ("After", BRIDGE_UNIT),
+        *_network(inputs),
+        *_behind_firewall(inputs),
         # A start that fails slowly must be counted too, so the window holds several of the longest starts.
         *_restarts(900),
     ]
@@ -231,9 +259,40 @@ def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
     ]
 
 
-def sysusers(user: str) -> str:
-    """Text of a sysusers.d(5) file that makes the services' user."""
-    return f'# Made by edge-install units.\nu {user} - "tic-vla-edge services" - -\n'
+def firewall_unit(inputs: ServiceInputs) -> str:
+    """Text of the unit that loads the firewall's file at boot. Raises UnitError without a program that loads it."""
+    if inputs.nft is None:
+        raise UnitError("no program loads the firewall: install nftables")
+    nft, file = word(str(inputs.nft)), argument(str(FIREWALL_FOLDER / FIREWALL_FILE))
+    service: list[Setting | str] = [
+        ("Type", "oneshot"),
+        ("RemainAfterExit", "yes"),
+        ("ExecStart", f"{nft} -f {file}"),
+        ("ExecReload", f"{nft} -f {file}"),
+        ("ExecStop", f"{nft} delete table inet {firewall.TABLE}"),
+        ("IPAddressDeny", "any"),
+        ("RestrictAddressFamilies", "AF_NETLINK AF_UNIX"),
+        ("CapabilityBoundingSet", "CAP_NET_ADMIN"),
+        ("PrivateDevices", "yes"),
+        ("ProcSubset", "pid"),
+        ("ProtectHome", "yes"),
+        ("MemoryDenyWriteExecute", "yes"),
+        ("RestrictRealtime", "yes"),
+        *_confinement(),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged @resources"),
+    ]
+    unit: list[Setting | str] = [
+        ("Description", "tic-vla-edge firewall of the robot's cable"),
+        ("Before", f"{BRIDGE_UNIT} {RUNNER_UNIT}"),
+    ]
+    return _render("firewall", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def firewall_rules(inputs: ServiceInputs) -> str:
+    """Text of the nftables file; raises UnitError for an interface without a name."""
+    users = (inputs.users.bridge, inputs.users.runner)
+    return firewall.ruleset(firewall.CableRules(inputs.interface, inputs.networks, inputs.domain, users))
 
 
 def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
@@ -245,6 +304,20 @@ def _network(inputs: ServiceInputs) -> list[Setting | str]:
     if inputs.over_loopback:
         return []
     return [("Wants", "network-online.target"), ("After", "network-online.target")]
+
+
+def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
+    """Wants and not Requires: without its firewall the robot must still have a bridge."""
+    if inputs.over_loopback or inputs.nft is None:
+        return []
+    return [("Wants", FIREWALL_UNIT), ("After", FIREWALL_UNIT)]
+
+
+def _back_off(systemd: int | None) -> list[Setting | str]:
+    """Delays between restarts of the bridge: short after a crash, longer while something persistent is wrong."""
+    if systemd is None or systemd < RESTART_STEPS_SINCE:
+        return [("RestartSec", "1s")]
+    return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
 
 
 def _restarts(window_s: int) -> list[Setting | str]:
@@ -270,20 +343,28 @@ def _cores(cores: Sequence[int]) -> list[Setting | str]:
 
 def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
     """What both services give up; `needed`: what they read besides Python."""
-    networks = " ".join(str(network) for network in (*inputs.networks, MULTICAST))
+    allowed = dict.fromkeys((*inputs.networks, *inputs.own, firewall.MULTICAST))
+    networks = " ".join(str(network) for network in allowed)
     hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if is_hidden(path)})
     return [
         "The robot's network and nothing else: its body is an unauthenticated peer.",
         ("IPAddressDeny", "any"),
         ("IPAddressAllow", networks),
         ("RestrictAddressFamilies", "AF_UNIX AF_INET AF_NETLINK"),
-        ("NoNewPrivileges", "yes"),
         ("CapabilityBoundingSet", ""),
-        ("AmbientCapabilities", ""),
-        ("ProtectSystem", "strict"),
         ("ProtectHome", "tmpfs" if hidden else "yes"),
         *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
         "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which anybody else could have put there.",
+        *_confinement(),
+    ]
+
+
+def _confinement() -> list[Setting | str]:
+    """What no service of ours needs."""
+    return [
+        ("NoNewPrivileges", "yes"),
+        ("AmbientCapabilities", ""),
+        ("ProtectSystem", "strict"),
         ("PrivateTmp", "yes"),
         ("PrivateMounts", "yes"),
         ("ProtectProc", "invisible"),
@@ -314,7 +395,8 @@ def is_hidden(path: Path) -> bool:
 def _accelerator(inputs: ServiceInputs) -> list[Setting | str]:
     """What the graphs' providers need: nothing on a processor, the device's nodes otherwise."""
     if not set(inputs.providers) & set(_COMPILES):
-        return [("PrivateDevices", "yes"), ("PrivateUsers", "yes"), ("MemoryDenyWriteExecute", "yes")]
+        # No PrivateUsers, in which the bridge's user has no number: the runner could not tell it from an impostor.
+        return [("PrivateDevices", "yes"), ("MemoryDenyWriteExecute", "yes")]
     nodes: list[Setting | str] = [("DeviceAllow", f"{word(str(node))} rw") for node in inputs.devices]
     if not nodes and set(inputs.providers) & set(NEED_DEVICES):
         nodes = ["DeviceAllow= is missing: no device of these providers was found where this was written."]

@@ -18,14 +18,15 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.client_link import ClientLink, SocketTakenError
+from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
 from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core import BridgeCore
 from firmware_bridge.latch_file import LatchFile, read_latch
+from firmware_bridge.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
@@ -38,6 +39,8 @@ _OPERATORS: Final = 4  # at a time
 _LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
+_STARTING_S: Final = 20.0  # the unit's TimeoutStartSec, which moves on while the bridge waits for its interface
+_EXTEND_NS: Final = 5_000_000_000
 _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
 
 EPILOG: Final = """examples:
@@ -50,8 +53,8 @@ EPILOG: Final = """examples:
                                          file says operator_arm
   edge-bridge release --robot go2.toml   after a stop: send nothing to the robot, so that a person can use its remote
   edge-bridge status --robot go2.toml    what the running bridge is doing
-stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then) and at the
-robot file's, or at --socket only.
+stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then, or as a
+member of tic-vla-operators) and at the robot file's, or at --socket only.
 exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, release, status: done); 1 internal failure, robot
 stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot file; 3
 refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this user may
@@ -61,19 +64,39 @@ reach; arm: no runner waits, or more than one bridge)"""
 class Bridge:
     """Shell around BridgeCore: joins sockets, robot and clock. Raises DdsError, ConfigError, SocketTakenError."""
 
-    def __init__(self, config: RobotConfig, log: LineLog, notifier: Notifier, latch_path: Path) -> None:
+    def __init__(
+        self,
+        config: RobotConfig,
+        log: LineLog,
+        notifier: Notifier,
+        latch_path: Path,
+        groups: SocketGroups = USER_ONLY,
+    ) -> None:
+        """`latch_path`: file that keeps an emergency stop over restarts; `groups`: who may use the sockets."""
         self._log = log
         self._notifier = notifier
-        self._robot = RobotLink(config, log.say)
-        self._link = ClientLink(config.bridge.socket)
-        self._operators = ClientLink(Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}"), places=_OPERATORS)
+        self._config = config
+        self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
+        self._join_robot()
+        self._link = ClientLink(config.bridge.socket, group=groups.runner)
+        operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
+        self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
         self._estop_file = config.safety.estop_file
         latch = read_latch(latch_path)
         self._latch_file = LatchFile(latch_path, log.say)
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
-        self._said, self._ready = "", False
+        self._said, self._ready, self._extended_ns = "", False, -_EXTEND_NS
+
+    @property
+    def greeting(self) -> str:
+        """What this bridge serves, or what it waits for, in one line."""
+        dds, socket_path = self._config.dds, self._config.bridge.socket
+        if isinstance(self._robot, AbsentRobot):
+            return f"{self._robot.reason}; plug in the robot's cable, or correct dds.interface in the robot file"
+        where = f"domain {dds.domain} on {dds.interface}, socket {socket_path}"
+        return f"ready, robot {self._config.name}, {where}"
 
     def run(self, wakeup: socket.socket) -> None:
         """Serve until a byte arrives on `wakeup`; leave with the robot stopped, whatever happens."""
@@ -115,7 +138,17 @@ class Bridge:
         ready = poller.poll(max(-(-left_ns // 1_000_000), 0))
         return any(fd == wakeup.fileno() for fd, _ in ready)
 
+    def _join_robot(self) -> bool:
+        """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
+        if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
+            return False
+        self._robot = RobotLink(self._config, self._log.say)
+        settle_memory()
+        return True
+
     def _step(self, *, shutdown: bool = False) -> Outputs:
+        if self._join_robot():
+            self._log.say(self.greeting)
         asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
         messages, operator = self._link.receive(), self._operators.receive()
         robot = self._robot.read(time.monotonic_ns())
@@ -125,14 +158,24 @@ class Bridge:
         for request in outputs.requests:
             self._robot.write(request)
         self._latch_file.keep(outputs.latch)
+        if isinstance(self._robot, AbsentRobot):
+            outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
         self._link.tell(outputs.status)
         self._operators.tell(outputs.status)
         self._report_progress(outputs.status)
         return outputs
 
+    def _report_start(self, text: str, now_ns: int) -> None:
+        if not isinstance(self._robot, AbsentRobot):
+            self._ready = self._notifier.ready(text)  # again until the manager has taken it
+        elif now_ns - self._extended_ns >= _EXTEND_NS and self._notifier.extend(_STARTING_S):
+            # Not ready: a runner that starts after this bridge would end at once without the interface.
+            self._extended_ns = now_ns
+
     def _report_progress(self, status: BridgeStatus) -> None:
         said = f"{status.state}: {status.reason}"
-        self._ready = self._ready or self._notifier.ready(said)  # again until the manager has taken it
+        if not self._ready:
+            self._report_start(said, status.stamp_ns)
         if said != self._said:
             self._said = said
             self._log.say(said)
@@ -153,6 +196,12 @@ def is_pressed(path: Path) -> bool:
             os.close(file)
     except OSError:
         return True
+
+
+def settle_memory() -> None:
+    """Let the garbage collector pass over everything that exists now: later collections look at a step's objects."""
+    gc.collect()
+    gc.freeze()
 
 
 def lock_memory() -> str | None:
@@ -179,16 +228,14 @@ def signals_to_socket() -> Iterator[socket.socket]:
             signal.set_wakeup_fd(-1)
 
 
-def serve(config: RobotConfig, latch_path: Path) -> dict[str, object]:
+def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[str, object]:
     """Be the bridge until a signal; the JSON result. Raises what `Bridge` raises."""
     with signals_to_socket() as wakeup:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
-        bridge = Bridge(config, log, notifier, latch_path)
-        where = f"domain {config.dds.domain} on {config.dds.interface}, socket {config.bridge.socket}"
-        log.say(f"ready, robot {config.name}, {where}")
-        gc.collect()
-        gc.freeze()  # what exists now stays; collections look at a step's objects only
+        bridge = Bridge(config, log, notifier, latch_path, groups)
+        log.say(bridge.greeting)
+        settle_memory()
         if (unlocked := lock_memory()) is not None:
             log.say(unlocked)
         try:
@@ -215,12 +262,15 @@ def main(argv: list[str] | None = None) -> int:
         "--latch", type=Path, metavar="PATH", help="file that keeps an emergency stop; default: SOCKET.latch"
     )
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain, instead of the robot file's")
+    parser.add_argument("--runner-group", metavar="NAME", help="serve: group that may command (default: none)")
+    parser.add_argument("--operator-group", metavar="NAME", help="serve: group that may stop and arm (default: none)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
-            code, result = 0, serve(config, args.latch or Path(f"{config.bridge.socket}.latch"))
+            latch = args.latch or Path(f"{config.bridge.socket}.latch")
+            code, result = 0, serve(config, latch, SocketGroups(args.runner_group, args.operator_group))
         else:
             from firmware_bridge.operate import operate  # never part of the process that serves
 

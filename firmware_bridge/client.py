@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import socket
-import struct
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.config import SERVICE_SOCKET
 from firmware_bridge.link import (
     MAX_DATAGRAM_BYTES,
     Arm,
@@ -23,6 +20,7 @@ from firmware_bridge.link import (
     decode,
     encode,
 )
+from firmware_bridge.peer import is_trusted_listener, peer_uid
 
 __all__ = ["BridgeClient", "BridgeStatus", "BridgeUnavailable"]
 
@@ -48,20 +46,22 @@ class BridgeClient:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._socket.connect(str(socket_path))
-            listener_uid = _peer_uid(self._socket)
+            listener_uid = peer_uid(self._socket)
         except PermissionError as error:
             self._socket.close()
-            raise BridgeUnavailable(f"no permission for the bridge at {socket_path}; use sudo") from error
+            message = f"no permission for the bridge at {socket_path}; use sudo or join the socket's group"
+            raise BridgeUnavailable(message) from error
         except OSError as error:
             self._socket.close()
             raise BridgeUnavailable(
                 f"no bridge listens at {socket_path} ({error.strerror}); start `edge-bridge --robot FILE.toml`"
             ) from error
-        ours = listener_uid in (os.getuid(), 0)
-        # Only root has put anything into the service's folder, so root may believe whom it finds there.
-        if not ours and (os.getuid() != 0 or Path(socket_path).parent != SERVICE_SOCKET.parent):
+        if not is_trusted_listener(Path(socket_path), listener_uid):
             self._socket.close()
-            raise BridgeUnavailable(f"{socket_path} belongs to user {listener_uid}, not to a bridge of this user's")
+            raise BridgeUnavailable(
+                f"{socket_path} belongs to user {listener_uid}, not to a bridge of this user's or the service's;"
+                " expected a folder that root has given to that user alone, such as /run/tic-vla-edge"
+            )
         self._socket.setblocking(False)
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
@@ -119,10 +119,3 @@ class BridgeClient:
         except OSError:  # full queue (a hung bridge) or a closed connection: poll() tells which
             return False
         return True
-
-
-def _peer_uid(connected: socket.socket) -> int:
-    """User of the process that listens at the other end (SO_PEERCRED, unix(7))."""
-    ucred = struct.Struct("3i")
-    uid: int = ucred.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, ucred.size))[1]
-    return uid

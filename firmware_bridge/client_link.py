@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import grp
 import os
 import socket
 import stat
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -22,8 +24,29 @@ class SocketTakenError(RuntimeError):
     """Another bridge listens at the socket's path."""
 
 
-def listen(path: Path) -> socket.socket:
-    """Listening socket of mode 0600; replaces a socket file nobody listens at.
+@dataclass(frozen=True)
+class SocketGroups:
+    """Groups of other users that may connect; None: only the bridge's own user and root."""
+
+    runner: str | None = None
+    """May command."""
+    operator: str | None = None
+    """May stop, arm and ask. The runner must not be in it: it could take back an emergency stop."""
+
+    def __post_init__(self) -> None:
+        if self.runner is not None and self.runner == self.operator:
+            raise ConfigError(
+                f"--runner-group and --operator-group: expected two groups, found {self.runner!r} twice: the runner"
+                " could take back an emergency stop"
+            )
+
+
+USER_ONLY: Final = SocketGroups()
+"""Sockets of mode 0600."""
+
+
+def listen(path: Path, group: str | None = None) -> socket.socket:
+    """Listening socket of mode 0600, or 0660 for a group; replaces a socket file nobody listens at.
 
     Raises SocketTakenError, or ConfigError when something else is in the way or the directory is not usable.
     """
@@ -32,9 +55,7 @@ def listen(path: Path) -> socket.socket:
         if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
             # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
             raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if path.parent == runtime_dir():  # under /tmp somebody else may have made it
-            check_is_ours(path.parent)
+        _make_folder(path.parent, shared=group is not None)
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
             answer = probe.connect_ex(str(path))
         if answer == 0:
@@ -46,12 +67,52 @@ def listen(path: Path) -> socket.socket:
             listener.bind(str(path))
         finally:
             os.umask(umask)
+        if group is not None:
+            _share(path, group)
+    except ConfigError:
+        listener.close()
+        raise
     except OSError as error:
         listener.close()
         raise ConfigError(f"socket {path}: cannot be used: {error.strerror}; give another --socket") from error
     listener.listen(4)
     listener.setblocking(False)
     return listener
+
+
+def _make_folder(folder: Path, *, shared: bool) -> None:
+    """Make the sockets' folder; for a shared one others may pass through it, and nobody but this user write."""
+    if not shared:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder == runtime_dir():  # under /tmp another user may have made it
+            check_is_ours(folder)
+        return
+    if not folder.exists():
+        folder.mkdir(mode=0o711, parents=True)
+        folder.chmod(0o711)  # whatever the umask is
+    found = folder.lstat()
+    mode = stat.S_IMODE(found.st_mode)
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or mode & 0o022 or not mode & 0o001:
+        raise ConfigError(
+            f"{folder}: expected a folder of this user's with mode 0711, found {stat.filemode(found.st_mode)} of user"
+            f" {found.st_uid}; correct it or give another --socket"
+        )
+
+
+def _share(path: Path, group: str) -> None:
+    """Let a group connect. Raises ConfigError for one that does not exist or that this process is not in."""
+    try:
+        os.chown(path, -1, grp.getgrnam(group).gr_gid)
+    except KeyError:
+        raise ConfigError(
+            f"group {group}: this machine has no such group; make it first (systemd-sysusers, see edge-install units)"
+        ) from None
+    except PermissionError:
+        raise ConfigError(
+            f"group {group}: the bridge's user is not in it, so {path} cannot be given to it;"
+            f" SupplementaryGroups={group} in the unit, or usermod -aG"
+        ) from None
+    path.chmod(0o660)
 
 
 def check_is_ours(folder: Path, option: str = "--socket") -> None:
@@ -68,12 +129,15 @@ def check_is_ours(folder: Path, option: str = "--socket") -> None:
 class ClientLink:
     """One socket with one client at a time, or a few."""
 
-    def __init__(self, path: Path, *, places: int = 1) -> None:
-        """`places`: a client beyond one is turned away, a client beyond several replaces the oldest."""
+    def __init__(self, path: Path, *, places: int = 1, group: str | None = None) -> None:
+        """`places`: a client beyond one is turned away, a client beyond several replaces the oldest.
+
+        `group`: users that may connect besides the bridge's own and root.
+        """
         self.malformed = 0
         self._path = path
         self._places = places
-        self._listener = listen(path)
+        self._listener = listen(path, group)
         self._deaf = False
         self._clients: list[socket.socket] = []
         self._told_ns = 0

@@ -135,7 +135,7 @@ class TestFolder:
 
     def test_a_listener_of_another_user_is_not_believed(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(ClientLink(path)):
-            monkeypatch.setattr(client_module, "_peer_uid", lambda _: os.getuid() + 1)
+            monkeypatch.setattr(client_module, "peer_uid", lambda _: os.getuid() + 1)
             with pytest.raises(BridgeUnavailable, match="not to a bridge of this user's"):
                 BridgeClient(path)
 

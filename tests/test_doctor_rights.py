@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import grp
 import os
 import resource
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
@@ -15,7 +17,7 @@ from edge.doctor_rights import device_access, locked_memory, power_meter, real_t
 from edge.doctor_user import Whom, user_named
 from edge.graph import CPU_PROVIDER
 from edge.power.meter import MeterError, PowerSample
-from firmware_bridge.config import ConfigError
+from firmware_bridge.config import OPERATOR_SUFFIX, ConfigError
 from tests.test_doctor_machine import write
 
 ME = Whom("somebody", 1000, frozenset({1000}), other=False)
@@ -45,9 +47,25 @@ def test_device_nodes_must_be_there_and_open(tmp_path: Path) -> None:
     assert (closed.level, "usermod" in closed.advice, other.name in closed.found) == (Level.FAIL, True, True)
 
 
+def chgrp_to_a_group_of_no_power(node: Path) -> None:
+    """Root's own group never counts as a device's group; tests may run as root."""
+    if os.geteuid() == 0:
+        os.chown(node, -1, max(entry.gr_gid for entry in grp.getgrall()))
+
+
+def test_a_device_that_its_group_may_only_read_is_open_to_that_group(tmp_path: Path) -> None:
+    node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
+    node.chmod(0o440)  # as on the Orin of NVIDIA/NemoClaw #4231
+    chgrp_to_a_group_of_no_power(node)
+    member = Whom("service", 4242, frozenset({node.stat().st_gid}), other=True)
+    assert device_access([CUDA], tmp_path, member).level is Level.OK
+    assert device_access([CUDA], tmp_path, replace(member, groups=frozenset())).level is Level.WARN
+
+
 def test_a_device_that_the_units_groups_open_only_warns_for_the_services_user(tmp_path: Path) -> None:
     node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
     node.chmod(0o660)
+    chgrp_to_a_group_of_no_power(node)
     service = Whom("service", 4242, frozenset({4242}), other=True)
     assert device_access([CUDA], tmp_path, service).level is Level.WARN
     member = replace(service, groups=frozenset({node.stat().st_gid}))
@@ -102,6 +120,68 @@ def test_nobody_else_may_reach_the_socket(tmp_path: Path, mode_bits: int, level:
 def test_a_socket_folder_of_another_user_fails(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     assert socket_folder(tmp_path / "bridge.sock", replace(ME, uid=tmp_path.stat().st_uid + 1)).level is Level.FAIL
+
+
+class TestServiceSockets:
+    """Sockets of the installed service: the bridge's user owns them, the runner is in the command socket's group."""
+
+    RUNNERS, OPERATORS = 4301, 4302
+
+    @pytest.fixture
+    def path(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """Two socket files; `status` below says which groups they have, since only root can change that."""
+        folder = tmp_path / "run"
+        folder.mkdir()
+        folder.chmod(0o711)
+        path = folder / "bridge.sock"
+        for file, group in ((path, self.RUNNERS), (Path(f"{path}{OPERATOR_SUFFIX}"), self.OPERATORS)):
+            file.touch()
+            file.chmod(0o660)
+            monkeypatch.setitem(self.groups, file, group)
+        real = Path.stat
+
+        def status(file: Path, **options: bool) -> os.stat_result:
+            found = list(real(file, **options))
+            found[5] = self.groups.get(file, found[5])
+            return os.stat_result(found)
+
+        monkeypatch.setattr(Path, "stat", status)
+        return path
+
+    groups: ClassVar[dict[Path, int]] = {}
+
+    def runner(self, path: Path, *groups: int) -> Whom:
+        return Whom("runner", path.parent.stat().st_uid + 4000, frozenset(groups), other=True)
+
+    def test_the_runner_reaches_its_own_socket_only(self, path: Path) -> None:
+        assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.OK
+
+    def test_a_runner_in_the_operators_group_fails(self, path: Path) -> None:
+        check = socket_folder(path, self.runner(path, self.RUNNERS, self.OPERATORS))
+        assert (check.level, "take back an emergency stop" in check.advice) == (Level.FAIL, True)
+
+    def test_a_runner_that_does_not_reach_its_socket_fails(self, path: Path) -> None:
+        check = socket_folder(path, self.runner(path))
+        assert (check.level, "--user" in check.advice) == (Level.FAIL, True)
+
+    def test_a_runner_of_the_bridges_own_user_fails(self, path: Path) -> None:
+        same = replace(self.runner(path, self.RUNNERS), uid=path.parent.stat().st_uid)
+        if same.uid != 0:
+            assert socket_folder(path, same).level is Level.FAIL
+
+    @pytest.mark.parametrize("mode", [0o666, 0o662, 0o661])
+    def test_a_socket_that_everybody_reaches_fails(self, path: Path, mode: int) -> None:
+        for file in (path, Path(f"{path}{OPERATOR_SUFFIX}")):
+            file.chmod(mode)
+            assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.FAIL
+            file.chmod(0o660)
+
+    def test_root_is_judged_by_modes_alone(self, path: Path) -> None:
+        assert socket_folder(path, replace(self.runner(path), uid=0)).level is Level.OK
+
+    def test_without_a_running_bridge_nothing_can_be_judged(self, path: Path) -> None:
+        path.unlink()
+        assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.SKIP
 
 
 def test_a_socket_folder_that_is_not_there_yet_is_made_by_the_bridge(tmp_path: Path) -> None:

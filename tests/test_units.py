@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
+import subprocess
 from ipaddress import IPv4Network
 from pathlib import Path
 
@@ -14,9 +15,20 @@ from hypothesis import strategies as st
 
 from edge.device import CUDA
 from edge.graph import CPU_PROVIDER
-from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units
+from edge.service_users import ServiceUsers, sysusers
+from edge.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.unit_text import UnitError, argument, bound, word
-from edge.units import BRIDGE_UNIT, RUNNER_UNIT, SOCKET, ServiceInputs, bridge_unit, runner_unit, sysusers
+from edge.units import (
+    BRIDGE_UNIT,
+    FIREWALL_UNIT,
+    RUNNER_UNIT,
+    SOCKET,
+    ServiceInputs,
+    bridge_unit,
+    firewall_rules,
+    firewall_unit,
+    runner_unit,
+)
 
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 PRINTABLE = st.text(st.characters(exclude_categories=("C", "Z"), include_characters=" "), max_size=60)
@@ -33,9 +45,12 @@ def inputs(**changes: object) -> ServiceInputs:
         engines=None,
         trust=None,
         instruction="walk to the vending machine",
-        user="tic-vla-edge",
-        networks=(IPv4Network("192.168.123.0/24"),),
-        over_loopback=False,
+        users=ServiceUsers(),
+        interface="eth0",
+        domain=0,
+        networks=(IPv4Network("192.168.123.161/32"),),
+        own=(IPv4Network("192.168.123.99/32"),),
+        nft=Path("/usr/bin/true"),
         providers=(CPU_PROVIDER,),
         devices=(),
         groups=(),
@@ -43,6 +58,7 @@ def inputs(**changes: object) -> ServiceInputs:
         control_priority=50,
         operator_arm=True,
         bridge_cores=(),
+        systemd=252,
     )
     return dataclasses.replace(defaults, **changes)
 
@@ -123,11 +139,35 @@ def test_a_trusted_key_and_the_memory_of_releases_are_given_to_the_runner() -> N
     assert "--trust" not in runner_unit(inputs())
 
 
-def test_both_speak_over_a_socket_that_only_their_user_can_reach() -> None:
+def test_bridge_and_runner_are_different_users() -> None:
     bridge, runner = settings(bridge_unit(inputs())), settings(runner_unit(inputs()))
-    assert bridge["User"] == runner["User"] == ["tic-vla-edge"]
+    assert (bridge["User"], runner["User"]) == (["tic-vla-bridge"], ["tic-vla-runner"])
+
+
+def test_the_runner_gets_the_command_socket_and_is_not_in_the_operators_group() -> None:
+    bridge, runner = settings(bridge_unit(inputs())), settings(runner_unit(inputs()))
+    words = read_words(bridge["ExecStart"][0], variables=True)
+    assert words[words.index("--runner-group") + 1] == runner["User"][0]
+    assert words[words.index("--operator-group") + 1] == "tic-vla-operators"
+    assert "tic-vla-operators" not in runner_unit(inputs())
+
+
+def test_the_bridge_may_give_its_sockets_to_both_groups() -> None:
+    found = settings(bridge_unit(inputs()))
+    assert found["SupplementaryGroups"] == ["tic-vla-runner tic-vla-operators"]
+    # The last filter adds to what the ones before it have left; @privileged holds both calls.
+    assert found["SystemCallFilter"][-1] == "chown fchownat"
+    assert "PrivateUsers" not in found, "in a user namespace other users' groups do not exist"
+
+
+def test_the_runner_sees_the_number_of_the_bridges_user() -> None:
+    assert "PrivateUsers" not in settings(runner_unit(inputs()))
+
+
+def test_both_speak_over_a_socket_in_a_folder_that_only_the_bridge_may_write_to() -> None:
+    bridge, runner = settings(bridge_unit(inputs())), settings(runner_unit(inputs()))
     assert f"/run/{bridge['RuntimeDirectory'][0]}" == str(SOCKET.parent)
-    assert bridge["RuntimeDirectoryMode"] == ["0700"]
+    assert bridge["RuntimeDirectoryMode"] == ["0711"]
     assert all(f'"{SOCKET}"' in unit["ExecStart"][0] for unit in (bridge, runner))
     # The runner must not take the folder away when it ends.
     assert "RuntimeDirectory" not in runner
@@ -182,7 +222,34 @@ def test_a_stopped_process_cannot_hold_up_its_own_end(unit) -> None:
     assert found["WatchdogSignal"] == ["SIGKILL"]
     assert int(found["WatchdogSec"][0]) <= 3
     assert {"TimeoutAbortSec", "TimeoutStopSec", "TimeoutStartSec"} <= set(found)
-    assert found["StartLimitBurst"] == ["5"]
+
+
+def test_a_runner_that_keeps_failing_is_given_up() -> None:
+    assert settings(runner_unit(inputs()))["StartLimitBurst"] == ["5"]
+
+
+@pytest.mark.parametrize("version", [None, 249, 252, 254, 257])
+def test_a_bridge_that_keeps_failing_is_started_again_without_end(version: int | None) -> None:
+    found = settings(bridge_unit(inputs(systemd=version)))
+    assert (found["StartLimitIntervalSec"], found["Restart"]) == (["0"], ["always"])
+    assert "StartLimitBurst" not in found
+
+
+@pytest.mark.parametrize("version", [None, 249, 253])
+def test_an_older_systemd_restarts_the_bridge_every_second(version: int | None) -> None:
+    found = settings(bridge_unit(inputs(systemd=version)))
+    assert found["RestartSec"] == ["1s"]
+    assert not {"RestartSteps", "RestartMaxDelaySec"} & set(found)
+
+
+def test_a_newer_systemd_restarts_the_bridge_at_once_and_then_backs_off() -> None:
+    found = settings(bridge_unit(inputs(systemd=254)))
+    assert (found["RestartSec"], found["RestartSteps"], found["RestartMaxDelaySec"]) == (["100ms"], ["5"], ["5s"])
+
+
+def test_the_bridge_waits_for_no_network_so_that_it_can_latch_a_stop_before_the_cable_is_in() -> None:
+    assert "network-online.target" not in bridge_unit(inputs())
+    assert "network-online.target" in runner_unit(inputs())
 
 
 def test_slow_failing_starts_of_the_runner_are_counted_within_one_window() -> None:
@@ -194,12 +261,32 @@ def test_only_the_robots_network_is_let_through() -> None:
     for unit in (bridge_unit, runner_unit):
         found = settings(unit(inputs()))
         assert found["IPAddressDeny"] == ["any"]
-        assert found["IPAddressAllow"] == ["192.168.123.0/24 239.255.0.1/32"]
+        assert found["IPAddressAllow"] == ["192.168.123.161/32 192.168.123.99/32 239.255.0.1/32"]
+        assert found["RestrictAddressFamilies"] == ["AF_UNIX AF_INET AF_NETLINK"]
+
+
+def test_the_firewall_is_loaded_before_both_and_neither_depends_on_it() -> None:
+    firewall = settings(firewall_unit(inputs()))
+    assert firewall["Before"] == [f"{BRIDGE_UNIT} {RUNNER_UNIT}"]
+    for unit in (bridge_unit, runner_unit):
+        found = settings(unit(inputs()))
+        assert FIREWALL_UNIT in found["Wants"]
+        assert not {"Requires", "BindsTo"} & set(found)
+
+
+def test_the_firewall_names_both_users_and_the_robots_cable() -> None:
+    text = firewall_rules(inputs())
+    assert 'meta skuid { "tic-vla-bridge", "tic-vla-runner", "root" } ip daddr @robot' in text
+    assert 'oifname != "eth0" accept' in text
+
+
+@pytest.mark.parametrize("changes", [{"interface": "lo"}, {"nft": None}])
+def test_without_a_firewall_no_unit_waits_for_it(changes: dict[str, object]) -> None:
+    assert FIREWALL_UNIT not in bridge_unit(inputs(**changes)) + runner_unit(inputs(**changes))
 
 
 def test_a_simulated_robot_needs_no_network_to_be_up() -> None:
-    assert "network-online.target" in bridge_unit(inputs())
-    assert "network-online.target" not in bridge_unit(inputs(over_loopback=True))
+    assert "network-online.target" not in runner_unit(inputs(interface="lo"))
 
 
 def test_what_lies_in_a_home_folder_is_shown_and_nothing_else() -> None:
@@ -239,8 +326,6 @@ def test_the_bridge_gets_the_cores_that_the_target_leaves_it() -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"user": "root"}, "ordinary user"),
-        ({"user": "a b"}, "ordinary user"),
         ({"networks": ()}, "--network"),
         ({"robot": Path("go2.toml")}, "absolute"),
         ({"programs": Path("/opt/it's")}, "quote"),
@@ -255,9 +340,24 @@ def test_inputs_that_make_no_service_are_refused(changes: dict[str, object], say
         inputs(**changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"bridge": "root"}, "--bridge-user root: expected"),
+        ({"runner": "a b"}, "--runner-user a b: expected"),
+        ({"operators": ""}, "--operator-group : expected"),
+        ({"runner": "tic-vla-bridge"}, "expected three names"),
+        ({"operators": "tic-vla-runner"}, "expected three names"),
+    ],
+)
+def test_users_that_would_not_be_apart_are_refused(changes: dict[str, str], says: str) -> None:
+    with pytest.raises(UnitError, match=re.escape(says)):
+        ServiceUsers(**changes)
+
+
 def written(folder: Path, service: ServiceInputs) -> list[Path]:
-    paths = [folder / BRIDGE_UNIT, folder / RUNNER_UNIT]
-    for path, text in zip(paths, (bridge_unit(service), runner_unit(service)), strict=True):
+    paths = [folder / BRIDGE_UNIT, folder / RUNNER_UNIT, folder / FIREWALL_UNIT]
+    for path, text in zip(paths, (bridge_unit(service), runner_unit(service), firewall_unit(service)), strict=True):
         path.write_text(text, encoding="utf-8")
     return paths
 
@@ -298,7 +398,7 @@ def test_no_service_is_more_exposed_than_promised(tmp_path: Path, providers: tup
         programs=programs(tmp_path / "bin"), providers=providers, devices=(Path("/dev/nvmap"),), groups=("video",)
     )
     verdict = check_units(written(tmp_path, service))
-    assert set(verdict.exposure) == {BRIDGE_UNIT, RUNNER_UNIT}
+    assert set(verdict.exposure) == {BRIDGE_UNIT, RUNNER_UNIT, FIREWALL_UNIT}
     assert verdict.good, verdict
 
 
@@ -309,6 +409,29 @@ def test_a_service_that_gives_nothing_up_is_too_exposed(tmp_path: Path) -> None:
     verdict = check_units([path])
     assert verdict.exposure[BRIDGE_UNIT] > MAX_EXPOSURE
     assert not verdict.good
+
+
+@needs_systemd
+def test_this_machines_systemd_knows_every_key_of_the_bridges_back_off(tmp_path: Path) -> None:
+    service = inputs(programs=programs(tmp_path / "bin"), systemd=systemd_version())
+    assert check_units(written(tmp_path, service)).complaints == ()
+
+
+@pytest.mark.parametrize(
+    ("answer", "version"),
+    [
+        ((0, "systemd 252 (252.38-1~deb12u1)\n+PAM"), 252),
+        ((0, "systemd 255.4 (255.4-1ubuntu8)\n"), 255),
+        ((1, ""), None),
+        ((0, "nothing of the kind"), None),
+    ],
+)
+def test_systemds_version_is_read(answer: tuple[int, str], version: int | None) -> None:
+    assert systemd_version(run=lambda _command: answer, which=lambda name: name) == version
+
+
+def test_without_systemd_there_is_no_version() -> None:
+    assert systemd_version(which=lambda _name: None) is None
 
 
 def test_without_systemd_the_verdict_says_that_nothing_was_checked(tmp_path: Path) -> None:
@@ -349,5 +472,21 @@ def test_an_old_systemd_that_cannot_score_files_is_said_to_be_one() -> None:
     assert "systemd 250" in verdict.not_checked[0]
 
 
-def test_the_user_is_a_system_user_without_a_shell() -> None:
-    assert re.search(r'^u robot - ".*" - -$', sysusers("robot"), re.MULTILINE)
+def test_the_users_are_system_users_without_a_shell_and_the_group_is_the_peoples() -> None:
+    text = sysusers(ServiceUsers("robot-bridge", "robot-runner", "robot-people"))
+    for line in (r'^u robot-bridge - ".*" - -$', r'^u robot-runner - ".*" - -$', r"^g robot-people -$"):
+        assert re.search(line, text, re.MULTILINE)
+
+
+@pytest.mark.skipif(shutil.which("systemd-sysusers") is None, reason="no systemd-sysusers here")
+def test_systemd_makes_the_users_apart_from_each_other(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    file = tmp_path / "tic-vla-edge.conf"
+    file.write_text(sysusers(ServiceUsers()))
+    command = ["systemd-sysusers", f"--root={tmp_path}", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 0, done.stderr
+    users = dict(line.split(":")[0:3:2] for line in (tmp_path / "etc/passwd").read_text().splitlines())
+    groups = {line.split(":")[0]: line.split(":")[3] for line in (tmp_path / "etc/group").read_text().splitlines()}
+    assert users["tic-vla-bridge"] != users["tic-vla-runner"]
+    assert groups["tic-vla-operators"] == groups["tic-vla-runner"] == ""
