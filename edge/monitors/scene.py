@@ -50,14 +50,16 @@ class SceneConfig:
     spacing_m: float = 0.05
     spacing_rad: float = math.radians(2.0)
     copies: int = 24
-    """Grey copies kept: at 0.8 m/s and 10 Hz as many pictures, so as many stale buffers in turn are recognised."""
+    compared: int = 4
+    """Of the copies that are far enough away, so many of the newest are compared. Beyond 0.5 m a corridor may look the
+    same again: panels and tiles repeat. Fewer would miss stale buffers in turn that differ by noise."""
     changed_levels: int = 2
     """Of 255: a block mean that differs by more has changed. Sensor noise and JPEG change block means by less."""
     expected_levels: float = 4.0
     """Of 255: only blocks that image motion must change by so much are judged."""
     cell_share: float = 0.25
     """Share of its judged blocks that must change for a cell to count as changed."""
-    min_cells: int = 12
+    min_cells: int = 20
     """Fewer textured cells than this, of 64, say nothing: a blank wall."""
     frozen_share: float = 0.2
     """Share of the textured cells. Simulated drives: 0.48 and more change when live; a clock changes below 0.1."""
@@ -93,7 +95,7 @@ class SceneMonitor:
     def step(self, pixels: npt.NDArray[np.uint8], T_odom_base: SE2, stamp_ns: int) -> str:
         """Judge a picture [1, h, w, 3] captured at `T_odom_base`; returns why it counts as frozen, empty when live.
 
-        A frozen verdict lasts until the picture differs from all copies, also while the robot stands.
+        A frozen verdict lasts until `release_pictures` in a row do not count as frozen, also while the robot stands.
         """
         grey = _shrink(pixels)
         went_m, turned_rad = self._motion(T_odom_base)
@@ -121,7 +123,11 @@ class SceneMonitor:
         elapsed_s = 0.0 if self._frozen else (stamp_ns - self._near_ns[: self._taken]) / 1e9
         went = (went_m >= config.moved_m) & (went_m >= config.slowest_mps * elapsed_s)
         turned = (turned_rad >= config.moved_rad) & (turned_rad >= config.slowest_radps * elapsed_s)
-        return np.flatnonzero(went | turned)
+        rows = np.flatnonzero(went | turned)
+        if self._frozen:
+            return rows
+        ages = (self._newest - rows) % config.copies
+        return rows[np.argsort(ages)[: config.compared]]
 
     def _remember(self, grey: _Grey, T_odom_base: SE2, stamp_ns: int, went_m: _Floats, turned_rad: _Floats) -> None:
         config = self._config
