@@ -16,7 +16,7 @@ BRIDGE_STOP_MS = 300
 """A bridge that is told to end, or whose runner is, stops the robot as soon as after a dead runner."""
 
 SCENE_MS = 1000
-"""A scene that stays the same is found by distance: 0.25 m or 12° take 0.4 s on the circle, twice that where it slows."""
+"""A scene that stays the same is found by distance: 0.25 m or 12° take 0.4 s on the circle, more where it slows."""
 
 
 class Judge(Enum):
