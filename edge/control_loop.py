@@ -172,8 +172,7 @@ class ControlLoop:
     def tick(self, deadline_ns: int) -> VelocityCommand:
         """One pass; returns the command it sent."""
         start_ns = self._clock()
-        pose = self._history.newest()
-        encoded = self._encode(self._newest_frame(), pose)
+        encoded = self._encode(self._newest_frame())
         encoded_ns = self._clock()
         semantic = self._slot.state
         pose = self._history.newest()
@@ -308,12 +307,13 @@ class ControlLoop:
         if not self._sink.send_velocity(self.last_seq, self._clock(), command.vx_mps, command.vy_mps, command.wz_radps):
             self.statistics.unsent += 1
 
-    def _encode(self, frame: Frame | None, pose: StampedPose | None) -> EncodedFrame | None:
+    def _encode(self, frame: Frame | None) -> EncodedFrame | None:
         """Encode a good frame once: a frame seen before, or not fit to be used, gives the tokens there are."""
-        fit = self._watch.picture(frame, None if pose is None else pose.T_odom_base, self._clock())
+        # Of the capture, not of now: a robot that starts to turn has moved before the picture shows it.
+        T_odom_base = None if frame is None else self._history.at(frame.stamp_ns)
+        fit = self._watch.picture(frame, T_odom_base, self._clock())
         if frame is None or not fit or (self._tokens is not None and frame.stamp_ns == self._tokens.stamp_ns):
             return self._tokens
-        T_odom_base = self._history.at(frame.stamp_ns)
         if T_odom_base is None:
             return self._tokens
         try:

@@ -17,8 +17,8 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "camera-frozen", 2, Action.ZERO, 500, _HERE,
-        "The camera sends the same picture although the robot has moved.",
-        "Restart the camera service; driving goes on when the picture changes.",
+        "The camera repeats pictures, or its scene stays the same, although the robot has moved.",
+        "If the robot did not slip on the spot, restart the camera service; driving goes on when the scene changes.",
         _LOOP + "a_picture_that_does_not_change_while_the_robot_moves",
     ),
     Fault(

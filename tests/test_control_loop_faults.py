@@ -17,7 +17,9 @@ import pytest
 
 from edge.faults import FAULTS
 from edge.findings import Finding
+from edge.geometry import SE2
 from edge.monitors.semantic import SemanticConfig
+from edge.pose_history import StampedPose
 from tests.control_bench import LIMITS, MS, PERIOD_NS, PX, Attitude, Bench
 
 BRIDGE_NS = 20 * MS
@@ -130,6 +132,59 @@ def test_a_picture_that_does_not_change_while_the_robot_stands_is_no_fault(bench
         bench.look(same)
         bench.tick()
     assert not found(bench, "camera-frozen")
+
+
+def test_two_stale_pictures_in_turn_while_the_robot_moves(bench: Bench) -> None:
+    stale = [bench.picture(), bench.picture()]
+    for picture in stale:
+        bench.feel()
+        bench.look(picture)
+        bench.tick()
+
+    def alternate() -> None:
+        bench.feel()
+        stale.append(stale.pop(0))
+        bench.look(stale[-1])
+
+    zero_in_time(bench, "camera-frozen", alternate)
+    for _ in range(50):
+        alternate()
+        assert bench.tick()[0] == 0.0
+    assert drives_again(bench)
+
+
+def test_a_clock_in_a_frozen_picture_while_the_robot_moves(bench: Bench) -> None:
+    """The robot drives at the speed limit: the scene must change within 0.2 m, which is a distance and not a time."""
+    frozen = bench.picture()
+    bench.feel()
+    bench.look(frozen)
+    bench.tick()
+
+    def with_clock() -> None:
+        picture = frozen.copy()
+        picture[0, 2:5, 4:16] = bench.picture()[0, 2:5, 4:16]
+        bench.feel(bench.walked_m + 0.1 * FULL)
+        bench.look(picture)
+
+    zero_in_time(bench, "camera-frozen", with_clock)
+    for _ in range(50):
+        with_clock()
+        assert bench.tick()[0] == 0.0
+    assert drives_again(bench)
+
+
+def test_a_turn_that_a_late_picture_does_not_show_yet_is_no_frozen_picture(bench: Bench) -> None:
+    """A picture belongs to the pose at its capture: of 0.2 s ago, before a robot at 1 rad/s had turned by 11°."""
+    noise = np.random.default_rng(3)
+    seen = bench.picture()
+    bench.walked_m += 0.1
+    for tick in range(12):
+        theta_rad = max(0.0, 0.1 * (tick - 9))
+        bench.states += 50
+        bench.history.put(StampedPose(bench.now_ns, SE2(bench.walked_m, 0.0, theta_rad), 0.0, 0.0, 1.0))
+        bench.look(seen + noise.integers(0, 2, seen.shape, dtype=np.uint8), age_ms=200.0)
+        bench.tick()
+        assert not found(bench, "camera-frozen")
 
 
 def test_pictures_that_arrive_old(bench: Bench) -> None:

@@ -42,6 +42,7 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
     [
         # In this order: those that leave the run alive share one runner.
         "camera stops",
+        "clock in a frozen picture",
         "plan is NaN",
         "robot's state silent",
         "remote: L2+B",

@@ -162,6 +162,36 @@ def test_a_frozen_camera_repeats_its_first_picture(camera: Camera) -> None:
     assert len(set(after)) == 1 and after[0] not in before
 
 
+@pytest.mark.parametrize("buffers", [2, 5])
+def test_stale_buffers_repeat_the_newest_pictures_in_turn(camera: Camera, buffers: int) -> None:
+    before = camera.ask(8)
+    camera.tell(command("camera-stale-buffers", buffers=buffers).line())
+    after = camera.ask(3 * buffers)
+    assert len(set(after)) == buffers and after[:buffers] == after[buffers : 2 * buffers] == after[2 * buffers :]
+    assert after[: buffers - 1] == before[9 - buffers :]
+
+
+def moved_share(first: bytes, second: bytes) -> float:
+    """Share of the pixels that differ by more than noise and a JPEG make, blurred over 5 pixels."""
+    pictures = [cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE) for jpeg in (first, second)]
+    blurred = [cv2.blur(picture, (5, 5)).astype(int) for picture in pictures]
+    return float(np.mean(np.abs(blurred[0] - blurred[1]) > 4))
+
+
+def test_a_clock_changes_a_small_part_of_a_frozen_picture(camera: Camera) -> None:
+    camera.tell(command("camera-frozen-clock").line())
+    (first,) = camera.ask()
+    time.sleep(0.11)  # another tenth of a second is drawn
+    (last,) = camera.ask()
+    assert first != last and moved_share(first, last) < 0.08
+
+
+def test_noise_changes_the_bytes_of_a_frozen_picture_and_not_its_scene(camera: Camera) -> None:
+    camera.tell(command("camera-frozen-noise").line())
+    first, *_, last = camera.ask(3)
+    assert first != last and moved_share(first, last) < 0.01
+
+
 def test_a_stale_camera_answers_with_an_old_picture(camera: Camera) -> None:
     old = camera.ask(3)
     camera.tell(command("camera-stale", delay_s=60).line())

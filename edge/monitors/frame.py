@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections import deque
-from dataclasses import dataclass
+from collections import OrderedDict, deque
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from edge.findings import Finding
 from edge.geometry import SE2
 from edge.jpeg import jpeg_size
+from edge.monitors.scene import SceneConfig, SceneMonitor
 
 DARK, BRIGHT = 8, 247
 """Of 255: a picture with nearly all values beyond one of these shows nothing."""
@@ -21,6 +22,8 @@ SHOWS_NOTHING = 0.01
 """Share of the values that must lie within, for a picture to show something."""
 BAD_IN_A_ROW = 3
 RATE_WINDOW_NS = 1_000_000_000
+CONTENTS_KEPT = 32
+"""Pictures whose content is remembered: the most buffers that a V4L2 driver hands out in turn."""
 SLOW, TOO_SLOW = 0.65, 0.4
 """Shares of the expected pictures in a second; half of them missing must be found although counting is off by one."""
 
@@ -55,12 +58,16 @@ class FrameConfig:
     """A picture that is older when it is first seen is refused. Fault matrix row 3 asks for 200 ms; one that comes just
     after a tick waits a period for the next, which with 100 ms of the camera's own would be beyond that."""
     frozen_ms: float = 190.0
-    """Zero when the content has been the same for so long while the robot moved: at 10 Hz the second repetition."""
+    """Zero when content comes again that is so old or older although the robot has moved since. At 10 Hz this is the
+    second repetition of one picture, or the first repetition of two or more in turn."""
     moved_m: float = 0.02
     moved_rad: float = 0.02
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """When a picture that is not equal byte for byte counts as frozen."""
 
     def __post_init__(self) -> None:
-        if not all(value is None or value > 0 for value in vars(self).values()):
+        numbers = [value for value in vars(self).values() if not isinstance(value, SceneConfig)]
+        if not all(value is None or value > 0 for value in numbers):
             raise ValueError(f"frame monitor: every value must be positive, found {self}")
 
 
@@ -74,16 +81,16 @@ class FrameOutputs:
 
 
 class FrameMonitor:
-    """Remembers the last pictures' stamps and content, never a picture."""
+    """Remembers the last pictures' stamps and content, and small grey copies of some."""
 
     def __init__(self, config: FrameConfig) -> None:
         self._config = config
         self._seen_ns: int | None = None
         self._usable = False
         self._content = 0
-        self._content_ns = 0
-        self._content_pose: SE2 | None = None
-        self._frozen = False
+        self._contents: OrderedDict[int, tuple[int, SE2]] = OrderedDict()
+        self._scene = SceneMonitor(config.scene)
+        self._frozen = ""
         self._refused = 0
         self._why = ""
         self._size: tuple[int, int] | None = None
@@ -92,7 +99,10 @@ class FrameMonitor:
         self._arrivals: deque[int] = deque(maxlen=max(4, 4 * round(config.rate_hz)))
 
     def step(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> FrameOutputs:
-        """Judge the newest picture at `now_ns`; a picture that was seen before keeps its verdict."""
+        """Judge the newest picture at `now_ns`; a picture that was seen before keeps its verdict.
+
+        `T_odom_base`: the robot's pose when the picture was captured; None: unknown.
+        """
         findings: list[Finding] = []
         if picture is not None and picture.stamp_ns > now_ns:
             ahead_ms = (picture.stamp_ns - now_ns) / 1e6
@@ -105,7 +115,7 @@ class FrameMonitor:
         if self._refused >= BAD_IN_A_ROW:
             findings.append(Finding("frames-refused", self._why))
         if self._frozen:
-            findings.append(Finding("camera-frozen"))
+            findings.append(Finding("camera-frozen", self._frozen))
         if self._other_size >= BAD_IN_A_ROW:
             findings.append(Finding("camera-swapped", self._why))
         self._judge_rate(now_ns, findings)
@@ -159,18 +169,28 @@ class FrameMonitor:
 
     def _judge_content(self, picture: Picture, T_odom_base: SE2 | None) -> None:
         # Every fourth line: whatever moves in a picture moves there too, at a quarter of the cost.
-        content = zlib.crc32(picture.pixels[0, ::4].tobytes())
-        if content != self._content or self._content_pose is None:
-            self._content, self._content_ns = content, picture.stamp_ns
-            self._content_pose = T_odom_base
-            self._frozen = False
-        elif T_odom_base is not None:
-            # A robot that stands still may see the same picture for ever; one that moves may not.
-            moved = self._content_pose.inverse() @ T_odom_base
-            went_m, turned_rad = math.hypot(moved.x_m, moved.y_m), abs(moved.theta_rad)
-            far = went_m > self._config.moved_m or turned_rad > self._config.moved_rad
-            long_enough = (picture.stamp_ns - self._content_ns) / 1e6 >= self._config.frozen_ms
-            self._frozen = self._frozen or (far and long_enough)
+        self._content = zlib.crc32(picture.pixels[0, ::4].tobytes())
+        if T_odom_base is not None:
+            scene = self._scene.step(picture.pixels, T_odom_base, picture.stamp_ns)
+            self._frozen = self._repetition(picture.stamp_ns, T_odom_base) or scene
+
+    def _repetition(self, stamp_ns: int, T_odom_base: SE2) -> str:
+        """Why this content counts as a repetition of an earlier picture; empty when it does not.
+
+        A robot that stands still may see the same picture for ever; one that moves may not.
+        """
+        first_ns, T_odom_first = self._contents.setdefault(self._content, (stamp_ns, T_odom_base))
+        # A picture that is repeated stays: it must still be recognised when the robot has stopped because of it.
+        self._contents.move_to_end(self._content)
+        if len(self._contents) > CONTENTS_KEPT:
+            self._contents.popitem(last=False)
+        moved = T_odom_first.inverse() @ T_odom_base
+        went_m, turned_rad = math.hypot(moved.x_m, moved.y_m), abs(moved.theta_rad)
+        age_ms = (stamp_ns - first_ns) / 1e6
+        far = went_m > self._config.moved_m or turned_rad > self._config.moved_rad
+        if not far or age_ms < self._config.frozen_ms:
+            return ""
+        return f"the picture of {age_ms:.0f} ms ago again, {went_m:.2f} m and {math.degrees(turned_rad):.0f}° away"
 
     def _judge_rate(self, now_ns: int, findings: list[Finding]) -> None:
         if self._since_ns is None or now_ns - self._since_ns < RATE_WINDOW_NS:

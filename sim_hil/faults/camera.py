@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hil.faults.commands import CLEAR, FaultCommand, FaultCommandError, parse
+from sim_hil.sensor_noise import SensorNoise
 from sim_hil.unitree.service import Received, ServiceServer
 from sim_hil.unitree.video_service import VideoHub, encode_jpeg
 
 _HISTORY_NS: Final = 5_000_000_000
 _NOISE_LEVELS: Final = 4  # grey levels of noise in a covered or blinded picture: its pixels differ every time
 _READ_BYTES: Final = 4096
+_CLOCK_SHARE: Final = (0.4, 0.1)  # width and height of a drawn clock, of the picture's
 
 
 class FaultyVideoHub(VideoHub):
@@ -45,8 +47,10 @@ class FaultyVideoHub(VideoHub):
         self._due: deque[tuple[int, Received, bytes]] = deque()
         self._history: deque[tuple[int, bytes]] = deque()
         self._frozen: bytes | None = None
+        self._stale: deque[bytes] = deque()
         self._capture_ns = 0
         self._rng = np.random.default_rng(0)
+        self._sensor = SensorNoise(*size, seed=0)
 
     def listen(self) -> bool:
         """Take the commands that have come; False when whoever sent them has gone."""
@@ -68,17 +72,21 @@ class FaultyVideoHub(VideoHub):
         if command.fault == CLEAR:
             self._on.clear()
             self._untold.clear()
-            self._frozen = None
+            self._thaw()
         elif command.on:
             self._on[command.fault] = command
             self._untold.add(command.fault)
-            self._frozen = None
+            self._thaw()
             if command.fault == "camera-stop":  # what it does is nothing, from now on
                 self._took_effect()
         else:
             self._on.pop(command.fault, None)
             self._untold.discard(command.fault)
             self._tell({"event": "fault", "fault": command.fault, "t_ns": time.monotonic_ns()})
+
+    def _thaw(self) -> None:
+        self._frozen = None
+        self._stale.clear()
 
     def _took_effect(self) -> None:
         for name in sorted(self._untold):
@@ -119,9 +127,15 @@ class FaultyVideoHub(VideoHub):
 
     def _spoiled(self, jpeg: bytes, now_ns: int) -> bytes:
         on, (width, height) = self._on, self._size
-        if "camera-freeze" in on:
+        if {"camera-freeze", "camera-frozen-clock", "camera-frozen-noise"} & on.keys():
             self._frozen = self._frozen or jpeg
             jpeg = self._frozen
+        if "camera-frozen-clock" in on:
+            jpeg = encode_jpeg(_with_clock(_decoded(jpeg), now_ns))
+        if "camera-frozen-noise" in on:
+            jpeg = encode_jpeg(self._sensor.add(_decoded(jpeg)))
+        if "camera-stale-buffers" in on:
+            jpeg = self._next_stale(round(on["camera-stale-buffers"].number("buffers")))
         if "camera-stale" in on:
             then_ns = now_ns - round(on["camera-stale"].number("delay_s") * 1e9)
             jpeg = next((old for t_ns, old in reversed(self._history) if t_ns <= then_ns), self._history[0][1])
@@ -131,12 +145,35 @@ class FaultyVideoHub(VideoHub):
             jpeg = encode_jpeg(self._noise(width, height, 256 - _NOISE_LEVELS))
         if "camera-wrong-size" in on:
             wrong = on["camera-wrong-size"]
-            picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
             size = (round(wrong.number("width")), round(wrong.number("height")))
-            jpeg = encode_jpeg(cv2.cvtColor(cv2.resize(picture, size), cv2.COLOR_BGR2RGB).astype(np.uint8))
+            jpeg = encode_jpeg(cv2.resize(_decoded(jpeg), size).astype(np.uint8))
         if "camera-torn" in on:
             jpeg = jpeg[: round(len(jpeg) * on["camera-torn"].number("share"))]
         return jpeg
 
+    def _next_stale(self, buffers: int) -> bytes:
+        """The oldest of the pictures that come again in turn."""
+        if not self._stale:
+            self._stale.extend(jpeg for _, jpeg in list(self._history)[-buffers:])
+        self._stale.rotate(-1)
+        return self._stale[-1]
+
     def _noise(self, width: int, height: int, floor: int) -> NDArray[np.uint8]:
         return self._rng.integers(floor, floor + _NOISE_LEVELS, (height, width, 3), dtype=np.uint8, endpoint=False)
+
+
+def _decoded(jpeg: bytes) -> NDArray[np.uint8]:
+    """RGB [h, w, 3] of a JPEG of our own."""
+    bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
+
+
+def _with_clock(rgb: NDArray[np.uint8], now_ns: int) -> NDArray[np.uint8]:
+    """The picture with seconds and hundredths drawn white on black into its upper left corner."""
+    height, width = rgb.shape[:2]
+    box = (round(_CLOCK_SHARE[0] * width), round(_CLOCK_SHARE[1] * height))
+    scale = box[1] / 40
+    cv2.rectangle(rgb, (0, 0), box, (0, 0, 0), -1)
+    text = f"{now_ns / 1e9 % 1e5:08.2f}"
+    cv2.putText(rgb, text, (2, round(0.8 * box[1])), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1)
+    return rgb

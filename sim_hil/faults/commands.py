@@ -39,6 +39,15 @@ def _kinds() -> dict[str, FaultKind]:
     return {
         "camera-stop": FaultKind("camera", "requests for a picture are never answered"),
         "camera-freeze": FaultKind("camera", "every answer is the first picture since then"),
+        "camera-stale-buffers": FaultKind(
+            "camera",
+            "the newest pictures come again in turn, so many as there are buffers",
+            {"buffers": (2.0, (2, 32))},
+        ),
+        "camera-frozen-clock": FaultKind("camera", "the first picture since then with a running clock drawn into it"),
+        "camera-frozen-noise": FaultKind(
+            "camera", "the first picture since then with new sensor noise, encoded again as JPEG"
+        ),
         "camera-stale": FaultKind("camera", "every answer is the picture of delay_s ago", {"delay_s": (1.0, seconds)}),
         "camera-slow": FaultKind("camera", "every answer comes delay_s late", {"delay_s": (1.0, seconds)}),
         "camera-half-rate": FaultKind(

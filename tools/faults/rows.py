@@ -15,6 +15,9 @@ from tools.faults.rig import Rig
 BRIDGE_STOP_MS = 300
 """A bridge that is told to end, or whose runner is, stops the robot as soon as after a dead runner."""
 
+SCENE_MS = 1000
+"""A scene that stays the same is found by distance: 0.25 m or 12° take 0.4 s on the circle, more where it slows."""
+
 
 class Judge(Enum):
     """What a row is judged by."""
@@ -201,6 +204,9 @@ def rows() -> tuple[Row, ...]:
     live = (
         _robot("camera stops", "camera-stopped", "camera-stop"),
         _robot("camera freezes", "camera-frozen", "camera-freeze"),
+        _robot("camera repeats two pictures in turn", "camera-frozen", "camera-stale-buffers"),
+        _with(_robot("clock in a frozen picture", "camera-frozen", "camera-frozen-clock"), bound=SCENE_MS),
+        _with(_robot("noise on a frozen picture", "camera-frozen", "camera-frozen-noise"), bound=SCENE_MS),
         _robot("camera answers 1 s late", "camera-stale", "camera-slow", delay_s=1.0),
         _robot("camera at half rate", "camera-slow", "camera-half-rate", rate_hz=5.0),
         _robot("camera at a third of its rate", "camera-too-slow", "camera-half-rate", rate_hz=3.0),
