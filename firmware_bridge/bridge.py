@@ -28,6 +28,7 @@ from firmware_bridge.core import BridgeCore, Call, Inputs, Move, Outputs
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
+from firmware_bridge.output_file import check_output, write_descriptor, write_output
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DdsError
 from firmware_bridge.unitree.robot_link import RobotLink
@@ -205,6 +206,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
+        if args.json not in (None, "-"):
+            check_output(Path(args.json))
+    except OSError as error:
+        sys.stderr.write(f"edge-bridge: --json {args.json!r}: expected a file or -: {error.strerror or error}\n")
+        return 2
+    try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
             code, result = 0, serve(config)
@@ -219,12 +226,11 @@ def main(argv: list[str] | None = None) -> int:
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":
-            sys.stdout.write(text)
-        elif args.json:
-            Path(args.json + ".partial").write_text(text, encoding="utf-8")
-            Path(args.json + ".partial").replace(args.json)
+            write_descriptor(sys.stdout.fileno(), text.encode())
+        elif args.json is not None:
+            write_output(Path(args.json), text.encode())
     except OSError as error:
-        sys.stderr.write(f"edge-bridge: the result could not be written: {error}\n")
+        sys.stderr.write(f"edge-bridge: the result could not be written: {error.strerror or error}\n")
         return 1
     return code
 
