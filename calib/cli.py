@@ -8,6 +8,8 @@ import sys
 from collections.abc import Mapping
 from typing import Final
 
+from edge.cli import command_line
+
 JOBS: Final[Mapping[str, tuple[str, str]]] = {
     "latency": ("calib.latency", "measure how long generations take beside control, for edge-bench and edge-train"),
     "odometry": ("calib.odometry", "fit scale, bias and drift of a robot's odometry to a flight log"),
@@ -35,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("edge-calib")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

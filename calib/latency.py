@@ -20,8 +20,8 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    write_named,
     write_result,
-    write_whole,
 )
 from edge.device import read_device
 from edge.graph import GraphError
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
                 f"{len(profile.generation_s)} generations, expected {LEAST} or more; nothing was written: "
                 "give it more --seconds",
             )
-        write_whole(args.out, json.dumps(profile.as_json(), indent=1) + "\n")
+        write_named(args.out, json.dumps(profile.as_json(), indent=1) + "\n")
         result = summary(profile, args.out, measured)
         write_result(args.json, result)
     except MeasureError as error:
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     check_result_target(args.json)
-    check_result_target(str(args.out))
+    check_result_target(str(args.out), "--out")
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: expected a file name that ends in .json")
     if not args.out.absolute().parent.is_dir():

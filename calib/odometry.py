@@ -27,8 +27,8 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    write_named,
     write_result,
-    write_whole,
 )
 from edge.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.drift_rate import Comparison, DriftMonitor
@@ -335,6 +335,8 @@ def run(args: argparse.Namespace) -> int:
     """Fit and write; returns the exit code."""
     try:
         check_result_target(args.json)
+        if args.out is not None:
+            check_result_target(str(args.out), "--out")
         drive = read_drive(args.log)
         prior = OdometryCalibration()
         fitted = fit(drive, _references(args, drive), prior)
@@ -342,7 +344,7 @@ def run(args: argparse.Namespace) -> int:
             comment = (
                 f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
             )
-            write_whole(args.out, fitted.calibration.to_toml(comment))
+            write_named(args.out, fitted.calibration.to_toml(comment))
         write_result(args.json, {"good": fitted.good, **asdict(fitted)})
     except NoFitError as error:
         sys.stderr.write(f"edge-calib odometry: {error}\n")

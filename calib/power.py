@@ -26,8 +26,8 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    write_named,
     write_result,
-    write_whole,
 )
 from edge.device import read_device
 from edge.graph import GraphError
@@ -105,7 +105,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.out is not None and args.out.suffix != ".toml":
         raise ValueError(f"--out {args.out}: expected a file name that ends in .toml")
     if args.out is not None:
-        check_result_target(str(args.out))
+        check_result_target(str(args.out), "--out")
 
 
 def _meter(kind: str, power: PowerPlan, counts: Counts, sysfs_root: Path) -> PowerMeter:
@@ -147,7 +147,7 @@ def _calibrate(
             if lengths[stage]
         ]
         where = f"edge-calib power: {meter.source}, {machine}, {date}"
-        write_whole(args.out, target_text(measured_target(target, fit, phases, points, where)))
+        write_named(args.out, target_text(measured_target(target, fit, phases, points, where)))
         written = True
     _report(fit)
     result = {

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import functools
 import importlib
 import json
 import os
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TextIO
+
+from firmware_bridge.output_file import (
+    check_output,
+    open_through,
+    partial_of,
+    regular_target,
+    replace_regular,
+    write_output,
+)
+
+P = ParamSpec("P")
 
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
@@ -17,39 +32,123 @@ EXIT_REFUSED = 3
 EXIT_INTERRUPTED = 130
 
 
-def check_result_target(where: str | None) -> None:
+class OutputError(RuntimeError):
+    """An output that the user has named could not be written: one line, the exit code is EXIT_CHECK_FAILED."""
+
+
+def check_result_target(where: str | None, option: str = "--json") -> None:
     """Refuse, before a long run, a place that its result cannot be written to; raises OSError with one clear line."""
     if where is None or where == "-":
         return
-    path = Path(where)
-    if not path.name or path.is_dir():
-        raise OSError(f"--json {where!r}: expected a file to write or -")
-    parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise OSError(f"--json {where}: {parent} is not a directory that can be written to")
+    try:
+        check_output(Path(where))
+    except OSError as error:
+        raise OSError(f"{option} {where!r}: expected a file to write or -: {error.strerror or error}") from error
 
 
 def write_result(where: str | None, result: Mapping[str, Any]) -> None:
-    """Write a result as JSON to a file (in one rename) or to standard output for `-`; raises OSError."""
+    """Write a result as JSON to a file (see `write_named`) or to standard output for `-`; raises OutputError."""
     if where is None:
         return
     text = json.dumps(result, indent=1) + "\n"
-    if where == "-":
-        sys.stdout.write(text)
+    if where != "-":
+        with _named(where):
+            Path(where).parent.mkdir(parents=True, exist_ok=True)
+        write_named(Path(where), text)
         return
-    path = Path(where)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text)
+    with _named("standard output"):
+        sys.stdout.write(text)
+        sys.stdout.flush()
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file in one rename, so that a file that is there is whole; raises OSError and leaves nothing."""
-    partial = path.with_name(path.name + ".partial")
+def write_named(path: Path, text: str | bytes) -> None:
+    """Write a file that the user has named, as `write_whole` does; raises OutputError (see `command_line`)."""
+    with _named(path):
+        write_whole(path, text)
+
+
+@contextlib.contextmanager
+def named_file(path: Path) -> Iterator[Path]:
+    """A path for a library to write to; its file then becomes what the user has named. Raises OutputError.
+
+    OSErrors of the library are OutputErrors too.
+    """
+    with _named(path):
+        target = regular_target(path)
+        if target is not None:
+            partial = partial_of(target)
+            try:
+                yield partial
+                with partial.open("rb") as file:
+                    os.fsync(file.fileno())
+                replace_regular(partial, target)
+            finally:
+                partial.unlink(missing_ok=True)
+            return
+        with tempfile.TemporaryDirectory(prefix="tic-") as folder:
+            yield Path(folder) / path.name
+            write_output(path, (Path(folder) / path.name).read_bytes())
+
+
+def write_whole(path: Path, text: str | bytes) -> None:
+    """Write a file in one rename, so that a file that is there is whole; raises OSError and leaves nothing.
+
+    A device or a FIFO is written to as it is, a symbolic link leads to the file that is replaced.
+    """
+    write_output(path, text.encode() if isinstance(text, str) else text)
+
+
+def open_stream(path: Path) -> TextIO:
+    """Open a file that is written line by line, a device or a FIFO too; raises OSError, also without a reader."""
+    if regular_target(path) is not None:
+        return path.open("w", encoding="utf-8")
+    descriptor = open_through(path)
+    os.set_blocking(descriptor, True)
+    return os.fdopen(descriptor, "w", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _named(what: object) -> Iterator[None]:
     try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        raise OutputError(f"{what}: cannot be written: {error.strerror or error}") from error
+
+
+def command_line(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """Decorate the main function of a command: an output that cannot be written is one line and EXIT_CHECK_FAILED.
+
+    Standard output is flushed here, where its error can still be reported.
+    """
+
+    def decorate(main: Callable[P, int]) -> Callable[P, int]:
+        @functools.wraps(main)
+        def run(*args: P.args, **kwargs: P.kwargs) -> int:
+            try:
+                code = main(*args, **kwargs)
+                with _named("standard output"):
+                    sys.stdout.flush()
+                return code
+            except (OutputError, OSError) as error:
+                if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE):
+                    raise
+                sys.stderr.write(f"{name}: {error}\n")
+                _give_up_stdout()
+                return EXIT_CHECK_FAILED
+
+        return run
+
+    return decorate
+
+
+def _give_up_stdout() -> None:
+    """Let nothing be left for the interpreter to write at its exit when standard output takes nothing more."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def run_with_extra(command: str, module: str, extra: str) -> int:

@@ -25,6 +25,7 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.device import available_providers
@@ -81,6 +82,7 @@ def _say(line: str) -> None:
     sys.stderr.flush()
 
 
+@command_line("edge-doctor")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
@@ -103,11 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _say(", ".join(f"{number} {level}" for level, number in counts.items()) + f" in {wall_s:.1f} s")
     result: dict[str, Any] = {"ok": not failed(checks), "counts": counts, "wall_s": wall_s}
     result["checks"] = [check.to_dict() for check in checks]
-    try:
-        write_result(args.json, result)
-    except OSError as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
+    write_result(args.json, result)
     return EXIT_CHECK_FAILED if failed(checks) else EXIT_DONE
 
 

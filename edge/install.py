@@ -16,6 +16,7 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.manifest import load_artifacts
@@ -64,6 +65,7 @@ def _say(line: str) -> None:
     sys.stderr.flush()
 
 
+@command_line("edge-install")
 def main(
     argv: Sequence[str] | None = None, machine: engines.Machine | None = None, host: install_units.Host | None = None
 ) -> int:

@@ -22,6 +22,7 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.language import LanguageModel
@@ -224,6 +225,7 @@ def _open(args: argparse.Namespace, run: RecordedRun) -> tuple[Artifacts, bool]:
     return artifacts, same
 
 
+@command_line("edge-replay")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

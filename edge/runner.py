@@ -24,7 +24,9 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
+    OutputError,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.instructions import check_first_instruction
@@ -139,6 +141,7 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
     return robot, options
 
 
+@command_line("edge-run")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
@@ -205,9 +208,9 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
         say(fault)
     try:
         write_result(args.json, result)
-    except OSError as error:
+    except OutputError as error:
         say(f"the run ended, but its result could not be written: {error}")
-        return EXIT_BAD_INPUT
+        return EXIT_CHECK_FAILED
     if args.json != "-":
         say(json.dumps({key: result[key] for key in ("control", "reasoning", "delay_s", "bridge")}))
     if result["faults"]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED, command_line
 from edge.stop_phrase import is_stop_phrase
 from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
 
@@ -157,6 +157,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("edge-say")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.artifact_files import SIGNATURE_NAME, ArtifactError, parse_manifest, read_manifest_bytes
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED, check_result_target, command_line, write_result
 from edge.manifest import load_artifacts
 from edge.trust import (
     MAX_RELEASE,
@@ -46,7 +46,7 @@ def keygen(key_file: Path) -> str:
     form = library.serialization
     public_file = key_file.with_name(key_file.name + ".pub")
     for path in (key_file, public_file):
-        if path.exists():
+        if path.exists() or path.is_symlink():
             raise KeyFileError(f"{path}: exists; a key is never overwritten, name another file")
     key = library.private.generate()
     secret = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption())
@@ -99,6 +99,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("signature")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

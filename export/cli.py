@@ -16,7 +16,16 @@ from typing import Any
 from rich.console import Console
 
 from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_target,
+    command_line,
+    named_file,
+    write_result,
+)
 from edge.manifest import load_artifacts
 from export.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.calibration import CalibrationError, load_calibration
@@ -168,7 +177,8 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
                 report = build_artifacts(job, out, cache, progress)
                 if args.save_weights is not None:
                     loaded = job.weights.get()
-                    save_weights(loaded.model, args.save_weights, loaded.info)
+                    with named_file(args.save_weights) as path:
+                        save_weights(loaded.model, path, loaded.info)
         finally:
             cache.remember_timings(run, progress.built_s)
     if not report["model"]["trained"]:
@@ -179,13 +189,9 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
 def _check_file_target(option: str, path: Path, out: Path) -> None:
     """Refuse, before a long build, a file that cannot be written or that the new directory would swallow."""
     real = Path(os.path.realpath(path))
-    if real.is_dir() or not path.name:
-        raise UsageError(f"{option} {path}: expected a file to write")
     if real == out or out in real.parents:
         raise UsageError(f"{option} {path}: lies inside --out, which is replaced as a whole; name a place outside it")
-    parent = next(folder for folder in real.parents if folder.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise UsageError(f"{option} {path}: {parent} is not a directory that can be written to")
+    check_result_target(str(path), option)
 
 
 def _verify(args: argparse.Namespace) -> dict[str, Any]:
@@ -236,6 +242,7 @@ def _result(report: dict[str, Any]) -> dict[str, Any]:
     return {"target": report["target"], "model": report["model"]["name"], "graphs": graphs, "plan": report["plan"]}
 
 
+@command_line("edge-export")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from edge.artifact_files import ArtifactError, read_manifest
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from edge.device import read_device
 from edge.geometry import SE2
 from edge.guidance import STRAIGHT_AHEAD
@@ -150,6 +150,7 @@ def _toml(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
+@command_line("export.measure")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser("python -m export.measure", description=str(__doc__).partition("\n")[0])

@@ -30,6 +30,7 @@ from firmware_bridge.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
+from firmware_bridge.output_file import check_output, write_descriptor, write_output
 from firmware_bridge.step_types import Call, Inputs, Move, Outputs
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DdsError
@@ -267,6 +268,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
+        if args.json not in (None, "-"):
+            check_output(Path(args.json))
+    except OSError as error:
+        sys.stderr.write(f"edge-bridge: --json {args.json!r}: expected a file or -: {error.strerror or error}\n")
+        return 2
+    try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
             latch = args.latch or Path(f"{config.bridge.socket}.latch")
@@ -282,12 +289,11 @@ def main(argv: list[str] | None = None) -> int:
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":
-            sys.stdout.write(text)
-        elif args.json:
-            Path(args.json + ".partial").write_text(text, encoding="utf-8")
-            Path(args.json + ".partial").replace(args.json)
+            write_descriptor(sys.stdout.fileno(), text.encode())
+        elif args.json is not None:
+            write_output(Path(args.json), text.encode())
     except OSError as error:
-        sys.stderr.write(f"edge-bridge: the result could not be written: {error}\n")
+        sys.stderr.write(f"edge-bridge: the result could not be written: {error.strerror or error}\n")
         return 1
     return code
 

@@ -17,7 +17,15 @@ from typing import Final
 
 import pybullet
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    OutputError,
+    check_result_target,
+    command_line,
+    write_result,
+)
 from firmware_bridge.config import ConfigError
 from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
 from sim_hil.display import check_display
@@ -134,6 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@command_line("edge-hil")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
     args = _parser().parse_args(argv)
@@ -228,7 +237,7 @@ def _write_results(loop: HilLoop, trace: TraceWriter | None, args: argparse.Name
             code = _complain(f"trace {args.trace} is incomplete: {trace.error}", EXIT_CHECK_FAILED)
     try:
         write_result(args.json, summary)
-    except OSError as error:
+    except OutputError as error:
         code = _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
     return code
 

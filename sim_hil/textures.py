@@ -215,8 +215,15 @@ def palette(colours: list[Colour]) -> Image:
     return image
 
 
+def png_bytes(image: Image) -> bytes:
+    """An RGB picture as PNG (OpenCV wants BGR); raises OSError when that fails."""
+    done, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise OSError("the picture could not be encoded as PNG")
+    return bytes(data)
+
+
 def write_png(image: Image, path: Path) -> Path:
-    """Write an RGB picture as PNG (OpenCV wants BGR); raises OSError when that fails."""
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1])):
-        raise OSError(f"could not write {path}")
+    """Write an RGB picture of the simulation's own; raises OSError when that fails."""
+    path.write_bytes(png_bytes(image))
     return path

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import queue
 import threading
 from pathlib import Path
 from typing import Final
 
+from edge.cli import open_stream
+
 _CAPACITY: Final = 4096
+_CLOSE_S: Final = 10.0  # a reader of a FIFO that hangs must not keep the run from ending
 
 
 class TraceWriter:
@@ -22,7 +26,7 @@ class TraceWriter:
         self.dropped = 0
         self.error: OSError | None = None
         self._queue: queue.Queue[dict[str, object] | None] = queue.Queue(_CAPACITY)
-        self._file = path.open("w", encoding="utf-8")
+        self._file = open_stream(path)
         self._thread = threading.Thread(target=self._write, name="trace", daemon=True)
         self._thread.start()
 
@@ -35,9 +39,16 @@ class TraceWriter:
 
     def close(self, t_ns: int, **summary: object) -> None:
         """Write what is queued and the `end` line, then close the file."""
-        self._queue.put({"t_ns": t_ns, "kind": "end", **summary, "trace_dropped": self.dropped})
-        self._queue.put(None)
-        self._thread.join()
+        try:
+            self._queue.put({"t_ns": t_ns, "kind": "end", **summary, "trace_dropped": self.dropped}, timeout=_CLOSE_S)
+            self._queue.put(None, timeout=_CLOSE_S)
+        except queue.Full:
+            self.error = OSError(errno.ETIMEDOUT, f"took nothing for {_CLOSE_S:g} s")
+            return
+        self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            self.error = OSError(errno.ETIMEDOUT, f"took nothing for {_CLOSE_S:g} s")
+            return
         try:
             self._file.close()
         except OSError as error:

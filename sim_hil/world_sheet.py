@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.cli import check_result_target, command_line, write_named
 from sim_hil.camera import CAMERA_HFOV_RAD
 from sim_hil.scene import KINDS, Scene, SceneError, SceneObject, Wall, load_scene, scene_names
 from sim_hil.scene_kinds import Kind
-from sim_hil.textures import DARK, WHITE, Image, plain, write, write_png
+from sim_hil.textures import DARK, WHITE, Image, plain, png_bytes, write
 from sim_hil.world import build_scene
 from sim_hil.world_renderer import Renderer
 
@@ -149,6 +150,7 @@ def _tiled(tiles: list[Image], columns: int) -> Image:
     return sheet
 
 
+@command_line("world_sheet")
 def main(argv: list[str] | None = None) -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(
@@ -174,11 +176,12 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"--size, --views, --columns: expected e.g. 320x180 and positive numbers, found {args.size}")
     columns = args.columns or max(1300 // (width + 4), 1)
     try:
+        check_result_target(args.out, "--out")
         if args.scene:
             sheet = scene_sheet(load_scene(args.scene), args.views, columns, width, height)
         else:
             sheet = kinds_sheet(args.kind or sorted(KINDS), columns, width, height)
-        write_png(sheet, Path(args.out))
+        write_named(Path(args.out), png_bytes(sheet))
     except (SceneError, OSError) as error:
         sys.stderr.write(f"world_sheet: {error}\n")
         return 2

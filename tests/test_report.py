@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from edge import page
 from edge.recorder import Recorder
+from firmware_bridge.output_file import partial_of
 from tests import synthetic_run
 from tools.report import checks, demo_report, run_data
 from tools.report.demo_report import RunFiles, load_run, spread, write_report
@@ -436,7 +437,7 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
         (_set("run.json", delay_error_ms=[]), "a record of the run lacks or misshapes a field: TypeError"),
         (_frames_that_are_no_pictures("~"), "not a foxglove.CompressedImage"),
         (_frames_that_are_no_pictures("a" * 5), "not a foxglove.CompressedImage"),
-        (lambda out: (out / "report.html.partial").mkdir(), "report.html and demo.json cannot be written"),
+        (lambda out: partial_of(out / "report.html").mkdir(), "report.html and demo.json cannot be written"),
     ],
 )
 def test_a_damaged_file_is_one_line_and_leaves_the_old_report(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edge.artifact_files import MANIFEST_NAME
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
 from export.checkpoint.coverage import CheckpointError
 from export.model.config import PRESETS
 from export.shipped import shipped_weights
@@ -245,6 +245,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("demo")
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

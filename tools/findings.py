@@ -19,6 +19,7 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
     write_result,
 )
 from export.progress import duration
@@ -86,6 +87,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("findings")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.cli import command_line, write_named
 from sim_hil.benchmark.episode import ROBOTS, SUITES, Episode, suite_to_toml
 from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import WordingError, wordings
@@ -197,6 +198,7 @@ def _say(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
+@command_line("build_suite")
 def main(argv: list[str] | None = None) -> int:
     """Write the suite; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -213,7 +215,7 @@ def main(argv: list[str] | None = None) -> int:
             same = args.out.read_text(encoding="utf-8") == text
             _say(f"{args.out} {'is' if same else 'is not'} what would be built")
             return 0 if same else 1
-        args.out.write_text(text, encoding="utf-8")
+        write_named(args.out, text)
     except (ValueError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -22,6 +22,7 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
     write_result,
 )
 from firmware_bridge.config import ConfigError
@@ -127,6 +128,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("edge-bench")
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; see EXAMPLES for the exit codes."""
     argv = sys.argv[1:] if argv is None else list(argv)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.benchmark.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.report import write_report
 from sim_hil.benchmark.results import ResultError
@@ -27,6 +27,7 @@ exit codes: 0 done, 2 bad arguments or input
 _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, points"}
 
 
+@command_line("edge-bench")
 def main(argv: Sequence[str]) -> int:
     """Command line, the job's name included."""
     parser = argparse.ArgumentParser(

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Protocol
 
+from edge.cli import write_whole
 from sim_hil.benchmark.results import EpisodeResult, FailedRun
 from sim_hil.benchmark.store import ResultStore
 from sim_hil.benchmark.task import EpisodeTask
@@ -124,7 +124,7 @@ def _take(
         raise RefusedRunError(f"episode {ended.id}: {ended.why}", ended.refused_code)
     if ended.result is not None:
         for name, data in ended.files:
-            _write(store.directory / name, data)
+            write_whole(store.directory / name, data)
         if store.add(ended.result):
             watcher.finished(ended.result)
     elif task.attempt < backend.attempts:
@@ -134,9 +134,3 @@ def _take(
         failed = FailedRun(ended.id, task.attempt, ended.why)
         store.add_failed(failed)
         watcher.failed(failed)
-
-
-def _write(path: Path, data: bytes) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)

@@ -7,13 +7,12 @@ which a way is told (route.tell) are the builder's own: a mistake in them is fou
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 
+from edge.cli import check_result_target, command_line, write_result
 from sim_hil.benchmark.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
 from sim_hil.benchmark.instruction_reading import untrue
 from sim_hil.benchmark.instructions import is_held_out
@@ -145,6 +144,7 @@ def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
     return {name: lines for name, lines in found.items() if lines}
 
 
+@command_line("validate")
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(
@@ -157,9 +157,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", metavar="FILE|-", help="the result as JSON")
     args = parser.parse_args(argv)
     try:
+        check_result_target(args.json)
         episodes = load_suite(args.suite)
         wrong = validate(episodes)
-    except (SuiteError, SceneError) as error:
+    except (SuiteError, SceneError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     result = {
@@ -171,14 +172,7 @@ def main(argv: list[str] | None = None) -> int:
         "wrong": len(wrong),
         "problems": wrong,
     }
-    try:
-        if args.json == "-":
-            sys.stdout.write(json.dumps(result) + "\n")
-        elif args.json:
-            Path(args.json).write_text(json.dumps(result) + "\n", encoding="utf-8")
-    except OSError as error:
-        sys.stderr.write(f"--json: cannot write: {error}\n")
-        return 2
+    write_result(args.json, result)
     for name, lines in wrong.items():
         for line in lines:
             sys.stderr.write(f"{name}: {line}\n")

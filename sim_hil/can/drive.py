@@ -14,6 +14,7 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_result,
 )
 from sim_hil.can import frames
@@ -106,6 +107,7 @@ def _result(client: CanClient, driven: list[Odometry]) -> dict[str, object]:
     }
 
 
+@command_line("drive")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
     args = _parser().parse_args(argv)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
+from edge.cli import check_result_target, command_line, write_named, write_result
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
 from sim_hil.scene import Scene
 from sim_hil.scene_map import draw_map
 from sim_hil.scene_write import scene_to_toml
-from sim_hil.textures import write_png
+from sim_hil.textures import png_bytes
 
 _EXAMPLES = f"""examples:
   python -m sim_hil.layouts hospital --seed 4711 --out hospital_4711.toml --map hospital_4711.png
@@ -48,6 +48,7 @@ def _summary(scene: Scene) -> dict[str, object]:
     }
 
 
+@command_line("layouts")
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     args = _parser().parse_args(argv)
@@ -57,6 +58,13 @@ def main(argv: list[str] | None = None) -> int:
     if not args.benchmark and 0 <= args.seed < RESERVED_BELOW:
         sys.stderr.write(f"--seed: {args.seed} is the benchmark's; take {RESERVED_BELOW} or more, or --benchmark\n")
         return 2
+    try:
+        check_result_target(args.json)
+        for option, path in (("--out", args.out), ("--map", args.map)):
+            check_result_target(None if path is None else str(path), option)
+    except OSError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
     seed = BENCHMARK_SEEDS[args.kind] if args.benchmark else args.seed
     try:
         scene = generate(args.kind, seed, reserved=args.benchmark)
@@ -64,13 +72,10 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write(str(error) + "\n")
         return 1 if seed >= 0 else 2
     try:
-        args.out.write_text(scene_to_toml(scene), encoding="utf-8")
+        write_named(args.out, scene_to_toml(scene))
         if args.map is not None:
-            write_png(draw_map(scene, args.px_per_m, names=True), args.map)
-        if args.json == "-":
-            sys.stdout.write(json.dumps(_summary(scene)) + "\n")
-        elif args.json:
-            Path(args.json).write_text(json.dumps(_summary(scene)) + "\n", encoding="utf-8")
+            write_named(args.map, png_bytes(draw_map(scene, args.px_per_m, names=True)))
+        write_result(args.json, _summary(scene))
     except OSError as error:
         sys.stderr.write(f"cannot write: {error}" + "\n")
         return 2

@@ -20,6 +20,7 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_result,
 )
 from sim_hil.network.config import KINDS, NetworkConfig, NetworkError, load_network
@@ -88,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@command_line("network")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
     args = _parser().parse_args(argv)
@@ -163,10 +165,7 @@ def _code(status: int) -> int:
 
 
 def _written(args: argparse.Namespace, relay: Relay, code: int) -> int:
-    try:
-        write_result(args.json, relay.summary())
-    except OSError as error:
-        return _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
+    write_result(args.json, relay.summary())
     return code
 
 

@@ -18,6 +18,7 @@ from edge.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.manifest import load_artifacts
@@ -94,6 +95,7 @@ def parse_seconds(text: str) -> float:
     return float(match[1]) * _UNITS_S[match[2] or "s"]
 
 
+@command_line("edge-soak")
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
     """Command line; see EXAMPLES for the exit codes."""
     args = parser().parse_args(argv)

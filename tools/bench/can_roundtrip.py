@@ -16,7 +16,7 @@ import urllib.request
 from itertools import pairwise
 from typing import Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.stats import percentiles
 from sim_hil.can.buses import INTERFACES, BusAddress, BusError, BusLink, open_bus
 from sim_hil.can.client import CanClient
@@ -74,6 +74,7 @@ def summary(samples: list[float]) -> dict[str, float | int | None]:
     return {"count": len(samples), **percentiles(samples, "p50", "p99", "max")}
 
 
+@command_line("can_roundtrip")
 def main(argv: list[str] | None = None) -> int:
     """Command line; 1 when the base does not answer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edge import runner
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.geometry import SE2
 from edge.policy import Policy
 from edge.power.monitor import PowerMonitor
@@ -177,6 +177,7 @@ def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], 
         return *read_ticks(log), missed
 
 
+@command_line("contention")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if argv is None else argv

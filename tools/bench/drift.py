@@ -23,7 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.drift_rate import Comparison, DriftMonitor
 from edge.geometry import SE2, wrap_angle
 from edge.odometry import DriftConfig, DriftEstimator, OdometryInputs
@@ -296,6 +296,7 @@ def _table(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+@command_line("drift")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -21,7 +21,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.power.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
 from edge.power.plan import PowerPlan, power_plan
 from edge.reasoning_budget import UNLIMITED, ReasoningBudget
@@ -233,6 +233,7 @@ def judge(load: str, run: Run, budget_w: float, period_s: float = 0.1) -> dict[s
     }
 
 
+@command_line("governor")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -255,11 +256,7 @@ def main(argv: list[str] | None = None) -> int:
         loads[load] = judge(load, run, budget_w)
         samples[load] = dataclasses.asdict(run)
     ok = all(row["ok"] for row in loads.values())
-    try:
-        write_result(args.json, {"loads": loads, "ok": ok, "seed": args.seed, "samples": samples, "tagged": "modelled"})
-    except OSError as error:
-        sys.stderr.write(f"governor: {error}\n")
-        return EXIT_BAD_INPUT
+    write_result(args.json, {"loads": loads, "ok": ok, "seed": args.seed, "samples": samples, "tagged": "modelled"})
     if args.json != "-":
         for load, row in loads.items():
             print(

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from edge.geometry import SE2
 from edge.language import LanguageModel
 from edge.manifest import Artifacts, load_artifacts
@@ -206,6 +206,7 @@ def saved(samples: dict[str, dict[str, list[float]]], way: str) -> float:
     return round(statistics.median(a - b for a, b in zip(early, late, strict=True)), 2)
 
 
+@command_line("late_anchor")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 import pybullet
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.benchmark.baselines import make_baseline
 from sim_hil.benchmark.episode import Episode
 from sim_hil.benchmark.world import EpisodeWorld, WorldOptions
@@ -174,6 +174,7 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+@command_line("lockstep")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see the module's page for the exit codes."""
     parser = argparse.ArgumentParser(

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from tokenizers import Tokenizer
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.geometry import SE2
 from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
 from edge.ring import EncodedFrame
@@ -284,6 +284,7 @@ def show(result: dict[str, Any]) -> None:
     Console().print(table)
 
 
+@command_line("parity_1b")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.nav_grid import NavGrid
 from sim_hil.people import UPDATE_HZ, People
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names
@@ -143,6 +143,7 @@ def _print_drives(drives: list[dict[str, Any]]) -> None:
         )
 
 
+@command_line("people")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

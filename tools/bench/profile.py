@@ -17,7 +17,7 @@ import numpy as np
 import onnxruntime as ort
 
 from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
 from edge.graph import DTYPES, Array
 from edge.manifest import Artifacts, load_artifacts
 
@@ -86,6 +86,7 @@ def profile(artifacts: Artifacts, name: str, *, context: int, threads: int) -> d
     }
 
 
+@command_line("profile")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -25,7 +25,7 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.camera import CAMERA_HFOV_RAD, CameraWorld
 from sim_hil.go2 import RENDER_FIELDS as ROBOT_FIELDS
 from sim_hil.people import RENDER_FIELDS, People, appearances
@@ -152,6 +152,7 @@ def _timing(renderer: str, scene: Scene, people: int, size: str, build_ms: float
     return Timing(renderer, scene.name, len(scene.objects), people, size, round(build_ms, 1), p50, p95, everything, raw)
 
 
+@command_line("render")
 def main(argv: list[str] | None = None) -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(

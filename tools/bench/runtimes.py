@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
 from edge.manifest import load_artifacts
 from tools.bench.peers.contenders import EVERYTHING, OURS, Contender, chosen
 from tools.bench.peers.process import ROOT, MemoryWatch, Peak, Worker, WorkerError, worker_command
@@ -262,6 +262,7 @@ def checked(args: argparse.Namespace) -> Bench:
     return Bench(args, model, contenders)
 
 
+@command_line("runtimes")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = arguments(argv)

@@ -17,7 +17,7 @@ import sys
 import time
 from pathlib import Path
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
 from tools.demo import INSTRUCTION
@@ -71,6 +71,7 @@ def stop_once(children: Children, runner: list[str], trace: Path, number: signal
     return lasting_zero_ms(received_moves(trace), signal_ns)
 
 
+@command_line("stop")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from edge.artifact_files import ArtifactError, read_manifest
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
 from edge.geometry import SE2
 from edge.manifest import load_artifacts
 from edge.policy import Policy
@@ -53,6 +53,7 @@ def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[
     return tick
 
 
+@command_line("tick")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

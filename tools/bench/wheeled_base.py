@@ -23,7 +23,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.carter_odometry import WheelCalibration
 from tools.bench.wheeled_course import World, forward_mps
 
@@ -156,6 +156,7 @@ def run(rate_hz: int, minutes: float, repeats: int) -> dict[str, list[Row]]:
     return rows
 
 
+@command_line("wheeled_base")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see the module's page for the exit codes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -24,6 +24,7 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_result,
 )
 from edge.recorder import space_refusal
@@ -159,6 +160,7 @@ def keep_logs(folder: Path, out: Path) -> None:
             (kept / log.name).write_bytes(log.read_bytes())
 
 
+@command_line("faults")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)

@@ -15,6 +15,7 @@ import sys
 import time
 from pathlib import Path
 
+from edge.cli import command_line, open_stream
 from firmware_bridge.config import DdsConfig
 from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus, take_each
@@ -25,6 +26,7 @@ _WAIT_NS = 50_000_000
 _DEPTH = 256
 
 
+@command_line("sniffer")
 def main(argv: list[str] | None = None) -> int:
     """Listen until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -39,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
     reader = bus.reader(ids.request_topic(ids.SPORT_SERVICE), Request_, depth=_DEPTH, reliable=True)
     waitset = bus.waitset(reader)
     sources: dict[int, int] = {}
-    with args.out.open("w", encoding="utf-8") as file:
+    with open_stream(args.out) as file:
         sys.stderr.write("sniffer: ready\n")
         sys.stderr.flush()
         while not ended:

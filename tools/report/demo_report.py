@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from edge import page
-from edge.cli import write_result, write_whole
+from edge.cli import OutputError, command_line, write_result, write_whole
 from tools.report import figures
 from tools.report.checks import Check, acceptance
 from tools.report.numbers import Number, delay_at_call, headline, numbers
@@ -105,7 +105,7 @@ def write_report(files: RunFiles, *, wall_s: float) -> Record:
     try:
         write_whole(files.report, html)
         write_result(str(files.summary), summary)
-    except OSError as error:
+    except (OSError, OutputError) as error:
         raise ReportError(f"{files.report} and {files.summary.name} cannot be written: {error}") from error
     return summary
 
@@ -289,6 +289,7 @@ def recorded_artifacts(out: Path) -> Path:
     return out / named
 
 
+@command_line("demo_report")
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
     parser = argparse.ArgumentParser(

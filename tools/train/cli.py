@@ -23,7 +23,9 @@ from edge.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
+    OutputError,
     check_result_target,
+    command_line,
     write_result,
     write_whole,
 )
@@ -119,6 +121,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("edge-train")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
@@ -132,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         again = "; go on with --resume" if args.out is not None else ""
         return _fail(EXIT_INTERRUPTED, f"interrupted, what is finished stays{again}")
-    except (ExportError, RunsError, StageFailedError) as error:
+    except (ExportError, OutputError, RunsError, StageFailedError) as error:
         return _fail(EXIT_CHECK_FAILED, str(error))
     except ArtifactError as error:
         return _fail(EXIT_REFUSED, str(error))

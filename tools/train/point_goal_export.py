@@ -18,7 +18,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, named_file
 from export.model.config import ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.vision import VisionEncoder
@@ -56,11 +56,11 @@ def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path:
     about = {"format": FORMAT, "image_px": px, "step_s": config.action.step_s, "origin": origin}
     onnx.helper.set_model_props(model, {KEY: json.dumps(about, sort_keys=True)})
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    onnx.save(model, str(partial))
-    partial.replace(path)
+    with named_file(path) as partial:
+        onnx.save(model, str(partial))
 
 
+@command_line("point_goal_export")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     p = argparse.ArgumentParser("point_goal_export", description=__doc__.split("\n")[0])

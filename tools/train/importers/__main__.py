@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
 from tools.train.dataset import DatasetWriter
 from tools.train.drive import DriveError, Entry
 from tools.train.importers import gnd, scand
@@ -45,6 +45,7 @@ def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, A
         return {"recordings": len(folders), **writer.summary(f"{layout}-"), "sha256": writer.finish().sha256}
 
 
+@command_line("importers")
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(
