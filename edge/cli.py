@@ -43,7 +43,9 @@ def check_result_target(where: str | None, option: str = "--json") -> None:
     try:
         check_output(Path(where))
     except OSError as error:
-        raise OSError(f"{option} {where!r}: expected a file to write or -: {error.strerror or error}") from error
+        raise OSError(
+            f"{option} {where or repr(where)}: expected a file to write or -: {error.strerror or error}"
+        ) from error
 
 
 def write_result(where: str | None, result: Mapping[str, Any]) -> None:

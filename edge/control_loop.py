@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from edge.arrival import ARRIVED, is_there
 from edge.back_off import BACKING_OFF, BackOff, BackOffConfig
-from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand
+from edge.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan
 from edge.faults import FAULT_OF_CAUSE
 from edge.findings import Finding
 from edge.frame import Frame
@@ -64,6 +64,9 @@ class ControlStatistics:
     delay_error_ms: Samples = field(default_factory=Samples)
     """|Δt measured for the action expert − (instant of its call − anchor)|."""
     unsent: int = 0
+    plans: int = 0
+    plans_not_finite: int = 0
+    """Of `plans`, those that no robot can be driven by: see `edge.controller.is_plan`."""
     reasons: dict[str, int] = field(default_factory=dict)
     """Ticks by what decided their velocity: "ok", the reason for zero (ARRIVED among them), BACKING_OFF or TURNING."""
     faults: dict[str, int] = field(default_factory=dict)
@@ -185,6 +188,8 @@ class ControlLoop:
             offset = semantic.motion_offset(pose.T_odom_base)
             called_ns = self._clock()
             trajectory = self._act(encoded, pose, delay_s, offset, semantic)
+            self.statistics.plans += 1
+            self.statistics.plans_not_finite += not is_plan(trajectory)
             error_ms = abs(float(np.float32(delay_s)) * 1e3 - (called_ns - semantic.anchor_ns) / 1e6)
             self.statistics.delay_error_ms.add(error_ms)
             self.statistics.delay_s.add(delay_s)

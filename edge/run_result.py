@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from edge.assembly import RunOptions
-from edge.control_loop import ControlLoop
+from edge.control_loop import ControlLoop, ControlStatistics
 from edge.manifest import Artifacts
 from edge.reasoning_loop import ReasoningLoop
 from edge.robot_inputs import RobotInputs
@@ -44,14 +44,18 @@ def run_result(
     faults: list[str],
     duration_s: float,
 ) -> dict[str, Any]:
-    """What happened; `faults` are lines for the operator, each of which ended the run."""
+    """What happened; `faults` are lines for the operator, each of which ended the run or made it worthless."""
     ticks = control.statistics
+    if (fault := plan_fault(ticks)) is not None:
+        faults = [*faults, fault]
     return {
         "control": {
             "ticks": ticks.ticks,
             "missed": ticks.missed,
             "tick_ms": percentiles(ticks.tick_ms, "p50", "p99", "p999", "max"),
             "unsent": ticks.unsent,
+            "plans": ticks.plans,
+            "plans_not_finite": ticks.plans_not_finite,
             "reasons": ticks.reasons,
             "faults": ticks.faults,
             "state": control.supervision.state.value,
@@ -82,6 +86,16 @@ def run_result(
         "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         "tagged": "measured",
     }
+
+
+def plan_fault(statistics: ControlStatistics) -> str | None:
+    """The fault of a run whose plans were never finite: the robot stood throughout; None for any other run."""
+    if not statistics.plans or statistics.plans_not_finite < statistics.plans:
+        return None
+    return (
+        f"output-not-finite: none of the {statistics.plans} plans was finite, the robot stood throughout; "
+        "verify the artifacts: edge-export verify DIR"
+    )
 
 
 def _odometry(inputs: RobotInputs) -> dict[str, Any]:

@@ -53,7 +53,8 @@ EXAMPLES = """examples:
 
 edge-bridge must be running; where the robot file says operator_arm, the robot stays where it is until
 `edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
-exit codes: 0 done (also after SIGTERM), 1 a fault ended the run, 2 bad arguments or input, 3 refused to drive,
+exit codes: 0 done (also after SIGTERM), 1 a fault ended the run, no plan was finite, or the
+            result could not be written, 2 bad arguments or input, 3 refused to drive,
             130 interrupted (SIGINT); a hang of reasoning that cannot be interrupted ends the process by SIGKILL,
             so that its service starts it again
 """

@@ -15,11 +15,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from edge.control_loop import ControlStatistics
 from edge.faults import FAULTS
 from edge.findings import Finding
 from edge.geometry import SE2
 from edge.monitors.semantic import SemanticConfig
 from edge.pose_history import StampedPose
+from edge.run_result import plan_fault
 from tests.control_bench import LIMITS, MS, PERIOD_NS, PX, Attitude, Bench
 
 BRIDGE_NS = 20 * MS
@@ -389,6 +391,32 @@ def test_an_output_that_is_not_finite(bench: Bench) -> None:
     assert bench.tick() == (0.0, "output-not-finite")  # in the same tick: only the bridge's period comes on top
     bench.policy.step = (0.1, 0.0, 0.0)
     assert drives_again(bench)
+
+
+def test_a_run_whose_plans_were_never_finite_has_a_fault(bench: Bench) -> None:
+    bench.see()
+    bench.loop.statistics = ControlStatistics()
+    bench.policy.step = (math.nan, 0.0, 0.0)
+    for _ in range(3):
+        bench.tick()
+    assert (bench.loop.statistics.plans, bench.loop.statistics.plans_not_finite) == (3, 3)
+    fault = plan_fault(bench.loop.statistics)
+    assert fault is not None and fault.startswith("output-not-finite: none of the 3 plans was finite")
+
+
+def test_one_finite_plan_is_none(bench: Bench) -> None:
+    bench.see()
+    bench.loop.statistics = ControlStatistics()
+    bench.policy.step = (math.nan, 0.0, 0.0)
+    bench.tick()
+    bench.policy.step = (0.1, 0.0, 0.0)
+    bench.tick()
+    assert (bench.loop.statistics.plans, bench.loop.statistics.plans_not_finite) == (2, 1)
+    assert plan_fault(bench.loop.statistics) is None
+
+
+def test_a_run_without_a_plan_has_no_fault_of_its_plans() -> None:
+    assert plan_fault(ControlStatistics()) is None
 
 
 def far_out(bench: Bench) -> None:

@@ -333,7 +333,7 @@ def test_a_part_of_the_log_is_replayed_with_the_generation_that_it_drove_by(log:
 
 def test_nothing_to_compare_is_no_success(log: Log) -> None:
     code, result = log.replay("--from", "100")
-    assert code == 1 and "nothing" in result["beyond"][0]
+    assert code == 1 and "no tick" in result["beyond"][0]
 
 
 def test_other_artifacts_are_refused_unless_forced(log: Log, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sim_hil.soak import budget
+from sim_hil.soak import budget, cli
 from sim_hil.soak.budget import FAIL, PASS, UNDECIDED, BudgetLine, Measure, judge, judge_line, load_budget
 from sim_hil.soak.measures import measures, names
+from sim_hil.soak.report import write_report
 from sim_hil.soak.schedule import SoakInputError
 from sim_hil.soak.slopes import slope
+from sim_hil.soak.soak_run import SoakFolder, SoakOptions, soak_result, verdict
 
 LIMIT = BudgetLine("x", "here", max=1.0)
 
@@ -85,6 +88,54 @@ def test_a_soak_without_anything_fails_in_no_line() -> None:
     assert all(found.verdict != FAIL for found in judge(load_budget(budget.DEFAULT), measures([], [])))
 
 
+def test_a_soak_without_anything_is_undecided_in_every_line() -> None:
+    found = judge(load_budget(budget.DEFAULT), measures([], []))
+    assert {line.verdict for line in found} == {UNDECIDED}
+    assert verdict(found) == UNDECIDED
+
+
+def test_one_line_without_data_makes_the_soak_undecided() -> None:
+    passed = judge_line(LIMIT, Measure(0.5, "", 5))
+    nothing = judge_line(LIMIT, Measure(None, "", 0))
+    failed = judge_line(LIMIT, Measure(2.0, "", 5))
+    assert verdict([passed]) == PASS
+    assert verdict([passed, nothing]) == UNDECIDED
+    assert verdict([passed, nothing, failed]) == FAIL
+
+
+def test_a_budget_without_lines_decides_nothing() -> None:
+    assert verdict([]) == UNDECIDED
+
+
+def test_a_soak_without_faults_is_not_judged_by_the_answers_to_them() -> None:
+    lines = load_budget(budget.DEFAULT)
+    left = budget.that_apply(lines, faults=False)
+    assert {line.measure for line in lines} - {line.measure for line in left} == {"faults_unanswered"}
+    assert budget.that_apply(lines, faults=True) == lines
+
+
+def empty_soak(tmp_path: Path) -> tuple[int, dict[str, Any], str]:
+    """A soak whose legs ended before anything was measured: exit code, result and page."""
+    options = SoakOptions(
+        tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "default"
+    )
+    soak = SoakFolder.create(tmp_path / "out", options)
+    result = soak_result(soak, options, load_budget(budget.DEFAULT), finished=True)
+    return cli.exit_code(result), result, write_report(soak, result).read_text(encoding="utf-8")
+
+
+def test_an_empty_soak_is_undecided_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, result, _ = empty_soak(tmp_path)
+    assert (code, result["verdict"]) == (1, UNDECIDED)
+    assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
+
+
+def test_the_page_of_an_empty_soak_says_undecided(tmp_path: Path) -> None:
+    page = empty_soak(tmp_path)[2]
+    assert '<span class="verdict bad">UNDECIDED</span>' in page
+    assert "no verdict: 12 of 12 budget lines are undecided" in page
+
+
 @pytest.mark.parametrize("lines", ["max = 1.0\nmin = 0.0", "", "max = nan", "most = 1.0"])
 def test_a_budget_that_is_wrong_is_refused(tmp_path: Path, lines: str) -> None:
     path = tmp_path / "budget.toml"
@@ -99,10 +150,10 @@ def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
 
 
 def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
-    for growth, verdict in ((3.0, FAIL), (0.1, PASS)):
+    for growth, wanted in ((3.0, FAIL), (0.1, PASS)):
         leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
         found = {j.line.measure: j for j in judge(load_budget(budget.DEFAULT), measures([], [leg]))}
-        assert found["memory_slope_mib_per_h.edge-run"].verdict == verdict
+        assert found["memory_slope_mib_per_h.edge-run"].verdict == wanted
         assert found["descriptor_slope_per_h.edge-run"].verdict == PASS
 
 

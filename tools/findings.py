@@ -143,6 +143,8 @@ def _main(args: argparse.Namespace) -> int:
                 f"{each['verdict']:<14} {each['claim']}: {each['value']:+.1f} {each['ci95'] or ''} n {each['n']}\n"
             )
     _say(f"{args.out / 'findings.md'}")
+    if not result["findings"]:
+        return _fail(EXIT_CHECK_FAILED, "no claim could be judged: no run has a result")
     return EXIT_CHECK_FAILED if broken else EXIT_DONE
 
 

@@ -211,6 +211,8 @@ def _run(args: argparse.Namespace) -> int:
         again = f"; continue with --resume --out {args.out}" if args.out is not None else ""
         counted = f"{result['summary']['episodes']} of {len(run.episodes)} episodes have a result"
         return _complain(f"interrupted, {counted}{again}", EXIT_INTERRUPTED)
+    if not store.results:
+        return _complain("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)
     return EXIT_CHECK_FAILED if store.failed else EXIT_DONE
 
 

@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
         for line in lines:
             sys.stderr.write(f"{name}: {line}\n")
     sys.stderr.write(f"{len(episodes)} episodes, {len(wrong)} of them wrong\n")
-    return 1 if wrong else 0
+    return 1 if wrong or not episodes else 0
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from sim_hil.soak.schedule import SoakInputError, known, read_toml
 DEFAULT: Final = Path(__file__).with_name("budget.toml")
 FORMAT: Final = 1
 PASS, FAIL, UNDECIDED = "PASS", "FAIL", "UNDECIDED"
+FAULTS_UNANSWERED: Final = "faults_unanswered"
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,11 @@ def judge(lines: Sequence[BudgetLine], measures: Mapping[str, Measure]) -> list[
     """Every line's verdict; raises SoakInputError for a line about something that is not measured."""
     check_names(lines, measures)
     return [judge_line(line, measures[line.measure]) for line in lines]
+
+
+def that_apply(lines: tuple[BudgetLine, ...], *, faults: bool) -> tuple[BudgetLine, ...]:
+    """The lines to judge by: a soak that is asked to inject no fault has no answers to faults."""
+    return tuple(line for line in lines if faults or line.measure != FAULTS_UNANSWERED)
 
 
 def check_names(lines: Sequence[BudgetLine], names: Mapping[str, object] | Sequence[str]) -> None:

@@ -30,7 +30,7 @@ from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
 from sim_hil.scene import SceneError, load_scene
 from sim_hil.soak import budget as budgets
 from sim_hil.soak import schedule
-from sim_hil.soak.budget import FAIL, BudgetLine
+from sim_hil.soak.budget import PASS, UNDECIDED, BudgetLine
 from sim_hil.soak.measures import names
 from sim_hil.soak.moments import keep_moments
 from sim_hil.soak.report import write_report
@@ -52,8 +52,8 @@ EXAMPLES = """examples:
 
 A leg is one stack (edge-hil, edge-bridge, edge-run) in one scene; within it the runner goes on from task to task.
 The default budget and faults: sim_hil/soak/budget.toml and faults.toml; copy and change them.
-exit codes: 0 the budget is kept, 1 it is not or nothing could be run, 2 bad arguments or input, 3 refused (artifacts),
-            130 interrupted (the report of what there is is written)
+exit codes: 0 the budget is kept, 1 it is not, a line of it is undecided or nothing could be run, 2 bad arguments or
+            input, 3 refused (artifacts), 130 interrupted (the report of what there is is written)
 """
 
 
@@ -105,6 +105,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         menu = _menu(args.faults)
         budget = budgets.load_budget(args.budget or budgets.DEFAULT)
         budgets.check_names(budget, names())
+        budget = budgets.that_apply(budget, faults=menu is not None)
         soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
     except ArtifactError as error:
         return _complain(error, EXIT_REFUSED)
@@ -131,7 +132,17 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         return _complain(failure, EXIT_CHECK_FAILED)
     if not finished:
         return _complain(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
-    return EXIT_CHECK_FAILED if result["verdict"] == FAIL else EXIT_DONE
+    return exit_code(result)
+
+
+def exit_code(result: Mapping[str, Any]) -> int:
+    """Of a finished soak; says which lines of the budget could not be judged. Undecided is not passed."""
+    undecided = [line for line in result["budget"] if line["verdict"] == UNDECIDED]
+    if without := [line["measure"] for line in undecided if line["found"]["value"] is None]:
+        _say(f"no data: {', '.join(without)}")
+    if near := [line["measure"] for line in undecided if line["found"]["value"] is not None]:
+        _say(f"too little data: {', '.join(near)}")
+    return EXIT_DONE if result["verdict"] == PASS else EXIT_CHECK_FAILED
 
 
 def options_of(args: argparse.Namespace) -> SoakOptions:

@@ -123,7 +123,9 @@ def _tasks(found: dict[str, Measure], tasks: Sequence[Mapping[str, Any]]) -> Non
 def _stops(found: dict[str, Measure], legs: Sequence[Analysis]) -> None:
     ends = [end for leg in legs for end in leg["life_ends"] if end["cause"] != "leg"]
     found["stops"] = Measure(len(ends), "", len(ends))
-    found["stops_unexplained"] = Measure(sum(not end["explained"] for end in ends), "", len(ends))
+    ran = bool(ends) or any(leg["lives"] for leg in legs)
+    unexplained = sum(not end["explained"] for end in ends) if ran else None
+    found["stops_unexplained"] = Measure(unexplained, "", len(ends), note="" if ran else "no runner has driven")
     # Before a robot that stands, a picture that stays the same is right.
     faults = [
         fault

@@ -14,7 +14,7 @@ from edge.stats import percentiles
 from sim_hil.report_style import delay_histogram
 from sim_hil.scene import SceneError, load_scene
 from sim_hil.soak import figures
-from sim_hil.soak.budget import FAIL, PASS
+from sim_hil.soak.budget import FAIL, PASS, UNDECIDED
 from sim_hil.soak.moments import Moment, read_moments
 from sim_hil.soak.soak_run import SoakFolder
 
@@ -83,11 +83,13 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
 
 
 def _verdict(result: Mapping[str, Any]) -> str:
-    kind = "bad" if result["verdict"] == FAIL else "good"
-    word = {FAIL: "a budget is not kept", PASS: "all budgets that could be judged are kept"}
-    undecided = sum(line["verdict"] not in (PASS, FAIL) for line in result["budget"])
-    text = word.get(result["verdict"], "nothing could be judged")
-    more = f"; {undecided} lines undecided" if undecided else ""
+    kind = "good" if result["verdict"] == PASS else "bad"
+    lines = result["budget"]
+    undecided = sum(line["verdict"] not in (PASS, FAIL) for line in lines)
+    count = f"{undecided} of {len(lines)} budget lines are undecided"
+    word = {FAIL: "the budget is not kept", PASS: "the budget is kept", UNDECIDED: f"no verdict: {count}"}
+    text = word[result["verdict"]]
+    more = f"; {count}" if undecided and result["verdict"] == FAIL else ""
     cut = "" if result["finished"] else f" It was ended after {result['elapsed_s']:.0f} of {result['asked_s']:.0f} s."
     return (
         f'<p><span class="verdict {kind}">{result["verdict"]}</span> {text}{more}.{cut}</p>'

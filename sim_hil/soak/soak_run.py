@@ -218,9 +218,9 @@ def _leg(
 
 
 def verdict(judgements: Sequence[Judgement]) -> str:
-    """PASS, FAIL, or UNDECIDED where no line could be judged at all."""
+    """FAIL where a line fails, else UNDECIDED where one could not be judged or there is none, else PASS."""
     found = {judgement.verdict for judgement in judgements}
-    return FAIL if FAIL in found else PASS if PASS in found or not found else UNDECIDED
+    return FAIL if FAIL in found else PASS if found == {PASS} else UNDECIDED
 
 
 def soak_result(

@@ -204,7 +204,10 @@ def main(argv: list[str] | None = None) -> int:
     except (SceneError, ValueError, OSError) as error:
         sys.stderr.write(f"lockstep: {error}\n")
         return EXIT_BAD_INPUT
-    passed = all(verdict(row) is not False for row in rows)
+    verdicts = [verdict(row) for row in rows]
+    passed = True in verdicts and False not in verdicts
+    if True not in verdicts and False not in verdicts:
+        sys.stderr.write("lockstep: no case has a target (those with a camera do): nothing was judged\n")
     write_result(args.json, {"passed": passed, "targets": TARGETS, "cases": rows})
     return EXIT_DONE if passed else EXIT_CHECK_FAILED
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.nav_grid import NavGrid
 from sim_hil.people import UPDATE_HZ, People
 from sim_hil.scene import Scene, SceneError, load_scene, scene_names
@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
         _print_runs(runs)
         if drives:
             _print_drives(drives)
-    return EXIT_DONE
+    return EXIT_DONE if runs else EXIT_CHECK_FAILED
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.camera import CAMERA_HFOV_RAD, CameraWorld
 from sim_hil.go2 import RENDER_FIELDS as ROBOT_FIELDS
 from sim_hil.people import RENDER_FIELDS, People, appearances
@@ -196,7 +196,7 @@ def main(argv: list[str] | None = None) -> int:
                 )
             timings += made
     write_result(args.json, {"frames": args.frames, "timings": [asdict(row) for row in timings]})
-    return EXIT_DONE
+    return EXIT_DONE if timings else EXIT_CHECK_FAILED
 
 
 if __name__ == "__main__":

@@ -48,6 +48,8 @@ class RowResult:
     @property
     def problems(self) -> list[str]:
         """Why the row has failed; empty: it has passed."""
+        if not self.samples:
+            return ["no injection"]
         bound = self.row.bound_ms
         found = [f"{sum(s.latency_ms is None for s in self.samples)} never came"]
         found = [] if found[0].startswith("0 ") else found
@@ -87,7 +89,7 @@ def result(rows: Sequence[RowResult], machine: Mapping[str, Any]) -> dict[str, A
     """The JSON result."""
     return {
         "injections": sum(len(row.samples) for row in rows),
-        "pass": all(not row.problems for row in rows),
+        "pass": bool(rows) and all(not row.problems for row in rows),
         "tagged": "measured",
         "machine": dict(machine),
         "rows": {row.row.name: row.as_json() for row in rows},

@@ -150,7 +150,7 @@ def acceptance(data: RunData) -> list[Check]:
     faults = data.results["edge-run"]["faults"]
     return [
         _at_most("faults", "Faults that ended the run", len(faults), 0, note="; ".join(map(str, faults))),
-        _at_least("control_ticks", "Control ticks", control["ticks"], int(TICKS_PER_60_S * scale)),
+        _at_least("control_ticks", "Control ticks", control["ticks"], max(1, int(TICKS_PER_60_S * scale))),
         _at_most(
             "ticks_missing_in_log",
             "Control ticks that the flight log lacks",
@@ -164,7 +164,12 @@ def acceptance(data: RunData) -> list[Check]:
             TICK_P99_LIMIT_MS,
             "ms",
         ),
-        _at_least("generations", "VLM generations", reasoning["generations"], int(GENERATIONS_PER_60_S * scale)),
+        _at_least(
+            "generations",
+            "VLM generations",
+            reasoning["generations"],
+            max(1, int(GENERATIONS_PER_60_S * scale)),
+        ),
         Check(
             "delay_error_ms",
             "Δt against the capture stamp of the camera frame, worst tick",
