@@ -148,7 +148,7 @@ def disarm(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> bool:
-    """Stop the robot; whether the bridge confirms within `limit_s` that nothing but zero went out since."""
+    """Stop the robot; whether within `limit_s` only zeros went out and the robot reported that it stands still."""
     asked_ns = clock()
     while clock() - asked_ns < limit_s * 1e9:
         bridge.stop()  # again and again: once more changes nothing, and one may get lost in a full queue
@@ -156,8 +156,9 @@ def disarm(
             status = bridge.poll()
         except BridgeUnavailable:
             return False  # the end of the connection stops the robot, but nobody confirms it
-        if status is not None and status.stamp_ns >= asked_ns and status.state in ("stopped", "disarmed"):
-            return status.zero_after_stop
+        stopped = status is not None and status.stamp_ns >= asked_ns and status.state in ("stopped", "disarmed")
+        if status is not None and stopped and status.zero_after_stop and status.motion == "still":
+            return True
         sleep(CONFIRM_POLL_S)
     return False
 
