@@ -8,7 +8,7 @@ SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
 
-.PHONY: help demo demos nano faults test lint clean
+.PHONY: help demo demos nano faults test test-all lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
@@ -16,6 +16,7 @@ help:
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
 	@echo "make test   lint, type-check and run the tests"
+	@echo "make test-all  the same and the tests marked slow"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
 
@@ -61,6 +62,9 @@ lint: .venv/.test-installed
 
 test: lint
 	$(BIN)/pytest
+
+test-all: lint
+	$(BIN)/pytest -m ""
 
 clean:
 	rm -rf out

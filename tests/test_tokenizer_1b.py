@@ -25,7 +25,7 @@ def texts() -> list[str]:
     draw = random.Random(0)
     ranges = [(32, 127), (0x80, 0x2FFF), (0x4E00, 0x9FFF), (0x1F300, 0x1F6FF), (9, 14)]
     noise = ["".join(chr(draw.randrange(*draw.choice(ranges))) for _ in range(80)) for _ in range(200)]
-    return [(ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8"), "We'LL go  \r\n\n 12345 (-1.4, 0.0)", *noise]
+    return [(ROOT / "docs/architecture.md").read_text(encoding="utf-8"), "We'LL go  \r\n\n 12345 (-1.4, 0.0)", *noise]
 
 
 def test_text_is_cut_as_by_tiktoken(tokenizer: Tokenizer) -> None:
