@@ -187,6 +187,15 @@ class TestPermission:
         bench.step()
         assert bench.status.permit == "needed"
 
+    def test_a_runner_that_asks_and_disconnects_in_one_step_does_not_wait_for_the_next_one(self) -> None:
+        bench = self.held()
+        bench.client = False
+        bench.step(Arm())
+        bench.client = True
+        bench.step()
+        bench.step(operator=(Arm(),))
+        assert bench.status.permit == "needed"
+
     @pytest.mark.parametrize(
         "danger", [{"foreign": "sport 1008"}, {"remote_in_use": True}, {"denied": "Move"}, {"publishers": "2 of x"}]
     )
