@@ -158,6 +158,14 @@ class World:
         self.bench.now_ns += ms * MS
         self.step()
 
+    def change_client(self, *parting: Message, reconnects: bool = True) -> None:
+        """The runner's connection ends with its last messages in the same step; the next one may follow at once."""
+        self.bench.client = False
+        self.step(*parting)
+        if reconnects:
+            self.bench.client = True
+            self.step()
+
     def recover(self) -> None:
         """Nothing is wrong any more, the old runner has gone and a new one is connected."""
         self.silent = self.tipped = self.broken = self.forged = self.gpio = self.writes_fail = False

@@ -19,6 +19,10 @@ from tests.bridge_world import L2, A, B, World
 FORCED_STATUS = BridgeStatus(0, "armed", "driving", 0, 0, 0, (0.0, 0.0, 0.0), False)
 SPEEDS = st.sampled_from((0.0, 0.5, -0.4, 0.8, 0.1 + 0.2, 1e9, -1e9, math.nan, math.inf, -math.inf, 5e-324))
 AGES_MS = st.sampled_from((0, 10, 240, 250, 251, -1))
+EVENTS = st.sampled_from(
+    ("nothing", "operator stops", "stop keys", "stick", "another client commands", "runner stops", "client changes")
+    + ("client changes before the permission",)
+)
 ENDS_MS = st.sampled_from((1, 19, 20, 90, 260, 510))
 
 
@@ -52,11 +56,7 @@ class BridgeMachine(RuleBasedStateMachine):
     def runner_disconnects(self, parting: tuple, reconnects: bool) -> None:
         """Its last messages may arrive in the step in which it has gone; the next runner may connect right after."""
         world = self._count()
-        world.bench.client = False
-        world.step(*parting)
-        if reconnects:
-            world.bench.client = True
-            world.step()
+        world.change_client(*parting, reconnects=reconnects)
 
     @precondition(lambda self: self.world.bench.client)
     @rule(message=st.sampled_from(((Arm(),), (Arm(),), (Stop(),), (Stop(), Arm()), (Release(),), (FORCED_STATUS,))))
@@ -83,7 +83,9 @@ class BridgeMachine(RuleBasedStateMachine):
             if world.state == "armed":
                 break
         assert world.state == "armed" or not person
-        world.command(0.8, 0.0, 0.3, 0)
+        for _ in range(6):  # up to the limit
+            world.command(0.8, 0.0, 0.3, 0)
+            world.wait(90)
 
     # Persons
 
@@ -96,16 +98,32 @@ class BridgeMachine(RuleBasedStateMachine):
         world = self._count()
         world.step(operator=(Velocity(2**40, world.bench.now_ns, velocity, 0.0, 0.0), FORCED_STATUS))
 
-    @precondition(lambda self: self.world.bench.client)
-    @rule(between_ms=st.sampled_from((0, 20, 2_900, 3_100)), after_ms=st.sampled_from((0, 20, 5_000, 9_900, 10_100)))
-    def operator_permits(self, between_ms: int, after_ms: int) -> None:
-        """The runner asks, the operator permits, the runner asks again: in time or too late."""
+    @rule(between_ms=st.sampled_from((0, 20, 2_900, 3_100)), event=EVENTS, after_ms=st.sampled_from((0, 9_000, 10_100)))
+    def operator_permits(self, between_ms: int, event: str, after_ms: int) -> None:
+        """The runner asks, the operator permits, something happens, a runner asks again: in time or too late."""
         world = self._count()
+        world.recover()
         world.step(Arm())
+        if event == "client changes before the permission":
+            world.change_client(Arm())
         world.stall(between_ms)
         world.step(operator=(Arm(),))
+        if event == "operator stops":
+            world.step(operator=(Stop(),))
+        elif event == "stop keys":
+            world.step(keys=L2 | B)
+        elif event == "stick":
+            world.step(stick=True)
+        elif event == "another client commands":
+            world.step(foreign="sport 1008")
+        elif event == "runner stops":
+            world.step(Stop())
+        elif event == "client changes":
+            world.change_client()
+        world.stall(1_100)
         world.stall(after_ms)
         world.step(Arm())
+        world.wait(20)
 
     @rule(keys=st.sampled_from((L2, B, L2 | B, A, L2 | A)), held_ms=st.sampled_from((0, 20, 100)))
     def keys_pressed(self, keys: int, held_ms: int) -> None:
