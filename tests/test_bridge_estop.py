@@ -245,6 +245,13 @@ class TestConfirmation:
         bench.wait(40)
         assert (bench.status.motion, bench.status.speed_mps) == ("still", 0.0)
 
+    def test_a_still_report_proves_nothing_where_another_publisher_may_have_made_it(self) -> None:
+        bench = Bench().arm()
+        _operator(bench)
+        bench.wait(40)
+        bench.step(publishers="2 publishers of rt/sportmodestate, expected 1")
+        assert bench.status.motion == "unknown"
+
     def test_a_robot_that_drives_on_is_named_within_half_a_second(self) -> None:
         bench = Bench().arm()
         bench.robot = {"vx_mps": 0.8}
