@@ -76,11 +76,22 @@ class Driver:
         self.close()
 
 
+class _Terminal(io.StringIO):
+    """Standard error that notes when its first line came."""
+
+    first_ns = 0
+
+    def write(self, text: str) -> int:
+        self.first_ns = self.first_ns or time.monotonic_ns()
+        return super().write(text)
+
+
 class Rig:
     """One robot and one bridge process; `latch` is the bridge's latch file."""
 
     def __init__(self, robot: FakeGo2, domain: int, folder: Path) -> None:
         self.robot, self.domain, self.folder = robot, domain, folder
+        self.first_line_ns = 0
         self.socket, self.latch = folder / "bridge.sock", folder / "bridge.sock.latch"
 
     def reset(self) -> None:
@@ -99,8 +110,9 @@ class Rig:
 
     def operate(self, command: str) -> tuple[int, dict[str, object], str]:
         """Exit code, status and what was written to stderr."""
-        with contextlib.redirect_stderr(io.StringIO()) as error:
+        with contextlib.redirect_stderr(_Terminal()) as error:
             code, values = operate(command, self.socket)
+        self.first_line_ns = error.first_ns
         return code, values, error.getvalue()
 
     def arm_for(self, driver: Driver) -> None:
