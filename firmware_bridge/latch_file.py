@@ -19,6 +19,8 @@ from typing import Final
 
 _MAX_BYTES: Final = 400
 _WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC
+_PATIENCE_NS: Final = 200_000_000
+"""A disk that takes longer does not keep an operator from hearing of a stop."""
 _EARLIER: Final = "emergency stop of an earlier bridge"
 
 
@@ -52,16 +54,22 @@ class LatchFile:
         """`say` takes one line for the operator when the file cannot be written."""
         self._path = path
         self._say = say
-        self._kept = read_latch(path)
+        self._kept = self._written = read_latch(path)
+        self._changed_ns = 0
         self._changes: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_changes, name="latch-file", daemon=True)
         self._thread.start()
 
-    def keep(self, reason: str) -> None:
-        """Make the file say `reason`, or remove it when that is empty."""
+    def keep(self, reason: str, now_ns: int) -> bool:
+        """Make the file say `reason`, or remove it when that is empty.
+
+        Returns whether a kill now would leave the file as it should be, or it has failed or takes too long. An
+        operator hears of a stop only then.
+        """
         if reason != self._kept:
-            self._kept = reason
+            self._kept, self._changed_ns = reason, now_ns
             self._changes.put(reason)
+        return self._written == reason or now_ns - self._changed_ns > _PATIENCE_NS
 
     def close(self, timeout_s: float) -> None:
         """Give the disk up to `timeout_s` to take the last change."""
@@ -72,7 +80,11 @@ class LatchFile:
         for reason in iter(self._changes.get, None):
             try:
                 self._write(reason)
+                self._written = reason
+                with contextlib.suppress(OSError):  # not every file system can be synced
+                    self._sync(reason)
             except OSError as error:
+                self._written = reason  # as well as it goes
                 failed = ("cannot be written", "may not survive") if reason else ("cannot be removed", "will survive")
                 says = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
                 self._say(f"latch file {self._path}: {says}")
@@ -82,19 +94,19 @@ class LatchFile:
             _check_regular(self._path)
         if reason:
             # Not a temporary file, synced and renamed: the latch must exist before anything waits for the disk.
-            descriptor = os.open(
-                self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o600
-            )
+            descriptor = os.open(self._path, _WRITE_FLAGS, 0o600)
             try:
                 os.write(descriptor, reason.encode("utf-8", "replace")[:_MAX_BYTES])
-                os.fsync(descriptor)
             finally:
                 os.close(descriptor)
         else:
             self._path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not every file system has folders that can be synced
-            folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+
+    def _sync(self, reason: str) -> None:
+        """For a power cut; a kill of the process needs none."""
+        for path in (self._path, self._path.parent) if reason else (self._path.parent,):
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
-                os.fsync(folder)
+                os.fsync(descriptor)
             finally:
-                os.close(folder)
+                os.close(descriptor)

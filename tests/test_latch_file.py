@@ -24,7 +24,7 @@ def kept(path: Path, *reasons: str) -> list[str]:
     lines: list[str] = []
     file = LatchFile(path, lines.append)
     for reason in reasons:
-        file.keep(reason)
+        file.keep(reason, 0)
     file.close(5)
     return lines
 
@@ -82,8 +82,33 @@ def test_a_disk_that_hangs_delays_neither_the_caller_nor_the_latch(path: Path, m
     monkeypatch.setattr(os, "fsync", lambda _: hangs.wait(20))
     file = LatchFile(path, lambda _: None)
     since_s = time.monotonic()
-    file.keep("emergency stop by an operator")
+    file.keep("emergency stop by an operator", 0)
     assert time.monotonic() - since_s < 0.5
     wait_for(lambda: read_latch(path) == "emergency stop by an operator", 5, "the latch")
+    hangs.set()
+    file.close(5)
+
+
+def test_it_counts_as_kept_once_a_kill_would_leave_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opens, real = threading.Event(), os.open
+    monkeypatch.setattr(os, "open", lambda *given: (opens.wait(20), real(*given))[1])
+    file = LatchFile(path, lambda _: None)
+    assert file.keep("", 0)
+    assert not file.keep("emergency stop by an operator", 1000)
+    assert not path.exists()
+    opens.set()
+    wait_for(lambda: file.keep("emergency stop by an operator", 1000), 5, "the latch")
+    assert path.exists()
+    file.close(5)
+
+
+def test_a_disk_that_hangs_keeps_nobody_from_hearing_of_a_stop(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hangs, real = threading.Event(), os.open
+    file = LatchFile(path, lambda _: None)
+    monkeypatch.setattr(os, "open", lambda *given: (hangs.wait(20), real(*given))[1])
+    assert not file.keep("emergency stop by an operator", 10**9)
+    assert not file.keep("emergency stop by an operator", 10**9 + 200_000_000)
+    assert file.keep("emergency stop by an operator", 10**9 + 200_000_001)
+    monkeypatch.undo()
     hangs.set()
     file.close(5)

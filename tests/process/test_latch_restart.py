@@ -65,7 +65,7 @@ def test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms(rig:
                 else:
                     assert rig.operate("stop")[0] == 0
                 kill(bridge)
-            assert rig.latch.exists()
+            assert rig.latch.exists(), f"the latch was not kept in repetition {number}"
             wait_for(lambda: rig.robot.speed_mps < 0.05, 5, "a robot at rest")
             bridge = bridges.enter_context(rig.bridge(f"bridge {number}"))
             rig.reset()
