@@ -18,6 +18,14 @@ from firmware_bridge.unitree.dds import DdsError
 
 STATE_TIMEOUT_S: Final = 3.0
 _POLL_S: Final = 0.02
+_DISCOVERY_S: Final = 0.5  # for every participant of the network to be announced
+
+
+_ADVICE: Final = {
+    "estop": "an emergency stop is latched: find out why it was pressed, then `edge-bridge arm` while a runner waits",
+    "second_publisher": "two robots, a forger or a motor-command program are on this network: leave one robot on it",
+}
+"""What to do where arming is refused, by cause."""
 
 
 class Reader(Protocol):
@@ -28,6 +36,9 @@ class Reader(Protocol):
 
     def request_frame(self, timeout_s: float) -> bytes:
         """One JPEG; raises CameraError."""
+
+    def surplus_publishers(self) -> str | None:
+        """Which topic of the robot has more publishers than it should have."""
 
     def close(self) -> None:
         """Leave the bus."""
@@ -55,7 +66,9 @@ def bridge(robot: RobotConfig, ask: Callable[[RobotConfig], BridgeStatus | None]
     if status.blocked_by == "operator":  # comes last: nothing else is in the way
         return Check(name, Level.OK, f"{found}; waits for `edge-bridge arm`", "ready to arm")
     if status.blocked_by != "none":
-        advice = f"arming is refused because of {status.blocked_by}; edge-bridge status says more"
+        advice = _ADVICE.get(
+            status.blocked_by, f"arming is refused because of {status.blocked_by}; edge-bridge status says more"
+        )
         return Check(name, Level.FAIL, f"{found}; blocked by {status.blocked_by}", "ready to arm", advice)
     return Check(name, Level.OK, found, "ready to arm")
 
@@ -81,7 +94,10 @@ def robot_link(
             advice = "is the robot on, and its cable in? ping it; compare the robot file's [dds] section"
             return [Check("robot", Level.FAIL, said, where, advice), skipped("camera", "the robot does not answer")]
         found = f"{robot.name} reports: mode {state.mode}, error code {state.error_code}"
-        return [Check("robot", Level.OK, found, where), _camera(reader, robot, image_px)]
+        surplus = _wait_for_surplus(reader, min(timeout_s, _DISCOVERY_S))
+        level, found = (Level.FAIL, f"{found}; {surplus}") if surplus else (Level.OK, f"{found}; one publisher a topic")
+        advice = _ADVICE["second_publisher"] if surplus else ""
+        return [Check("robot", level, found, where, advice), _camera(reader, robot, image_px)]
     finally:
         reader.close()
 
@@ -91,6 +107,13 @@ def _wait_for_state(reader: Reader, timeout_s: float) -> RobotState | None:
     while (state := reader.state()) is None and time.monotonic_ns() < deadline_ns:
         time.sleep(_POLL_S)
     return state
+
+
+def _wait_for_surplus(reader: Reader, timeout_s: float) -> str | None:
+    deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+    while (surplus := reader.surplus_publishers()) is None and time.monotonic_ns() < deadline_ns:
+        time.sleep(_POLL_S)
+    return surplus
 
 
 def _camera(reader: Reader, robot: RobotConfig, image_px: int) -> Check:

@@ -51,6 +51,13 @@ BRIDGE: tuple[Fault, ...] = (
         "tests/test_bridge_process.py::test_a_killed_bridges_successor_stops_the_moving_robot_first",
     ),
     Fault(
+        "latch-lost", 30, Action.STOP, 0, "bridge",
+        "The bridge was killed after an emergency stop: the next bridge reads the stop from its latch file.",
+        "Find out why the stop was pressed, then run `edge-bridge arm` while a runner waits.",
+        "tests/process/test_latch_restart.py::"
+        "test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms",
+    ),
+    Fault(
         "bridge-hung", 31, Action.STOP, 1200, "robot",
         "The bridge hangs: the runner ends its run, the robot itself drops a command after 1 s.",
         "systemd's watchdog restarts the bridge, disarmed; look at its journal.",
@@ -67,6 +74,13 @@ BRIDGE: tuple[Fault, ...] = (
         "A command came twice or in the wrong order and was dropped.",
         "Nothing to do.",
         "tests/test_bridge_core.py::TestGate::test_a_sequence_number_that_does_not_increase_is_rejected",
+    ),
+    Fault(
+        "state-from-future", 36, Action.NOTHING, 0, "bridge",
+        "A report of the robot carried a time that has not come yet and was dropped.",
+        "Look for a second publisher of the robot's state: another robot or a forger.",
+        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "test_forged_states_with_future_stamps_do_not_hide_a_tipped_robot",
     ),
     Fault(
         "message-flood", 37, Action.NOTHING, 0, "bridge",
@@ -88,9 +102,37 @@ BRIDGE: tuple[Fault, ...] = (
     ),
     Fault(
         "second-commander", 40, Action.STOP, 500, "bridge",
-        "Somebody else commands the robot.",
+        "Another client commands the robot.",
         "Close the other program or app; only one may command the robot.",
         "tests/test_bridge_process.py::test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched",
+    ),
+    Fault(
+        "lease-taken", 40, Action.STOP, 500, "bridge",
+        "Another client asked for the lease of the sport service, which shuts this bridge out.",
+        "Close the other program or app; while the robot moves, stop it with L2 and B on its remote.",
+        "tests/process/test_stop_means_stop.py::TestConfirmation::"
+        "test_a_lease_request_while_driving_is_a_second_commander",
+    ),
+    Fault(
+        "stop-denied", 40, Action.STOP, 0, "bridge",
+        "Another client holds the lease: the robot denies the stop, and `edge-bridge stop` says that it still moves.",
+        "Press L2 and B on the robot's remote, or switch the robot off.",
+        "tests/process/test_stop_means_stop.py::TestConfirmation::"
+        "test_a_robot_that_another_client_drives_on_is_never_confirmed",
+    ),
+    Fault(
+        "second-publisher", 40, Action.STOP, 500, "bridge",
+        "A second robot or a forger publishes on a topic that the bridge reads.",
+        "Give each robot a network of its own; edge-bridge status names the topic.",
+        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "test_two_robots_are_not_armed_and_a_second_one_stops_the_first",
+    ),
+    Fault(
+        "motor-commands", 40, Action.STOP, 500, "bridge",
+        "Another program publishes motor commands (rt/lowcmd), which bypass the sport service.",
+        "End that program; where it is the robot's own, set safety.robot_lowcmd_publishers.",
+        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "test_a_publisher_of_motor_commands_stops_a_driven_robot",
     ),
     Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
@@ -113,8 +155,20 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "emergency-stop", 47, Action.STOP, 60, "bridge",
         "The emergency stop was pressed, or the remote took over.",
-        "Find out why, release it, then arm again.",
+        "Find out why, release it, then arm again; after an emergency stop with `edge-bridge arm`.",
         "tests/test_bridge_process.py::test_a_hand_on_the_remote_is_zero_within_60_ms",
+    ),
+    Fault(
+        "emergency-stop-latched", 47, Action.STOP, 0, "bridge",
+        "An emergency stop was pressed while the robot was not driven: it latches in every state of the bridge.",
+        "Find out why, then run `edge-bridge arm` while a runner waits.",
+        "tests/test_bridge_model.py::test_after_an_emergency_stop_nothing_moves_the_robot_without_an_operator",
+    ),
+    Fault(
+        "permission-expired", 47, Action.NOTHING, 0, "bridge",
+        "An operator's arm was not used within 10 s, or its runner disconnected: it is void.",
+        "Run `edge-bridge arm` again while a runner waits.",
+        "tests/process/test_stop_means_stop.py::TestPermission::test_it_expires_after_ten_seconds",
     ),
 )  # fmt: skip
 
@@ -194,6 +248,7 @@ FAULT_OF_CAUSE: Mapping[str, str] = MappingProxyType(
         "estop": "emergency-stop",
         "remote_takeover": "emergency-stop",
         "second_commander": "second-commander",
+        "second_publisher": "second-publisher",
         "link_down": "robot-link-down",
         "state_silent": "link-lost",
         "wrong_mode": "robot-mode-left",

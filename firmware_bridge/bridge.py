@@ -158,11 +158,12 @@ class Bridge:
         outputs = self._core.step(inputs, time.monotonic_ns())
         for request in outputs.requests:
             self._robot.write(request)
-        self._latch_file.keep(outputs.latch)
+        latch_is_kept = self._latch_file.keep(outputs.latch, outputs.status.stamp_ns)
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
         self._link.tell(outputs.status)
-        self._operators.tell(outputs.status)
+        if latch_is_kept:  # a stop that an operator has seen confirmed must survive a kill
+            self._operators.tell(outputs.status)
         self._report_progress(outputs.status)
         return outputs
 

@@ -129,9 +129,10 @@ class BridgeCore:
     def _note_connection(self, inputs: Inputs, now_ns: int) -> None:
         if inputs.client and not self._had_client:
             self._last_seq = -1  # numbering is per connection
-        self._had_client = inputs.client
-        if not inputs.client:
+        if not (inputs.client and self._had_client):
+            # Also when a client is new: the last Arm of the client before it may have arrived with its disconnection.
             self._permit.void(disconnected=True)
+        self._had_client = inputs.client
         if self._asleep_ns is not None and inputs.asleep_ns - self._asleep_ns > _ASLEEP_NS:
             self._stop("suspended", "this machine was suspended", now_ns)
         self._asleep_ns = inputs.asleep_ns

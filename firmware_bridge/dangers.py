@@ -105,12 +105,13 @@ class DangerWatch:
     def motion(self, now_ns: int, since_ns: int = _NEVER_NS) -> tuple[str, float]:
         """One of link.MOTIONS and the robot's speed in m/s (-1: unknown).
 
-        "still" needs a report that is fresh and was received after `since_ns`.
+        "still" needs a report that is fresh, was received after `since_ns`, and comes from the only publisher.
         """
         robot = self.fresh(now_ns, _SEEN_NS)
         if robot is None or robot.received_ns <= since_ns:
             return "unknown", -1.0
-        return "moving" if is_moving(robot) else "still", math.hypot(robot.vx_mps, robot.vy_mps)
+        motion = "moving" if is_moving(robot) else "still" if self._publishers is None else "unknown"
+        return motion, math.hypot(robot.vx_mps, robot.vy_mps)
 
 
 def is_moving(robot: RobotState) -> bool:

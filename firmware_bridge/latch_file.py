@@ -1,32 +1,50 @@
 """The emergency-stop latch on disk: a stop must hold although the bridge is killed and started again.
 
-The file exists while the latch holds and contains its reason. A thread writes it, because a slow disk must not delay
-the bridge. A file that cannot be read counts as a latch.
+The file exists while the latch holds and contains its reason. Its mere existence is the latch: a file that is empty,
+garbage, unreadable or no regular file counts as one, so neither a full disk nor a kill between two system calls loses
+it. A thread writes it, because a slow disk must not delay the bridge.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import queue
+import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 _MAX_BYTES: Final = 400
+_WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC
+_PATIENCE_NS: Final = 200_000_000
+"""A disk that takes longer does not keep an operator from hearing of a stop."""
+_EARLIER: Final = "emergency stop of an earlier bridge"
 
 
 def read_latch(path: Path) -> str:
-    """Reason of the latch that an earlier bridge has left at `path`, empty without one."""
+    """Reason of the latch that an earlier bridge has left at `path`, empty without one. Never waits."""
     try:
-        with path.open("rb") as file:
-            reason = " ".join(file.read(_MAX_BYTES).decode("utf-8", "replace").split())
+        _check_regular(path)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            text = os.read(descriptor, _MAX_BYTES).decode("utf-8", "replace")
+        finally:
+            os.close(descriptor)
     except FileNotFoundError:
         return ""
     except OSError as error:
-        return f"emergency stop of an earlier bridge, reason unreadable ({error.strerror})"
-    return reason or "emergency stop of an earlier bridge"
+        return f"{_EARLIER}, reason unreadable ({error.strerror})"
+    reason = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return reason or _EARLIER
+
+
+def _check_regular(path: Path) -> None:
+    """Raise OSError for what is there but is no regular file: a device or FIFO is neither read, written nor removed."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a regular file")
 
 
 class LatchFile:
@@ -36,16 +54,22 @@ class LatchFile:
         """`say` takes one line for the operator when the file cannot be written."""
         self._path = path
         self._say = say
-        self._kept = read_latch(path)
+        self._kept = self._written = read_latch(path)
+        self._changed_ns = 0
         self._changes: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_changes, name="latch-file", daemon=True)
         self._thread.start()
 
-    def keep(self, reason: str) -> None:
-        """Make the file say `reason`, or remove it when that is empty."""
+    def keep(self, reason: str, now_ns: int) -> bool:
+        """Make the file say `reason`, or remove it when that is empty.
+
+        Returns whether a kill now would leave the file as it should be, or it has failed or takes too long. An
+        operator hears of a stop only then.
+        """
         if reason != self._kept:
-            self._kept = reason
+            self._kept, self._changed_ns = reason, now_ns
             self._changes.put(reason)
+        return self._written == reason or now_ns - self._changed_ns > _PATIENCE_NS
 
     def close(self, timeout_s: float) -> None:
         """Give the disk up to `timeout_s` to take the last change."""
@@ -56,23 +80,33 @@ class LatchFile:
         for reason in iter(self._changes.get, None):
             try:
                 self._write(reason)
+                self._written = reason
+                with contextlib.suppress(OSError):  # not every file system can be synced
+                    self._sync(reason)
             except OSError as error:
-                effect = "an emergency stop will not survive a restart of the bridge"
-                self._say(f"latch file {self._path}: cannot be written ({error.strerror}): {effect}")
+                self._written = reason  # as well as it goes
+                failed = ("cannot be written", "may not survive") if reason else ("cannot be removed", "will survive")
+                says = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
+                self._say(f"latch file {self._path}: {says}")
 
     def _write(self, reason: str) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            _check_regular(self._path)
         if reason:
-            partial = self._path.with_name(self._path.name + ".partial")
-            with partial.open("wb") as file:
-                file.write(reason.encode("utf-8", "replace")[:_MAX_BYTES])
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(self._path)
+            # Not a temporary file, synced and renamed: the latch must exist before anything waits for the disk.
+            descriptor = os.open(self._path, _WRITE_FLAGS, 0o600)
+            try:
+                os.write(descriptor, reason.encode("utf-8", "replace")[:_MAX_BYTES])
+            finally:
+                os.close(descriptor)
         else:
             self._path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not every file system has folders that can be synced
-            folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
+
+    def _sync(self, reason: str) -> None:
+        """For a power cut; a kill of the process needs none."""
+        for path in (self._path, self._path.parent) if reason else (self._path.parent,):
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
-                os.fsync(folder)
+                os.fsync(descriptor)
             finally:
-                os.close(folder)
+                os.close(descriptor)

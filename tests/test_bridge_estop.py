@@ -187,6 +187,15 @@ class TestPermission:
         bench.step()
         assert bench.status.permit == "needed"
 
+    def test_a_runner_that_asks_and_disconnects_in_one_step_does_not_wait_for_the_next_one(self) -> None:
+        bench = self.held()
+        bench.client = False
+        bench.step(Arm())
+        bench.client = True
+        bench.step()
+        bench.step(operator=(Arm(),))
+        assert bench.status.permit == "needed"
+
     @pytest.mark.parametrize(
         "danger", [{"foreign": "sport 1008"}, {"remote_in_use": True}, {"denied": "Move"}, {"publishers": "2 of x"}]
     )
@@ -235,6 +244,13 @@ class TestConfirmation:
         _operator(bench)
         bench.wait(40)
         assert (bench.status.motion, bench.status.speed_mps) == ("still", 0.0)
+
+    def test_a_still_report_proves_nothing_where_another_publisher_may_have_made_it(self) -> None:
+        bench = Bench().arm()
+        _operator(bench)
+        bench.wait(40)
+        bench.step(publishers="2 publishers of rt/sportmodestate, expected 1")
+        assert bench.status.motion == "unknown"
 
     def test_a_robot_that_drives_on_is_named_within_half_a_second(self) -> None:
         bench = Bench().arm()

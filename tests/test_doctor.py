@@ -134,7 +134,8 @@ def test_a_bridge_that_would_arm_is_fine(robot: RobotConfig) -> None:
 
 def test_a_bridge_that_would_refuse_says_why(robot: RobotConfig) -> None:
     check = bridge(robot, lambda _robot: status("stopped", "estop"))
-    assert (check.level, "estop" in check.advice) == (Level.FAIL, True)
+    assert (check.level, "estop" in check.found) == (Level.FAIL, True)
+    assert "`edge-bridge arm` while a runner waits" in check.advice
 
 
 def test_a_bridge_that_waits_for_its_operator_is_fine_and_says_so(robot: RobotConfig) -> None:
@@ -156,8 +157,8 @@ def jpeg(value: int | None) -> bytes:
 class FakeRobot:
     """What `Go2Reader` gives, without a bus."""
 
-    def __init__(self, frame: bytes | Exception, *, silent: bool = False) -> None:
-        self._frame, self._silent = frame, silent
+    def __init__(self, frame: bytes | Exception, *, silent: bool = False, surplus: str | None = None) -> None:
+        self._frame, self._silent, self._surplus = frame, silent, surplus
         self.closed = False
 
     def state(self) -> Any:
@@ -167,6 +168,9 @@ class FakeRobot:
         if isinstance(self._frame, Exception):
             raise self._frame
         return self._frame
+
+    def surplus_publishers(self) -> str | None:
+        return self._surplus
 
     def close(self) -> None:
         self.closed = True
@@ -180,6 +184,13 @@ def levels(robot: RobotConfig, fake: FakeRobot) -> list[Level]:
 
 def test_a_robot_that_reports_and_shows_a_picture_is_fine(robot: RobotConfig) -> None:
     assert levels(robot, FakeRobot(jpeg(None))) == [Level.OK, Level.OK]
+
+
+def test_a_second_robot_on_the_network_fails_and_is_named(robot: RobotConfig) -> None:
+    fake = FakeRobot(jpeg(None), surplus="2 publishers of rt/sportmodestate, expected 1")
+    check = robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)[0]
+    assert (check.level, "2 publishers of rt/sportmodestate" in check.found) == (Level.FAIL, True)
+    assert "two robots" in check.advice
 
 
 def test_the_camera_of_a_silent_robot_is_not_asked(robot: RobotConfig) -> None:

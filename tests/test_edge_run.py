@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from edge.recording import read_messages
+from firmware_bridge.operate import operate
 from tests.processes import (
     GO2_SIM,
     REPOSITORY,
@@ -122,6 +123,19 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
     zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
     check_stop_latency(zero_ns - killed_ns, STOP_BOUND_NS, killed_ns, host)
     assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
+
+
+def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_an_operator_arms_it(
+    robot: Robot,
+) -> None:
+    waiting = "waiting for `edge-bridge arm`"
+    assert operate("stop", robot.socket)[0] == 0
+    with running("edge.runner", *robot.arguments(), folder=robot.folder, ready=waiting) as runner:
+        time.sleep(3.0)
+        assert robot.moves() == []
+        assert operate("arm", robot.socket)[0] == 0
+        wait_for(robot.is_moving, 30, "the robot to be told to move")
+        assert runner.stderr().count(waiting) == 1
 
 
 def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead(robot: Robot) -> None:

@@ -110,3 +110,34 @@ class TestOrder:
         order = StampOrder()
         order.accept(state(5, received_ns=0))
         assert not any(order.accept(state(5, received_ns=k * S)) for k in range(1, 10))
+
+    def test_a_stamp_from_the_future_does_not_hide_the_reports_after_it(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(500 * S, received_ns=10 * S))
+        assert not order.accept(state(900 * S, received_ns=10 * S + 10))
+        assert order.accept(state(500 * S + 20, received_ns=10 * S + 20))
+
+    def test_a_forger_that_creeps_into_the_future_is_not_followed(self) -> None:
+        """Each of its stamps is 0.4 s ahead of the one before, which alone would pass for jitter."""
+        order = StampOrder()
+        ahead_ns, hidden_ms, longest_ms, ms = 0, 0, 0, S // 1000
+        for k in range(500):
+            now_ns = k * 20 * ms
+            genuine = order.accept(state(100 * S + now_ns, received_ns=now_ns))
+            hidden_ms = 0 if genuine else hidden_ms + 20
+            longest_ms = max(longest_ms, hidden_ms)
+            ahead_ns += 400 * ms
+            order.accept(state(100 * S + now_ns + ahead_ns, received_ns=now_ns + 10 * ms))
+        assert longest_ms <= 520
+
+    def test_a_robots_clock_may_drift_and_its_reports_may_be_late(self) -> None:
+        order, ms = StampOrder(), S // 1000
+        for k in range(20_000):
+            stamp_ns = 100 * S + k * 20 * ms + k * 2000  # 100 ppm fast
+            assert order.accept(state(stamp_ns, received_ns=k * 20 * ms + (400 * ms if k % 50 < 10 else 0)))
+
+    def test_a_robot_without_a_clock_is_not_hidden_by_a_forger_with_one(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(0, received_ns=S))
+        assert not order.accept(state(10**18, received_ns=S + 1))
+        assert order.accept(state(0, received_ns=S + 2))

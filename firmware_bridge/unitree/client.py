@@ -12,6 +12,7 @@ from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.idl import SportModeState_
 from firmware_bridge.unitree.idl_low import LowState_
 from firmware_bridge.unitree.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
+from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.rpc import RpcClient, RpcError
 from firmware_bridge.unitree.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
 
@@ -47,6 +48,8 @@ class Go2Reader:
         self._battery_due_ns = 0
         self._order = StampOrder()
         self._listener: Callable[[RobotState], None] | None = None
+        self._publishers: PublisherWatch | None = None
+        self._motor_publishers = config.safety.robot_lowcmd_publishers
         self._closing = threading.Event()
         self._bus = bus or Bus(config.dds)
         self._owns_bus = bus is None
@@ -72,6 +75,11 @@ class Go2Reader:
         The robot does not say when it measured: judge the age by `received_ns`.
         """
         return self._battery
+
+    def surplus_publishers(self) -> str | None:
+        """Which topic of the robot has more publishers than it should have; None while discovery knows of none."""
+        self._publishers = self._publishers or PublisherWatch(self._bus, self._motor_publishers)
+        return self._publishers.surplus()
 
     def set_state_listener(self, listener: Callable[[RobotState], None] | None) -> None:
         """Call `listener` with every state as it arrives, in the reading thread; it must not block or raise."""

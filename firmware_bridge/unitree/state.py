@@ -23,6 +23,7 @@ MAX_CURRENT_A: Final = 200.0
 _NORM_TOLERANCE: Final = 0.05
 _NS_PER_S: Final = 1_000_000_000
 _CLOCK_RESTART_NS: Final = _NS_PER_S
+_CLOCK_DRIFT: Final = 1000  # 1 ms a second, ten times what a quartz does
 _MAX_AHEAD_NS: Final = 500_000_000  # our choice: far above the jitter of a loaded robot, too short to hide a report
 
 
@@ -102,7 +103,7 @@ def battery_state(sample: LowState_, received_ns: int) -> BatteryState | None:
 class StampOrder:
     """Lets a robot's reports through in the order in which the robot made them, each of them once.
 
-    A stamp that has run ahead of our clock since the last accepted report is from the future: it would hide every
+    A stamp that is ahead of our clock, compared with the reports so far, is from the future: it would hide every
     genuine report after it. A robot whose clock starts over is believed after one second without anything acceptable;
     one that fills in no stamp at all is believed as it comes.
     """
@@ -111,15 +112,21 @@ class StampOrder:
         self.dropped = 0
         self._stamp_ns = -1
         self._received_ns = 0
+        self._offset_ns = 0  # of the robot's clock to ours
 
     def accept(self, state: RobotState) -> bool:
         """Whether `state` is newer than every earlier one and not from the future."""
         stamp_ns, passed_ns = state.robot_stamp_ns, state.received_ns - self._received_ns
+        offset_ns = stamp_ns - state.received_ns
         restarted = passed_ns > _CLOCK_RESTART_NS and stamp_ns != self._stamp_ns
-        ahead = self._stamp_ns > 0 and stamp_ns - self._stamp_ns > passed_ns + _MAX_AHEAD_NS
+        # The offset follows as slowly as two clocks drift: a forger must not creep into the future step by step.
+        drift_ns = passed_ns // _CLOCK_DRIFT
+        ahead = self._stamp_ns >= 0 and offset_ns > self._offset_ns + drift_ns + _MAX_AHEAD_NS
         old = stamp_ns <= self._stamp_ns and not stamp_ns == self._stamp_ns == 0
         if (old or ahead) and not restarted:
             self.dropped += 1
             return False
+        followed_ns = min(max(offset_ns, self._offset_ns - drift_ns), self._offset_ns + drift_ns)
+        self._offset_ns = followed_ns if self._stamp_ns >= 0 and not restarted else offset_ns
         self._stamp_ns, self._received_ns = stamp_ns, state.received_ns
         return True

@@ -120,7 +120,7 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> Non
             rig.kill_bridge()
         rig.clear()
         if row.operator_arms:
-            rig.operator_arms()
+            rig.needs_operator = True  # of the next runner
     elif not rig.drives_on(RESUME_S):
         sample.hindered.append(f"did not drive on within {RESUME_S:g} s")
         rig.kill_runner()

@@ -41,6 +41,7 @@ class Rig:
         self.config: RobotConfig = load_robot_config(ROBOT_FILE, socket=folder / "b.sock", domain=domain)
         self.runner_starts = 0
         self.jump_m = 1.0
+        self.needs_operator = False
         self._artifacts = artifacts
         self._record = record
         self._say = say
@@ -115,6 +116,13 @@ class Rig:
                 self.start_runner()
             assert self.runner is not None
             runner = self.runner
+            if self.needs_operator:
+                self._wait(
+                    lambda runner=runner: _waits(runner) or not runner.running, MOVING_TIMEOUT_S, runner, "request"
+                )
+                if runner.running:
+                    self._operator_arms()
+                    self.needs_operator = False
             self._wait(lambda runner=runner: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
@@ -164,8 +172,8 @@ class Rig:
         self._forget(self.bridge)
         self.bridge = None
 
-    def operator_arms(self) -> None:
-        """Take an emergency stop back, as an operator does it. Raises StepError."""
+    def _operator_arms(self) -> None:
+        """Permit the waiting runner to arm, as an operator does it. Raises StepError."""
         command = [
             *COMMANDS["edge-bridge"],
             "arm",
@@ -238,6 +246,11 @@ class Rig:
             if time.monotonic_ns() > deadline_ns:
                 raise child.failure(f"no {what} within {timeout_s:g} s")
             time.sleep(_POLL_S)
+
+
+def _waits(runner: Child) -> bool:
+    """Whether a runner waits for an operator's arm."""
+    return "waiting for `edge-bridge arm`" in runner.log.read_text()
 
 
 def last_words(child: Child) -> str:

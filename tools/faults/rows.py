@@ -51,7 +51,7 @@ class Row:
     spacing_s: float = 0.0
     """Time between two injections, for faults that escalate when they come again."""
     operator_arms: bool = False
-    """Afterwards an operator has to take it back (`edge-bridge arm`) before a runner may arm."""
+    """Afterwards an operator has to permit the next runner to arm (`edge-bridge arm`)."""
     thaw: bool = False
     """Afterwards SIGCONT to the runner, which must not move the robot."""
 
@@ -120,6 +120,14 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "out-of-memory": "to the robot the same as a runner that is killed, which is injected",
         "message-flood": "to the bridge the same as old commands after SIGCONT, which are injected",
         "message-reordered": "commands cannot change places on a local SEQPACKET socket; states are injected",
+        "latch-lost": "the robot rests already; process tests kill the bridge after a stop",
+        "state-from-future": "process test with a second participant that forges reports",
+        "lease-taken": "to the robot the same as a second commander, which is injected; process test",
+        "stop-denied": "the robot does not obey: process test of what the operator is told",
+        "second-publisher": "process test with a second robot in the same domain",
+        "motor-commands": "process test with a second participant",
+        "emergency-stop-latched": "the robot is not driven; model test and process tests",
+        "permission-expired": "the robot is not driven; process test",
         "robot-link-down": "would take the network of this machine down; test on fake writes that fail",
     }
 )
