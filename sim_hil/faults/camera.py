@@ -132,6 +132,7 @@ class FaultyVideoHub(VideoHub):
         if "camera-wrong-size" in on:
             wrong = on["camera-wrong-size"]
             picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+            assert picture is not None  # our own JPEG: it decodes
             size = (round(wrong.number("width")), round(wrong.number("height")))
             jpeg = encode_jpeg(cv2.cvtColor(cv2.resize(picture, size), cv2.COLOR_BGR2RGB).astype(np.uint8))
         if "camera-torn" in on:
