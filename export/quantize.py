@@ -96,7 +96,8 @@ def _quantise_slab(weight: Floats, block: int, width: int) -> tuple[npt.NDArray[
 
 
 def _codes(x: Floats, scale: Floats, half: int) -> Floats:
-    return np.clip(np.rint(x / scale), -half, half - 1).astype(np.float32)
+    codes: Floats = np.clip(np.rint(x / scale), -half, half - 1).astype(np.float32)
+    return codes
 
 
 def _error(x: Floats, codes: Floats, scale: Floats) -> Floats:

@@ -206,7 +206,7 @@ class Search:
 
     def bytes_of(self, graph: str, precision: Precision) -> int:
         """Bytes of the graph's linear layers in a precision."""
-        part = self._model.vision if graph == "vision_encoder" else self._model.action
+        part: nn.Module = self._model.vision if graph == "vision_encoder" else self._model.action
         if graph.split(".")[0] == "language_model":
             part = self._model.language
         return layer_bytes(part, linear_layers(self._model.config, graph), precision)
@@ -244,13 +244,15 @@ def drop_dominated(
         reason = ""
         for exact in kept:
             a, b = _time(graph, exact, measured), _time(graph, candidate, measured)
-            known = a is not None and b is not None
             smaller = sizes_bytes[candidate] < sizes_bytes[exact]
-            times = f"{b:.4g} against {a:.4g} ms" if known else "no measured time says it is faster"
-            if not smaller and not (known and b < a):
+            times = "no measured time says it is faster"
+            faster = slower = False
+            if a is not None and b is not None:
+                times, faster, slower = f"{b:.4g} against {a:.4g} ms", b < a, b > a
+            if not smaller and not faster:
                 size = f"{_mb(sizes_bytes[candidate])} against {_mb(sizes_bytes[exact])}"
                 reason = f"not smaller than the more exact {exact} ({size}) and not faster ({times})"
-            elif speed_first and known and b > a:
+            elif speed_first and slower:
                 reason = f"slower than the more exact {exact} ({times})"
         if reason:
             dropped.append(Dropped(candidate, reason))
@@ -261,8 +263,13 @@ def drop_dominated(
 
 def _time(graph: str, precision: str, measured: Sequence[MeasuredPoint]) -> float | None:
     """Best measured time in ms, of a call or of a token."""
-    points = [point for point in measured if point.graph == graph and point.precision == precision]
-    times = [p.ms if p.ms is not None else 1000 / p.tokens_per_s for p in points if p.ms or p.tokens_per_s]
+    times: list[float] = []
+    for point in measured:
+        if point.graph == graph and point.precision == precision:
+            if point.ms is not None:
+                times += [point.ms] if point.ms or point.tokens_per_s else []
+            elif point.tokens_per_s:
+                times.append(1000 / point.tokens_per_s)
     return min(times) if times else None
 
 
@@ -304,7 +311,7 @@ class _Trial:
 
     def _row(self, group: str, precision: str, raised: tuple[str, ...], reading: Reading) -> SensitivityRow:
         load = self.limits.load(reading, trained=self._trained)
-        values = {
+        values: dict[str, Any] = {
             name: value if value is None or math.isfinite(value) else None for name, value in asdict(reading).items()
         }
         return SensitivityRow(group, precision, raised, load=_short(load), **values)

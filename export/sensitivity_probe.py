@@ -157,7 +157,8 @@ class VisionProbe(Probe):
                     tokens = self._from_block(frame, len(vision.blocks) if index is None else int(index))
             visual[frame] = tokens.numpy()
         # The same picture under every age of the state, so that each delay is seen with the few frames there are.
-        plans, exact = [], []
+        plans: list[Floats] = []
+        exact: list[Floats] = []
         for i, (sample, context) in enumerate(zip(r.samples.samples, r.contexts, strict=True)):
             frame = self._scan_frames[i % len(self._scan_frames)]
             for tokens_of, into in ((visual, plans), (r.visual, exact)):
@@ -182,7 +183,8 @@ class VisionProbe(Probe):
         x = self._inputs[frame][start]
         for block in vision.blocks[start:]:
             x = block(x)
-        return vision.projector(fold_tokens(x[:, 1:], vision.config.pixel_shuffle))
+        tokens: Tensor = vision.projector(fold_tokens(x[:, 1:], vision.config.pixel_shuffle))
+        return tokens
 
 
 class LanguageProbe(Probe):
@@ -229,7 +231,7 @@ class LanguageProbe(Probe):
     def whole(self, precision: Precision) -> Reading:
         """See `Probe`."""
         language = self.reference.model.language
-        found = []
+        found: list[tuple[Tensor | None, Tensor]] = []
         for run in self._runs:
             with torch.no_grad(), self._rounded(language, precision):
                 hidden, _, kv = language.hidden_states(run["ids"], run["visual"], run["past"])
@@ -244,7 +246,7 @@ class LanguageProbe(Probe):
         if group == "lm_head":
             return self._reading([(None, run["hidden"]) for run in self._runs], precision, calls_error)
         language, start = self.reference.model.language, int(group.split(".")[1])
-        found = []
+        found: list[tuple[Tensor | None, Tensor]] = []
         # One prompt ranks the layers of a large model; what is chosen in the end is read on all of them.
         for run in self._runs[: 1 if is_large(self.reference.model.config) else None]:
             x, cos, sin, mask, *_ = run["inputs"][start]

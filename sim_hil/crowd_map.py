@@ -7,6 +7,7 @@ beside a wall or on a street costs more than one in the open; every cell knows t
 from __future__ import annotations
 
 from math import hypot, sqrt
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from sim_hil.scene import Scene, Vec2
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Cell = TypeVar("Cell", bound=np.generic)
 
 BODY_RADIUS_M = 0.22
 _REQUIRED_M = 0.30  # a person's radius and a little air
@@ -237,7 +239,7 @@ def _ground(scene: Scene, shape: tuple[int, int], origin: Vec2, resolution: floa
     return heights.ravel()
 
 
-def _pair(grid: NDArray, dx: int, dy: int) -> tuple[NDArray, NDArray]:  # type: ignore[type-arg]
+def _pair(grid: NDArray[Cell], dx: int, dy: int) -> tuple[NDArray[Cell], NDArray[Cell]]:
     """A grid cut to the cells that have a neighbour (dx, dy) further on, and those neighbours."""
     rows, columns = grid.shape
     here_rows = slice(0, rows - dy) if dy >= 0 else slice(-dy, rows)

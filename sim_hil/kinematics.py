@@ -67,7 +67,8 @@ def jacobian(leg: int, q: Vec3) -> tuple[Vec3, Vec3, Vec3]:
 def foot_velocity(leg: int, q: Vec3, dq: Vec3) -> Vec3:
     """Foot velocity relative to the base, base frame, m/s."""
     rows = jacobian(leg, q)
-    return tuple(r[0] * dq[0] + r[1] * dq[1] + r[2] * dq[2] for r in rows)  # type: ignore[return-value]
+    x, y, z = (r[0] * dq[0] + r[1] * dq[1] + r[2] * dq[2] for r in rows)
+    return x, y, z
 
 
 def joint_torque(leg: int, q: Vec3, force: Vec3) -> Vec3:

@@ -126,7 +126,10 @@ class MeshBuilder:
     ) -> None:
         """A box in a frame; its faces may show pictures: front is +x, sides are +y and -y. `bottom`: whether seen."""
         (x, y, z), (a, b, c) = centre, (extent / 2 for extent in size)
-        at = lambda i, j, k: frame.point((x + i * a, y + j * b, z + k * c))  # noqa: E731 - eight corners, one rule
+
+        def at(i: int, j: int, k: int) -> Vec3:
+            return frame.point((x + i * a, y + j * b, z + k * c))
+
         faces = [
             (front, (at(1, -1, -1), at(1, 1, -1), at(1, 1, 1), at(1, -1, 1))),
             (back, (at(-1, 1, -1), at(-1, -1, -1), at(-1, -1, 1), at(-1, 1, 1))),

@@ -24,4 +24,5 @@ class SensorNoise:
         height, width = rgb.shape[:2]
         y, x = self._rng.integers(0, (height, width))
         noise = self._noise[y : y + height, x : x + width]
-        return np.clip(rgb + noise, 0, 255).astype(np.uint8)
+        noisy: NDArray[np.uint8] = np.clip(rgb + noise, 0, 255).astype(np.uint8)
+        return noisy

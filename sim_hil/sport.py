@@ -310,7 +310,8 @@ class SportController:
         angles, speeds = measured.q_rad, measured.dq_radps
         carry: list[float] = []
         for leg, force in enumerate(push):
-            carry += _NO_FORCE if force == _NO_FORCE else joint_torque(leg, angles[3 * leg : 3 * leg + 3], force)  # type: ignore[arg-type]
+            hip, thigh, calf = angles[3 * leg : 3 * leg + 3]
+            carry += _NO_FORCE if force == _NO_FORCE else joint_torque(leg, (hip, thigh, calf), force)
         torques = []
         for target, previous, q, dq, extra, (lower, upper, limit, fading, joint) in zip(
             targets, self._targets, angles, speeds, carry, _JOINTS, strict=True

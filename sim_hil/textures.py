@@ -68,8 +68,9 @@ def grain(image: Image, seed: int, strength: float, cell: int) -> Image:
     """Soft blotches, so that a plain surface has something to hold on to for optical flow."""
     height, width = image.shape[:2]
     noise = np.random.default_rng(seed).normal(0, strength, (max(height // cell, 1), max(width // cell, 1)))
-    noise = cv2.resize(noise.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.clip(image + noise[..., None], 0, 255).astype(np.uint8)
+    smooth = cv2.resize(noise.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    grained: Image = np.clip(image + smooth[..., None], 0, 255).astype(np.uint8)
+    return grained
 
 
 def vending_front(thing: SceneObject) -> Image:

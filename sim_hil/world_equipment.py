@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sim_hil import world_prints
+from sim_hil.textures import Colour
 from sim_hil.world_kit import BLACK, CARTON, DARK, STEEL, WHITE, WOOD, Kit
 
 _RACK_BLUE = (36, 70, 140)
@@ -121,7 +122,7 @@ def _storage_rack(kit: Kit) -> None:
             tall = (0.45 + 0.35 * rng.random()) * step
             if rng.random() < 0.7:
                 tone = 0.85 + 0.25 * rng.random()
-                tint = tuple(min(int(channel * tone), 255) for channel in CARTON)
+                tint = _carton(tone)
                 middle = (low + high) / 2
                 kit.part((-0.40, 0.40), (low + 0.01 * wide, middle), (lift, lift + tall), tint, box, back=box)
                 tall *= 0.75 + 0.25 * rng.random()
@@ -151,13 +152,17 @@ def _empty_pallet(kit: Kit) -> None:
         kit.part((low, low + 0.13), (-0.5, 0.5), (0.7, 1.0), WOOD)
 
 
+def _carton(brightness: float) -> Colour:
+    red, green, blue = (min(int(channel * brightness), 255) for channel in CARTON)
+    return red, green, blue
+
+
 def _box_stack(kit: Kit) -> None:
     box = kit.picture(world_prints.carton)
     spots = (((-0.5, 0.5), (-0.5, 0.0), (0.0, 0.42)), ((-0.45, 0.5), (0.04, 0.5), (0.0, 0.36)),
              ((-0.4, 0.4), (-0.34, 0.2), (0.42, 0.76)), ((-0.3, 0.3), (-0.2, 0.12), (0.76, 1.0)))  # fmt: skip
     for index, (x, y, z) in enumerate(spots):
-        tint = tuple(int(channel * (0.9 + 0.07 * index)) for channel in CARTON)
-        kit.part(x, y, z, tint, box, box, box)  # type: ignore[arg-type]
+        kit.part(x, y, z, _carton(0.9 + 0.07 * index), box, box, box)
 
 
 def _forklift(kit: Kit) -> None:

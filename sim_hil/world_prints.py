@@ -88,10 +88,10 @@ def curtain(thing: SceneObject) -> Image:
     image = _front(thing)
     width = image.shape[1]
     folds = (np.sin(np.arange(width) / width * 2 * np.pi * 12) * 16)[None, :, None]
-    image = np.clip(image + folds, 0, 255).astype(np.uint8)
+    folded: Image = np.clip(image + folds, 0, 255).astype(np.uint8)
     for left in (0.0, 0.325, 0.655, 0.98):
-        fill(image, left, 0, left + 0.02, 1, WHITE)
-    return image
+        fill(folded, left, 0, left + 0.02, 1, WHITE)
+    return folded
 
 
 def desktop(thing: SceneObject) -> Image:

@@ -120,8 +120,8 @@ class Renderer:
         samples = self._samples if width * height <= _SAMPLED_PX else 1
         drawn = self._draw(width * samples, height * samples)
         if samples > 1:
-            drawn = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA)
-        return cv2.flip(cv2.cvtColor(drawn, cv2.COLOR_BGRA2RGB), 0)
+            drawn = np.asarray(cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        return np.asarray(cv2.flip(cv2.cvtColor(drawn, cv2.COLOR_BGRA2RGB), 0), np.uint8)
 
     def close(self) -> None:
         """Release everything; may be called twice."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pybullet
@@ -49,17 +49,17 @@ class RobotBody:
             pybullet.disconnect(self._client)
             raise
 
-    def _shape(self, entry: tuple[object, ...]) -> _Shape:
+    def _shape(self, entry: tuple[Any, ...]) -> _Shape:
         _, link, kind, size, _, offset, turn, colour = entry[:8]
-        mesh, paint = MeshBuilder(), rgb(colour[:3])  # type: ignore[index]
-        a, b, c = size  # type: ignore[misc]
+        mesh, paint = MeshBuilder(), rgb(colour[:3])
+        a, b, c = size
         if kind == pybullet.GEOM_BOX:
             mesh.box(Frame(), (0.0, 0.0, 0.0), (a, b, c), paint)
         elif kind == pybullet.GEOM_SPHERE:
             mesh.ball(Frame(), (0.0, 0.0, 0.0), (a, a, a), paint, 10)
         else:  # cylinders and capsules: length and radius
             mesh.prism(Frame(), (((0.0, 0.0, -a / 2), b, b), ((0.0, 0.0, a / 2), b, b)), paint, 14)
-        return _Shape(link, offset, turn, self._stage.add(mesh))  # type: ignore[arg-type]
+        return _Shape(link, offset, turn, self._stage.add(mesh))
 
     def pose(self, state: Array) -> None:
         """Show it as a render state says."""

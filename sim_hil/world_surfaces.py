@@ -126,7 +126,7 @@ def _asphalt() -> Image:
 
 def _asphalt_line() -> Image:
     """A dashed line down the middle of 4 m of lane."""
-    image = cv2.resize(_asphalt(), (256, 256))
+    image = np.asarray(cv2.resize(_asphalt(), (256, 256)), np.uint8)
     fill(image, 0.1, 0.47, 0.6, 0.53, (232, 232, 226))
     return image
 
@@ -153,7 +153,7 @@ def _soil() -> Image:
 
 def _zebra_crossing() -> Image:
     """Bars across the heading, which is the way that people walk."""
-    image = cv2.resize(_asphalt(), (128, 128))
+    image = np.asarray(cv2.resize(_asphalt(), (128, 128)), np.uint8)
     fill(image, 0.0, 0.0, 0.5, 1.0, (238, 238, 232))
     return image
 

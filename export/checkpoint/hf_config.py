@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.sources import read_json
@@ -20,6 +20,7 @@ from export.model.config import LanguageConfig, ModelConfigError, TicVlaConfig, 
 CONFIG = "config.json"
 PREPROCESSOR = "preprocessor_config.json"
 _NO_DEFAULT = object()
+N = TypeVar("N", int, float)
 
 Demand = tuple[str, tuple[Any, ...], Any]
 """Key, the values that this network implements, the default of an absent key."""
@@ -248,8 +249,8 @@ def _demand(where: str, prefix: str, section: Mapping[str, Any], demands: tuple[
 
 
 def _number(
-    where: str, prefix: str, section: Mapping[str, Any], key: str, kind: type, default: Any = _NO_DEFAULT
-) -> Any:
+    where: str, prefix: str, section: Mapping[str, Any], key: str, kind: type[N], default: object = _NO_DEFAULT
+) -> N:
     value = section.get(key, default)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)

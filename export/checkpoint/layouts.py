@@ -8,7 +8,7 @@ training code puts in front.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from export.model.config import TicVlaConfig
@@ -171,7 +171,7 @@ def find_layouts(names: Collection[str], ours: Collection[str], config: TicVlaCo
     """
     vlm = {name: (name,) for name in ours if name.startswith(("vision.", "language."))}
     action = {name: (name,) for name in ours if name.startswith(("action.", "value."))}
-    groups = [
+    groups: list[list[tuple[str, Mapping[str, tuple[str, ...]], tuple[str, ...]]]] = [
         [("tic-vla-edge", vlm, ()), *((x.name, x.names(config), x.ignored) for x in VLM_LAYOUTS)],
         [("tic-vla-edge action", action, ())],
     ]

@@ -55,7 +55,7 @@ class SafetensorsFile:
         tensor = torch.empty(entry.shape, dtype=FLOATS[entry.dtype])
         with self.path.open("rb") as file:
             file.seek(entry.begin)
-            count = file.readinto(memoryview(tensor.reshape(-1).view(torch.uint8).numpy()))
+            count = file.readinto(tensor.reshape(-1).view(torch.uint8).numpy().data)
         if count != entry.end - entry.begin:
             raise CheckpointError(f"{self.label}: {name} ends after {count} of {entry.end - entry.begin} bytes")
         return tensor

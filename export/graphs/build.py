@@ -8,6 +8,7 @@ from typing import Any
 
 import onnx
 from onnx import TensorProto
+from torch import nn
 
 from export.graphs.action import write_action, write_context
 from export.graphs.language import ROLES, write_language
@@ -75,7 +76,7 @@ def write_graph(
     raise ValueError(f"graph {name!r} is not known; expected one of {(*graph_names(False), *LANGUAGE_PAIR)}")
 
 
-def _weight_bytes(module: Any, precision: Precision) -> int:
+def _weight_bytes(module: nn.Module, precision: Precision) -> int:
     return sum(parameter.numel() for parameter in module.parameters()) * bits(precision.default) // 8
 
 

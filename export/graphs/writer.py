@@ -16,6 +16,7 @@ from export.precision import PRECISIONS, Precision, block_size
 from export.quantize import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
+Constant = Array | np.generic | Sequence[int] | Sequence[Sequence[int]] | int
 Ranges = Mapping[str, float]
 """Largest magnitude that calibration met at a layer's input, by layer name."""
 
@@ -120,7 +121,7 @@ class GraphWriter:
         self._names.add(name)
         return name
 
-    def constant(self, value: Array | Sequence[int] | int, stem: str = "c") -> str:
+    def constant(self, value: Constant, stem: str = "c") -> str:
         """A small constant (int64 for Python integers); equal ones are stored once."""
         array = np.asarray(value)
         if array.dtype.kind == "i" and not isinstance(value, np.ndarray):
@@ -130,7 +131,7 @@ class GraphWriter:
             self._shared[key] = self._store(array, self.unique(stem))
         return self._shared[key]
 
-    def floats(self, value: Array, stem: str = "f") -> str:
+    def floats(self, value: Array | np.generic, stem: str = "f") -> str:
         """A small constant in the graph's float type."""
         return self.constant(np.asarray(value).astype(self.float), stem)
 

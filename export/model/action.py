@@ -13,6 +13,7 @@ present goes through: cross-attention alone would denoise every step without kno
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +22,16 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from export.model.attention import CrossAttentionLayer, KeyValue, projection
 from export.model.config import TicVlaConfig
 from export.model.heads import ActionScale, Diffusion, Flow, differentiated, drawn, integrated, wrapped
+from export.model.module_list import TypedModuleList
+
+
+class TrunkLayers(Protocol):
+    """The cross-attention layers over B instants, however their keys and values are kept."""
+
+    @property
+    def batch(self) -> int: ...
+
+    def __call__(self, x: Tensor, *, among: bool = False) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -68,8 +79,8 @@ class ActionExpert(nn.Module):
         self.latency_projection = projection(4, c.hidden)
         self.metadata_position = nn.Parameter(torch.zeros(1, 2, c.hidden))
         self.queries = nn.Parameter(torch.zeros(1, c.steps, c.hidden))
-        self.key_values = nn.ModuleList(KeyValue(c.hidden, c.heads) for _ in range(c.layers))
-        self.layers = nn.ModuleList(CrossAttentionLayer(c.hidden, c.heads, c.ffn) for _ in range(c.layers))
+        self.key_values = TypedModuleList(KeyValue(c.hidden, c.heads) for _ in range(c.layers))
+        self.layers = TypedModuleList(CrossAttentionLayer(c.hidden, c.heads, c.ffn) for _ in range(c.layers))
         self.norm = nn.LayerNorm(c.hidden)
         self.head = projection(c.hidden, c.hidden)
         self.scale = None if c.head == "query" else ActionScale(c)
@@ -108,7 +119,7 @@ class ActionExpert(nn.Module):
         if interface == "values-only":
             guidance = guidance[..., self.config.kv_dim // 2 :]
         places = self.semantic_position[:, self.semantic_position.shape[1] - guidance.shape[1] :]
-        tokens = self.semantic_projection(guidance) + places
+        tokens: Tensor = self.semantic_projection(guidance) + places
         if self.training and interface != "waypoints":
             # Whole K‖V tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
             chance = drawn(torch.rand, tuple(tokens.shape[:2]), tokens.device, generator)
@@ -174,7 +185,7 @@ class ActionExpert(nn.Module):
         now = self.now_tokens(visual_tokens, state, latency, generator)
         return self.plan(self.trunk(now, context_keys, context_values, context_mask))
 
-    def plan(self, trunk: Trunk) -> Tensor:
+    def plan(self, trunk: TrunkLayers) -> Tensor:
         """The trajectory [B, steps, 3] from what the layers see; of a distribution, the point that `heads` explains."""
         if self.scale is None:
             actions = self.out(self._features(trunk))
@@ -207,7 +218,7 @@ class ActionExpert(nn.Module):
         known = mask.to(errors.dtype)[..., None]
         return (errors * known).sum() / (3 * known.sum()).clamp(min=1)
 
-    def errors(self, trunk: Trunk, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def errors(self, trunk: TrunkLayers, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """What training makes small, number by number [B, steps, 3], for driven trajectories `target` [B, steps, 3].
 
         query: smooth L1 of the integrated poses (equation 4); diffusion: squared error of the clean normalised actions
@@ -228,15 +239,17 @@ class ActionExpert(nn.Module):
         noisy, times = self.diffusion.corrupted(actions, generator)
         return (self._denoised(noisy, times, trunk).float() - actions).square()
 
-    def _features(self, trunk: Trunk) -> Tensor:
+    def _features(self, trunk: TrunkLayers) -> Tensor:
         """What each step's query found [B, steps, hidden]."""
-        return self.head(self.norm(trunk(self.queries.expand(trunk.batch, -1, -1))))
+        features: Tensor = self.head(self.norm(trunk(self.queries.expand(trunk.batch, -1, -1))))
+        return features
 
-    def _denoised(self, noisy: Tensor, times: Tensor, trunk: Trunk) -> Tensor:
+    def _denoised(self, noisy: Tensor, times: Tensor, trunk: TrunkLayers) -> Tensor:
         """Clean normalised actions [B, steps, 3] as predicted from noisy ones at levels [B]."""
         assert self.diffusion is not None
         tokens = self.diffusion.tokens(noisy, times, self.queries)
-        return self.out(self.head(self.norm(trunk(tokens, among=True))))
+        clean: Tensor = self.out(self.head(self.norm(trunk(tokens, among=True))))
+        return clean
 
 
 def _shared(tensor: Tensor, share: int) -> Tensor:

@@ -46,4 +46,5 @@ class CrossAttentionLayer(nn.Module):
         q = self.q(self.norm1(x)).reshape(n, t, self.heads, d // self.heads).transpose(1, 2)
         attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)
         x = x + self.o(attended.transpose(1, 2).reshape(n, t, d))
-        return x + self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        out: Tensor = x + self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        return out

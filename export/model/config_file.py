@@ -77,7 +77,11 @@ def with_overrides(config: TicVlaConfig, overrides: Mapping[str, str]) -> TicVla
 
 
 def _sections() -> dict[str, type]:
-    return {key: hint for key, hint in _hints(TicVlaConfig).items() if dataclasses.is_dataclass(hint)}
+    return {
+        key: hint
+        for key, hint in _hints(TicVlaConfig).items()
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint)
+    }
 
 
 def _hints(cls: type) -> dict[str, Any]:

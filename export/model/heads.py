@@ -160,11 +160,13 @@ class Diffusion(nn.Module):
 
     def time_tokens(self, times: Tensor) -> Tensor:
         """What a noise level [B] adds to every token: [B, 1, hidden]."""
-        return self.time_projection(time_embedding(times, self.config.hidden))[:, None]
+        tokens: Tensor = self.time_projection(time_embedding(times, self.config.hidden))
+        return tokens[:, None]
 
     def tokens(self, noisy: Tensor, times: Tensor, positions: Tensor) -> Tensor:
         """Noisy normalised actions [B, steps, 3] at levels [B] → tokens [B, steps, hidden]."""
-        return self.action_in(noisy) + positions + self.time_tokens(times)
+        tokens: Tensor = self.action_in(noisy) + positions + self.time_tokens(times)
+        return tokens
 
     def corrupted(self, clean: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Clean normalised actions at noise levels [B] drawn evenly: what the denoiser is trained on."""

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
 from export.model.config import LanguageConfig
+from export.model.module_list import TypedModuleList
 from export.model.vision import fold_tokens
 
 
@@ -72,6 +73,8 @@ class LanguageModel(nn.Module):
     any one frame when there are none), `past` = 2·layers tensors [1, kv_heads, P, head_dim] (k0, v0, k1, v1, …).
     """
 
+    inv_freq: Tensor
+
     def __init__(self, config: LanguageConfig, token_dim: int) -> None:
         super().__init__()
         self.config = config
@@ -81,7 +84,7 @@ class LanguageModel(nn.Module):
             self.merge: nn.Module = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.hidden))
         else:
             self.merge = nn.Identity()
-        self.layers = nn.ModuleList(DecoderLayer(config) for _ in range(config.layers))
+        self.layers = TypedModuleList(DecoderLayer(config) for _ in range(config.layers))
         self.norm = RmsNorm(config.hidden, config.rms_eps)
         self.lm_head = nn.Linear(config.hidden, config.vocab, bias=False)
         inv_freq = config.rope_theta ** (-torch.arange(0, config.head_dim, 2).float() / config.head_dim)

@@ -27,4 +27,5 @@ class ValueNetwork(nn.Module):
     def forward(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
         seen = self.convolutions(visual_tokens.transpose(1, 2))
         known = self.low_dimensional(torch.cat([state, goal], dim=-1))
-        return self.head(torch.cat([seen, known], dim=-1)).squeeze(-1)
+        values: Tensor = self.head(torch.cat([seen, known], dim=-1))
+        return values.squeeze(-1)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
 from export.model.config import VisionConfig
+from export.model.module_list import TypedModuleList
 
 
 def pixel_shuffle_v2(x: Tensor, side: int) -> Tensor:
@@ -44,14 +45,18 @@ class VisionBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         n, t, d = x.shape
-        qkv = self.qkv(self.norm1(x)).reshape(n, t, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
+        qkv: Tensor = self.qkv(self.norm1(x)).reshape(n, t, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2])
         x = x + self.ls1 * self.proj(attended.transpose(1, 2).reshape(n, t, d))
-        return x + self.ls2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        out: Tensor = x + self.ls2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        return out
 
 
 class VisionEncoder(nn.Module):
     """uint8 frame [n, H, W, 3] (RGB) → visual tokens [n, N, D]; normalisation is part of the graph."""
+
+    mean: Tensor
+    inv_std: Tensor
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -69,7 +74,7 @@ class VisionEncoder(nn.Module):
             self.embed = nn.Conv2d(3, config.hidden, config.patch_px, stride=config.patch_px)
         self.cls = nn.Parameter(torch.zeros(1, 1, config.hidden))
         self.position = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.hidden))
-        self.blocks = nn.ModuleList(VisionBlock(config) for _ in range(config.layers))
+        self.blocks = TypedModuleList(VisionBlock(config) for _ in range(config.layers))
         folded = config.hidden * config.pixel_shuffle**2
         self.projector = nn.Sequential(
             nn.LayerNorm(folded, eps=config.projector_eps),
@@ -85,4 +90,5 @@ class VisionEncoder(nn.Module):
         for block in self.blocks:
             x = block(x)
         # CLS is dropped and there is no final norm: what InternVL feeds its projector.
-        return self.projector(fold_tokens(x[:, 1:], self.config.pixel_shuffle))
+        tokens: Tensor = self.projector(fold_tokens(x[:, 1:], self.config.pixel_shuffle))
+        return tokens

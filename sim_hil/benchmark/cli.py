@@ -183,7 +183,8 @@ def _run(args: argparse.Namespace) -> int:
     if args.out is None and (args.resume or args.video != "none"):
         raise ConditionsError("--resume and --video: expected --out DIR with them")
     conditions = conditions_of(args)
-    episodes, skipped = choose(load_suite(args.suite), args.episodes), []
+    episodes = choose(load_suite(args.suite), args.episodes)
+    skipped: list[str] = []
     if conditions.clock == "realtime":
         check_realtime(conditions, jobs=args.jobs, cluster=args.cluster is not None, video=args.video)
         episodes, skipped = drivable(episodes)

@@ -237,7 +237,7 @@ def _line_and_left(route: Array) -> tuple[Array, Array]:
     return route, np.stack((-ways[:, 1] / lengths, ways[:, 0] / lengths), axis=1)
 
 
-def _stopping(value: float, rate: float, times_s: Array) -> Array:
+def _stopping(value: float, rate: float, times_s: NDArray[np.floating]) -> Array:
     """What is left at these times of a value that is brought to zero."""
     return np.asarray(np.sign(value) * np.maximum(abs(value) - rate * times_s, 0.0))
 

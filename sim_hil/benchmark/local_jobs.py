@@ -53,7 +53,7 @@ class LocalJobs:
                 continue
             del self._times_s[told.key]
             why = f"its process gave no result: {told.why or 'ended with exit code 0'}"
-            ended.append(self._said.pop(told.key, None) or Ended(told.key, why=why))
+            ended.append(self._said.pop(told.key) if told.key in self._said else Ended(told.key, why=why))
         return ended
 
     def times_s(self) -> dict[str, float]:

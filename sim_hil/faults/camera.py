@@ -165,6 +165,7 @@ class FaultyVideoHub(VideoHub):
 def _decoded(jpeg: bytes) -> NDArray[np.uint8]:
     """RGB [h, w, 3] of a JPEG of our own."""
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr is not None  # our own JPEG: it decodes
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
 

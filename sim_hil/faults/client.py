@@ -7,13 +7,17 @@ import socket
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 
 _POLL_S = 0.01
 
 
 class FaultError(RuntimeError):
     """A fault that could not be injected; one line that says which and why."""
+
+
+TIMEOUT_S: Final = 5.0
+"""For a fault to take effect."""
 
 
 class FaultClient:
@@ -42,7 +46,7 @@ class FaultClient:
         except OSError as error:
             raise FaultError(f"{fault}: nobody takes faults at {self._server.name}: {error.strerror}") from error
 
-    def effect_ns(self, fault: str, timeout_s: float = 5.0) -> int:
+    def effect_ns(self, fault: str, timeout_s: float = TIMEOUT_S) -> int:
         """When what was asked for took effect, monotonic ns; waits for it. Raises FaultError."""
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         while True:
@@ -59,7 +63,7 @@ class FaultClient:
             if answer["fault"] == fault:
                 return int(answer["effect_ns"])
 
-    def inject(self, fault: str, *, on: bool = True, timeout_s: float = 5.0, **values: float | str) -> int:
+    def inject(self, fault: str, *, on: bool = True, timeout_s: float = TIMEOUT_S, **values: float | str) -> int:
         """`ask` and `effect_ns` in one; older answers that nobody waited for are thrown away first."""
         self.answers()
         self.ask(fault, on=on, **values)

@@ -151,10 +151,9 @@ def _values(name: str, kind: FaultKind, table: dict[str, object]) -> dict[str, V
     for key, (default, (low, high)) in kind.numbers.items():
         value = table.get(key, default)
         # Compared, not converted: an integer may be longer than any float, and NaN is within no range.
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not low <= value <= high:  # type: ignore[operator]
+        if not isinstance(value, (int, float)) or isinstance(value, bool) or not low <= value <= high:
             raise FaultCommandError(f"{name}.{key}: expected {low:g} to {high:g}, found {value!r}")
-        values[key] = float(value)  # type: ignore[arg-type]
+        values[key] = float(value)
     for key, choices in kind.texts.items():
         text = table.get(key, choices[0])
         if text not in choices:

@@ -123,7 +123,7 @@ def parse_impairment(where: str, table: Mapping[str, Any]) -> Impairment:
 
 
 def _partitions(where: str, value: object) -> tuple[tuple[float, float], ...]:
-    pairs = value if isinstance(value, list) else [None]
+    pairs: list[Any] = value if isinstance(value, list) else [None]
     for pair in pairs:
         numbers = isinstance(pair, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in pair)
         if not numbers or len(pair) != 2:

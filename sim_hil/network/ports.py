@@ -83,7 +83,8 @@ class UdpEnds:
         side, data, client = packet
         with contextlib.suppress(OSError):
             if side == RIGHT:
-                self._listener.sendto(data, client)  # type: ignore[arg-type]
+                assert isinstance(client, tuple)
+                self._listener.sendto(data, client)
             else:
                 self._towards(client).send(data)
 

@@ -213,7 +213,8 @@ def _over(drive: _Drive, pose: TruePose, episode: Episode) -> bool:
 
 def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapping[str, Any]]]:
     """One row per tick and the generations, from the flight log, within the episode."""
-    log, generations = EpisodeLog(), []
+    log = EpisodeLog()
+    generations: list[Mapping[str, Any]] = []
     at = np.array([pose.t_ns for pose in poses], np.int64)
     columns = [np.array([getattr(pose, name) for pose in poses]) for name in ("x_m", "y_m", "theta_rad")]
     columns[2] = np.unwrap(columns[2])

@@ -31,7 +31,8 @@ def offsets_s(legs: Sequence[Analysis]) -> list[float]:
 
 
 def _minutes(leg: Analysis, offset_s: float, stamps_ns: Sequence[int]) -> Array:
-    return (np.array(stamps_ns, float) - leg["begin_ns"]) / 6e10 + offset_s / 60
+    minutes: Array = (np.array(stamps_ns, float) - leg["begin_ns"]) / 6e10 + offset_s / 60
+    return minutes
 
 
 def timing(legs: Sequence[Analysis]) -> bytes:

@@ -65,7 +65,7 @@ class Injector:
         self._note("fault_on", number=self._number, for_s=round(injection.for_s, 3), **about)
         if fault.process is None:
             assert self._stack.faults is not None
-            self._stack.faults.ask(fault.inject, **fault.values)
+            self._stack.faults.ask(fault.inject, on=True, **fault.values)
             return
         child = {"edge-run": self._stack.runner, "edge-bridge": self._stack.bridge}[fault.process[0]]
         if child is not None and child.running:

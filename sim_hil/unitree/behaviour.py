@@ -284,7 +284,7 @@ class Go2Behaviour:
         for leg in range(4):
             base = 3 * leg
             q = measured.q_rad[base : base + 3]
-            carry = joint_torque(leg, q, _WEIGHT)  # type: ignore[arg-type]
+            carry = joint_torque(leg, (q[0], q[1], q[2]), _WEIGHT)
             for joint in range(3):
                 i = base + joint
                 rate = (targets[i] - before[i]) / self._dt_s

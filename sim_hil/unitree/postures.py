@@ -6,6 +6,7 @@ The feet stay where they stand; the body is put elsewhere over them and the legs
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from math import cos, sin
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -74,12 +75,12 @@ def attitude(roll: float, pitch: float, yaw: float) -> Script:
 
 
 def _hello() -> Script:
-    leaning = {"pitch": -0.15, "shift_m": (-0.07, 0.05, 0.0)}
+    leaning = partial(body_over_feet, pitch=-0.15, shift_m=(-0.07, 0.05, 0.0))
     raised = (0.08, -0.02, 0.20)
     out, back = (0.10, -0.14, 0.22), (0.10, 0.06, 0.22)
-    waves = tuple((0.3, body_over_feet(**leaning, lifted={_FR: foot})) for foot in (out, back) * 3)  # type: ignore[arg-type]
-    lean = (0.6, body_over_feet(**leaning))  # type: ignore[arg-type]
-    lift = (0.5, body_over_feet(**leaning, lifted={_FR: raised}))  # type: ignore[arg-type]
+    waves = tuple((0.3, leaning(lifted={_FR: foot})) for foot in (out, back) * 3)
+    lean = (0.6, leaning())
+    lift = (0.5, leaning(lifted={_FR: raised}))
     return Script((lean, lift, *waves, lift, lean, (0.6, STANDING)), MODE_POSE)
 
 

@@ -61,7 +61,12 @@ def api_name(service: str, api_id: int) -> str:
 
 def parse_move(parameter: str) -> tuple[float, float, float] | None:
     """Velocity of a Move's parameter `{"x","y","z"}`; None unless it is three finite numbers."""
-    return parse_numbers(parameter, "x", "y", "z")  # type: ignore[return-value]
+    return _velocity(parameter, "z")
+
+
+def _velocity(parameter: str, yaw: str) -> tuple[float, float, float] | None:
+    numbers = parse_numbers(parameter, "x", "y", yaw)
+    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
 
 
 def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
@@ -91,8 +96,8 @@ class CommandLog:
             return
         if request.service == ids.OBSTACLES_AVOID_SERVICE and request.api_id == AVOID_MOVE:
             mode = (parse_table(request.parameter) or {}).get("mode", _VELOCITY_MODE)
-            velocity = parse_numbers(request.parameter, "x", "y", "yaw") if mode == _VELOCITY_MODE else None
-            self._moved(request, velocity)  # type: ignore[arg-type]
+            velocity = _velocity(request.parameter, "yaw") if mode == _VELOCITY_MODE else None
+            self._moved(request, velocity)
         elif request.service == ids.MOTION_SWITCHER_SERVICE and request.api_id == _RELEASE_MODE:
             self._at_zero = True
         elif request.service == ids.SPORT_SERVICE:

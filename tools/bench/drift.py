@@ -161,7 +161,8 @@ class _TrueDrift:
         self._true = self._true @ moved
         length = math.hypot(self._true.x_m, self._true.y_m)
         if length >= SEGMENT_M:
-            self._monitor.add(Comparison(length, *self._errors, variance_m2=0.0, variance_rad2=0.0))
+            forward_m, left_m, yaw_rad = self._errors
+            self._monitor.add(Comparison(length, forward_m, left_m, yaw_rad, variance_m2=0.0, variance_rad2=0.0))
             self.distance_m += length
             self._true, self._errors = SE2(0.0, 0.0, 0.0), [0.0, 0.0, 0.0]
 

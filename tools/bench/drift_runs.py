@@ -18,6 +18,7 @@ from edge.camera_geometry import Attitude, CameraGeometry
 from edge.geometry import SE2, wrap_angle
 from edge.visual_odometry import VisualMotion, VisualOdometry, grey_frame
 from sim_hil.camera import CAMERA_HFOV_RAD, CAMERA_PITCH_RAD, CAMERA_POSITION_M, CameraWorld
+from sim_hil.go2 import RobotTruth
 from sim_hil.scene import Scene
 from sim_hil.simulation import Simulation, SportAction
 
@@ -148,6 +149,7 @@ def _record(
         for _ in range(steps):
             simulation.step()
         truth = simulation.truth()
+        assert isinstance(truth, RobotTruth)
         time_s = truth.time_s - start_s
         pose = SE2(float(truth.position_m[0]), float(truth.position_m[1]), float(truth.rpy_rad[2]))
         if simulation.fell:

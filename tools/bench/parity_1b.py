@@ -194,7 +194,8 @@ def ours_as_graphs(work: Work) -> Arrays:
     shape = (1, c.kv_heads, len(ids) + work.new_tokens, c.head_dim)
     buffers = [np.zeros(shape, dtype=np.float32) for _ in range(2 * c.layers)]
     names = ["next_token", "logits", "last_layer_kv", *cache_names(c.layers, "present")]
-    feed, total, text = ids, 0, []
+    feed, total = ids, 0
+    text: list[int] = []
     prompt: dict[str, npt.NDArray[Any]] = {}
     while len(text) < work.new_tokens:
         total += len(feed)
@@ -228,7 +229,7 @@ def run_stage(name: str, work: Work) -> None:
         arrays = STAGES[name](work)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     wall_s = (time.monotonic_ns() - started_ns) / 1e9
-    np.savez(work.directory / f"{name}.npz", _peak_rss_bytes=peak, _wall_s=wall_s, **arrays)
+    np.savez(work.directory / f"{name}.npz", _peak_rss_bytes=peak, _wall_s=wall_s, allow_pickle=False, **arrays)
 
 
 def in_own_process(name: str, work: Work) -> dict[str, npt.NDArray[Any]]:

@@ -48,7 +48,8 @@ def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[
 
     def tick() -> np.ndarray:
         with torch.no_grad():
-            return model.action(model.vision(frame), state, latency, keys, values).numpy()
+            plan: torch.Tensor = model.action(model.vision(frame), state, latency, keys, values)
+            return plan.numpy()
 
     return tick
 

@@ -71,6 +71,11 @@ def _trained(original: Callable[..., Any]) -> Callable[..., Any]:
     return load_artifacts
 
 
+def _replace(owner: object, name: str, wrapped: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+    """Put a wrapper in the place of a function; raises AttributeError where there is none of that name."""
+    setattr(owner, name, wrapped(getattr(owner, name)))
+
+
 def _seconds(values: Mapping[str, Any], default: float) -> float:
     return float(values.get("seconds_s", default))
 
@@ -85,13 +90,13 @@ class Faults:
 
     def install(self) -> None:
         """Replace the methods, for this process only."""
-        Policy.act = self._act(Policy.act)  # type: ignore[method-assign]
-        Policy.encode = self._encode(Policy.encode)  # type: ignore[method-assign]
-        LanguageModel.run = self._language(LanguageModel.run)  # type: ignore[method-assign]
-        LanguageModel.text_of = self._text(LanguageModel.text_of)  # type: ignore[method-assign]
-        runner.load_artifacts = _trained(runner.load_artifacts)
-        PartFile.write = self._disk(PartFile.write)  # type: ignore[method-assign]
-        PartFile.sync = self._disk(PartFile.sync)  # type: ignore[method-assign]
+        _replace(Policy, "act", self._act)
+        _replace(Policy, "encode", self._encode)
+        _replace(LanguageModel, "run", self._language)
+        _replace(LanguageModel, "text_of", self._text)
+        _replace(runner, "load_artifacts", _trained)
+        _replace(PartFile, "write", self._disk)
+        _replace(PartFile, "sync", self._disk)
         time.time = self._clock(time.time)  # noqa: TID251 - the very thing that must not matter
 
     def _act(self, original: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from firmware_bridge.unitree import ids
 
@@ -37,7 +38,7 @@ class Tail:
         self._path = path
         self._offset = 0
 
-    def lines(self) -> list[dict[str, object]]:
+    def lines(self) -> list[dict[str, Any]]:
         """What has been added since the last call; nothing while there is no file."""
         try:
             with self._path.open("rb") as file:
@@ -62,7 +63,7 @@ class Hearing:
         for line in self._tail.lines():
             found = line["velocity"]
             velocity = (float(found[0]), float(found[1]), float(found[2])) if isinstance(found, list) else None
-            self._heard.append(Heard(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity))  # type: ignore[call-overload]
+            self._heard.append(Heard(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity))
         while self._heard and self._heard[-1].t_ns - self._heard[0].t_ns > KEEP_NS:
             self._heard.popleft()
 

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from firmware_bridge.config import RobotConfig, load_robot_config
@@ -26,6 +27,10 @@ _STEADY_MOVES = 10  # 0.2 s of the bridge's commands
 _STEADY_SHARE = 0.9
 _ATTEMPTS = 4
 _COMMANDER_S = 2.2
+
+
+def _has_printed(child: Child, text: str) -> bool:
+    return text in child.log.read_text()
 
 
 class Rig:
@@ -83,12 +88,12 @@ class Rig:
         self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where, *faults])
         heard = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "heard.jsonl")])
         for child, line in ((heard, "sniffer: ready"), (self.hil, READY_LINE)):
-            self._wait(lambda child=child, line=line: line in child.log.read_text(), READY_TIMEOUT_S, child, line)
+            self._wait(partial(_has_printed, child, line), READY_TIMEOUT_S, child, line)
 
     def start_bridge(self) -> None:
         """Start edge-bridge and wait for its socket."""
         self.bridge = self._children.start("edge-bridge", [*COMMANDS["edge-bridge"], *self._link()])
-        self._wait(lambda: "ready" in self.bridge.log.read_text(), 30.0, self.bridge, "ready line")
+        self._wait(partial(_has_printed, self.bridge, "ready"), 30.0, self.bridge, "ready line")
 
     def start_runner(self) -> None:
         """Start edge-run with switchable faults; it arms and drives by itself."""
@@ -117,17 +122,18 @@ class Rig:
             assert self.runner is not None
             runner = self.runner
             if self.needs_operator:
-                self._wait(
-                    lambda runner=runner: _waits(runner) or not runner.running, MOVING_TIMEOUT_S, runner, "request"
-                )
+                self._wait(partial(_asks_or_ended, runner), MOVING_TIMEOUT_S, runner, "request")
                 if runner.running:
                     self._operator_arms()
                     self.needs_operator = False
-            self._wait(lambda runner=runner: self.moving() or not runner.running, MOVING_TIMEOUT_S, runner, "motion")
+            self._wait(partial(self._moving_or_ended, runner), MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
             self._say(f"the runner ended before it was asked to: {last_words(runner)}")
         raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_words(runner)}")
+
+    def _moving_or_ended(self, runner: Child) -> bool:
+        return self.moving() or not runner.running
 
     def moving(self) -> bool:
         """Whether the newest commands are all near full speed, and fresh."""
@@ -248,9 +254,9 @@ class Rig:
             time.sleep(_POLL_S)
 
 
-def _waits(runner: Child) -> bool:
-    """Whether a runner waits for an operator's arm."""
-    return "waiting for `edge-bridge arm`" in runner.log.read_text()
+def _asks_or_ended(runner: Child) -> bool:
+    """Whether a runner waits for an operator's arm or has ended."""
+    return "waiting for `edge-bridge arm`" in runner.log.read_text() or not runner.running
 
 
 def last_words(child: Child) -> str:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from types import MappingProxyType
+from typing import Any
 
 from edge.faults import FAULTS, Action
+from sim_hil.faults.client import TIMEOUT_S
 from tools.faults.rig import Rig
 
 BRIDGE_STOP_MS = 300
@@ -141,7 +143,12 @@ _INSIDE_S = 30.0
 
 
 def _robot(name: str, fault: str, injected: str, **values: float | str) -> Row:
-    return Row(name, fault, lambda rig: rig.robot.inject(injected, **values), lambda rig: _off(rig, injected))
+    return Row(
+        name,
+        fault,
+        lambda rig: rig.robot.inject(injected, on=True, timeout_s=TIMEOUT_S, **values),
+        lambda rig: _off(rig, injected),
+    )
 
 
 def _harmless(name: str, injected: str, **values: float | str) -> Row:
@@ -159,11 +166,11 @@ def _off(rig: Rig, injected: str) -> None:
 
 
 def _inside(name: str, fault: str, injected: str, **values: float | str) -> Row:
-    return Row(name, fault, lambda rig: rig.inside.inject(injected, timeout_s=_INSIDE_S, **values), _clear)
+    return Row(name, fault, lambda rig: rig.inside.inject(injected, on=True, timeout_s=_INSIDE_S, **values), _clear)
 
 
-def _with(row: Row, **changes: object) -> Row:
-    return Row(**{**row.__dict__, **changes})  # type: ignore[arg-type]
+def _with(row: Row, **changes: Any) -> Row:
+    return replace(row, **changes)
 
 
 def _jump(rig: Rig) -> int:

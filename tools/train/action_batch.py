@@ -201,17 +201,20 @@ def _layer(
     meant = _own(weights[..., -tokens:] @ semantic[1], share)
     attended = (seen + meant).transpose(1, 2).reshape(batch, steps, heads * width)
     x = x + layer.o(attended)
-    return x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))
+    out: Tensor = x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))
+    return out
 
 
 def _shared(x: Tensor, share: int) -> Tensor:
     """[S·share, heads, steps, d] → [S, heads, share·steps, d]: frames of one state as rows of one product."""
-    return x.unflatten(0, (-1, share)).transpose(1, 2).flatten(2, 3)
+    rows: Tensor = x.unflatten(0, (-1, share))
+    return rows.transpose(1, 2).flatten(2, 3)
 
 
 def _own(x: Tensor, share: int) -> Tensor:
     """The inverse of `_shared`."""
-    return x.unflatten(2, (share, -1)).transpose(1, 2).flatten(0, 1)
+    rows: Tensor = x.unflatten(2, (share, -1))
+    return rows.transpose(1, 2).flatten(0, 1)
 
 
 def smooth_l1(planned: Tensor, batch: ActionBatch, *, beta: float, heading_weight: float) -> Tensor:

@@ -22,14 +22,14 @@ def augmented(picture: Picture, config: AugmentConfig, rng: np.random.Generator)
     amount = rng.uniform(size=3)
     seen = picture
     if chance[0] < config.blur_share:
-        seen = cv2.GaussianBlur(seen, (0, 0), 0.2 + amount[0] * config.blur_px)
+        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), 0.2 + amount[0] * config.blur_px), np.uint8)
     light = seen.astype(np.float32)
     gains = (1 + config.brightness * turned[0]) * (1 + config.colour * turned[1:4])
     middle = light.mean()
     light = (middle + (light - middle) * np.float32(1 + config.contrast * turned[4])) * gains.astype(np.float32)
     if chance[1] < config.noise_share:
         light += rng.standard_normal(light.shape, np.float32) * np.float32(amount[1] * config.noise)
-    changed = np.clip(np.rint(light), 0, 255).astype(np.uint8)
+    changed: Picture = np.clip(np.rint(light), 0, 255).astype(np.uint8)
     if chance[2] < config.jpeg_share:
         span = config.jpeg_quality_max - config.jpeg_quality_min
         changed = through_jpeg(changed, config.jpeg_quality_min + round(float(amount[2]) * span))

@@ -23,6 +23,7 @@ from sim_hil.benchmark.expert_motion import Driving
 from sim_hil.benchmark.expert_route import RoutePlanner
 from sim_hil.benchmark.observation import Odometer
 from sim_hil.benchmark.robots import footprint_m, max_step_m
+from sim_hil.benchmark.visibility import ASPECT
 from sim_hil.camera import CameraWorld
 from sim_hil.nav_grid import NavGrid
 from sim_hil.people import UPDATE_HZ, People
@@ -30,7 +31,6 @@ from tools.train.augment import encoded
 from tools.train.config_collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.detour import Course, draw_detour
 from tools.train.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
-from tools.train.encoder_ids import ASPECT
 from tools.train.encoder_poses import body_state
 from tools.train.record import Look, NothingToLearnError, Recorded
 from tools.train.scenarios import Scenario
@@ -200,7 +200,7 @@ def carried(
         tour.go_on()
         odometer.step(tour.body.pose, _STEP_S)
     count = len(ends)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "jpeg": np.concatenate(jpegs),
         "jpeg_end": np.array(ends, np.int64),
         "pose": np.array(rows["pose"]),

@@ -234,16 +234,17 @@ def deterministic(device: str) -> Iterator[None]:
     """On the CPU only what gives the same bits every time; an operation that cannot raises RuntimeError."""
     import torch
 
-    before = torch.are_deterministic_algorithms_enabled(), torch.utils.deterministic.fill_uninitialized_memory
+    deterministic: Any = torch.utils.deterministic  # torch sets its attributes up at run time
+    before = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
     if device == "cpu":
         torch.use_deterministic_algorithms(True)
         # Nobody reads what was never written; filling it only costs time.
-        torch.utils.deterministic.fill_uninitialized_memory = False
+        deterministic.fill_uninitialized_memory = False
     try:
         yield
     finally:
         torch.use_deterministic_algorithms(before[0])
-        torch.utils.deterministic.fill_uninitialized_memory = before[1]
+        deterministic.fill_uninitialized_memory = before[1]
 
 
 def _train(

@@ -69,8 +69,8 @@ def draw(title: str, series: Mapping[str, Sequence[tuple[int, float]]], path: Pa
                       marker="o" if len(values) < 30 else "", markersize=3, label=None if many else name)  # fmt: skip
             if many:
                 axis.plot(steps, smoothed(values), color=colour, linewidth=1.6, label=name)
-        values = [value for name in names for _, value in series[name]]
-        if "loss" in names[0] and min(values) > 0 and max(values) > LOG_RATIO * min(values):
+        drawn = [value for name in names for _, value in series[name]]
+        if "loss" in names[0] and min(drawn) > 0 and max(drawn) > LOG_RATIO * min(drawn):
             axis.set_yscale("log")
         axis.grid(color="#dfe4e9", linewidth=0.6)
         axis.legend(loc="best", fontsize=8, frameon=False)

@@ -132,5 +132,6 @@ def _stuck(state: NDArray[np.float32], future: Array) -> NDArray[np.bool_]:
     moves = np.append(0, np.cumsum((np.hypot(*state[:, :2].T) >= _STANDS) | (np.abs(state[:, 2]) >= _STANDS)))
     ks = np.arange(len(state))
     stood = (ks >= RATE_HZ) & (moves[ks + 1] == moves[np.maximum(ks - RATE_HZ, 0)])
-    leads = np.hypot(*future[:, _LABEL_STEPS - 1, :2].T) >= _LEADS_M
-    return stood & (leads | (np.abs(future[:, _LABEL_STEPS - 1, 2]) > TURN_RAD))
+    leads: NDArray[np.bool_] = np.hypot(*future[:, _LABEL_STEPS - 1, :2].T) >= _LEADS_M
+    stuck: NDArray[np.bool_] = stood & (leads | (np.abs(future[:, _LABEL_STEPS - 1, 2]) > TURN_RAD))
+    return stuck

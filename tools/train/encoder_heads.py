@@ -109,8 +109,8 @@ class Balance:
         there = {
             "colour": labels["colour"] != NONE,
             "facing": labels["facing"] != NONE,
-            "thing_m": labels["rank"] > BACKGROUND,
-            "open_m": labels["open_kind"] > 0,
+            "thing_m": np.greater(labels["rank"], BACKGROUND),
+            "open_m": np.greater(labels["open_kind"], 0),
         }
         return Balance(classes, {name: max(float(mask.mean()), _LEAST_SHARE) for name, mask in there.items()})
 
@@ -169,4 +169,5 @@ def _weights(counts: NDArray[np.float64]) -> NDArray[np.float32]:
     rare = np.maximum(shares, shares[shares > 0].min(initial=1.0)) ** -0.5
     for _ in range(4):  # the cap lowers the mean, which raises the rest
         rare = np.minimum(rare / (shares * rare).sum(), _MOST_WEIGHT)
-    return rare.astype(np.float32)
+    weights: NDArray[np.float32] = rare.astype(np.float32)
+    return weights

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import cos, sin, tan
 from typing import Final
 
@@ -16,7 +17,7 @@ from sim_hil.go2 import rotation_matrix
 from sim_hil.mesh import MeshBuilder, Surface, Vec2, Vec3
 from sim_hil.people import RENDER_FIELDS, Appearance
 from sim_hil.person_body import PersonBody
-from sim_hil.scene import Scene
+from sim_hil.scene import Scene, SceneObject
 from sim_hil.textures import Colour, Image
 from sim_hil.world import add_object
 from sim_hil.world_pieces import Pieces
@@ -101,7 +102,8 @@ class IdWorld:
         self._show_people(render_state, view.eye, sight)
         picture = self._renderer.picture(view.eye, view.ahead, up, self.mount.hfov_rad, px, px, ASPECT)
         levels = picture.astype(np.int32) // _STEP
-        return levels[..., 0] + (levels[..., 1] << _BITS) + (levels[..., 2] << 2 * _BITS)
+        ids: Ids = levels[..., 0] + (levels[..., 1] << _BITS) + (levels[..., 2] << 2 * _BITS)
+        return ids
 
     def close(self) -> None:
         """Release the renderer; may be called twice."""
@@ -114,9 +116,13 @@ class IdWorld:
         add_floor(pieces, scene)
         self._pen.number = CEILING
         add_ceiling(pieces, scene)
-        parts: list[Callable[[], None]] = [lambda each=each: add_terrain(pieces, each) for each in scene.terrain]
-        parts += [lambda each=each: add_wall(pieces, each) for each in scene.walls]
-        parts += [lambda each=each: add_object(pieces.at(*each.position_m[:2]), each) for each in scene.objects]
+
+        def place(thing: SceneObject) -> None:
+            add_object(pieces.at(*thing.position_m[:2]), thing)
+
+        parts: list[Callable[[], None]] = [partial(add_terrain, pieces, each) for each in scene.terrain]
+        parts += [partial(add_wall, pieces, each) for each in scene.walls]
+        parts += [partial(place, each) for each in scene.objects]
         for number, add in enumerate(parts, FIRST):
             self._pen.number = number
             add()

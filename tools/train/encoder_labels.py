@@ -154,7 +154,8 @@ class SceneLabels:
             offsets = people[who[person], :2] - view.eye[:2]
             ranges[person] = np.hypot(offsets[:, 0], offsets[:, 1]) - _PERSON_HALF_M
         ranges[flat == SKY] = FAR_M
-        return np.clip(ranges, NEAREST_M, FAR_M)
+        clipped: Array = np.clip(ranges, NEAREST_M, FAR_M)
+        return clipped
 
     def _cells(
         self, classes: NDArray[np.int64], ranks: NDArray[np.int64], colours: NDArray[np.int64],
@@ -263,7 +264,7 @@ def bearing_rad(view_half_width: float, column: float, columns: int) -> float:
     return -atan2(((column + 0.5) / columns * 2 - 1) * view_half_width, 1.0)
 
 
-def _inside(area: Area, x: Array, y: Array) -> NDArray[np.bool_]:
+def _inside(area: Area, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Whether points lie in a polygon, by the even-odd rule."""
     inside = np.zeros(np.broadcast_shapes(x.shape, y.shape), bool)
     corners = area.polygon
@@ -302,7 +303,8 @@ def _gaps(boxes: Array, eye: Array) -> Array:
     x, y = eye[0] - boxes[..., 0], eye[1] - boxes[..., 1]
     c, s = boxes[..., 3], boxes[..., 4]
     along, across = np.abs(x * c + y * s) - boxes[..., 5] / 2, np.abs(y * c - x * s) - boxes[..., 6] / 2
-    return np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
+    gaps: Array = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
+    return gaps
 
 
 def _left(enter: Array, leave: Array) -> Array:

@@ -56,8 +56,8 @@ class Poses:
 
     def draw(self, people: Array) -> Pose:
         """A pose that leaves room to everybody; `people` [n, 2 or more]: x m, y m."""
-        names, shares = zip(*SHARES, strict=True)
-        sort = str(self._rng.choice(names, p=shares))
+        shares = dict(SHARES)
+        sort = str(self._rng.choice(list(shares), p=list(shares.values())))
         for attempt in range(_MORE_TRIES):
             pose = self._drawn(sort if attempt < _TRIES else "anywhere", people)
             if self._grid.is_free(pose[0], pose[1]) and _roomy(pose, people) and self._worth_seeing(pose):

@@ -161,7 +161,8 @@ def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> N
 
 def _most_common(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     """[...]: of [N, ...] the most common number below `count` at each place."""
-    return np.stack([(values == c).sum(axis=0) for c in range(count)], axis=-1).argmax(axis=-1)
+    winners: NDArray[np.int64] = np.stack([(values == c).sum(axis=0) for c in range(count)], axis=-1).argmax(axis=-1)
+    return winners
 
 
 def _most_common_of(values: NDArray[Any], count: int) -> int:

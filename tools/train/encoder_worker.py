@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from sim_hil.benchmark.visibility import ASPECT
 from sim_hil.benchmark.worker_process import Message, worker_main
 from sim_hil.camera import CameraWorld
 from sim_hil.layouts import LayoutError
@@ -25,7 +26,7 @@ from tools.train.augment import encoded
 from tools.train.config_encoder import MOST_SCENES
 from tools.train.drive import PICTURE_PX
 from tools.train.encoder_data import WORKER, Shard, finish, path_of
-from tools.train.encoder_ids import ASPECT, IdWorld, view_of
+from tools.train.encoder_ids import IdWorld, view_of
 from tools.train.encoder_labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder_poses import Poses, body_state
 from tools.train.sites import Site

@@ -198,7 +198,7 @@ def fit(
     job.ranks.copy_parameters(pupil.module.parameters())
     training = Training(STAGE, job, config, pupil, data, held, total, _key(config, dataset, pupil, of, total))
     numbers = training.run()
-    result = {
+    result: dict[str, Any] = {
         "steps": total,
         "drives": len(dataset.train),
         "frames": sum(len(drive) for drive in drives if not drive.id.startswith(MIRROR)),
@@ -223,7 +223,9 @@ def _frames(
     """`scenes`: where walls are looked at."""
     steps, in_mirror = job.recipe.model.action.steps, isinstance(dataset, MirroredDrives)
     return [
-        DriveFrames.of(drive, steps, config.weights, scenes and scenes.along(drive, in_mirror=in_mirror))
+        DriveFrames.of(
+            drive, steps, config.weights, None if scenes is None else scenes.along(drive, in_mirror=in_mirror)
+        )
         for drive in dataset.drives(ids, pictures=False)
     ]
 

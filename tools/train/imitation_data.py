@@ -167,6 +167,7 @@ class Samples:
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
         told_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
         latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(told_s, offsets, strict=True)]
+        guidance: NDArray[np.floating]
         if self._by_waypoints:
             guidance = self._waypoints(state, offsets)
             keep = np.ones(guidance.shape[:2], bool)

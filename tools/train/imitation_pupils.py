@@ -87,7 +87,8 @@ class PointGoalPupil(Pupil):
 
     def plan(self, batch: ActionBatch) -> Tensor:
         """From picture, state and goal alone."""
-        return self._network(batch.visual_tokens, batch.state * batch.keep_state[:, None], batch.goal)
+        plans: Tensor = self._network(batch.visual_tokens, batch.state * batch.keep_state[:, None], batch.goal)
+        return plans
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
         """Equation 4 and walls."""

@@ -31,10 +31,17 @@ POOL = 32
 Halves = npt.NDArray[np.float16]
 
 
+class FrameRows(Protocol):
+    """Visual tokens by frame."""
+
+    def __getitem__(self, k: int, /) -> Halves:
+        """f16 [tokens, D] of frame k."""
+
+
 class FrameTokens(Protocol):
     """Visual tokens of recorded frames, encoded once."""
 
-    def frames(self, drive_id: str) -> Halves:
+    def frames(self, drive_id: str) -> FrameRows:
         """f16 [N, tokens, D] of all frames of a drive, mapped from a file."""
 
 
@@ -123,7 +130,7 @@ def check_places(rows: Sequence[Row], img_context_id: int) -> None:
 def embed(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor) -> Tensor:
     """[B, T, hidden]: token embeddings, with the frames' merged tokens in the places that are for them."""
     images = language.merge(fold_tokens(visual_tokens, language.config.token_merge))
-    x = language.embed(input_ids)
+    x: Tensor = language.embed(input_ids)
     is_image = input_ids == language.config.img_context_id
     return x.masked_scatter(is_image[..., None], images.reshape(-1, x.shape[-1]).to(x.dtype))
 
@@ -137,7 +144,8 @@ def angles(language: LanguageModel, positions: Tensor) -> tuple[Tensor, Tensor]:
 
 def heads_of(x: Tensor, heads: int) -> Tensor:
     """[B, T, heads·d] → [B, heads, T, d]."""
-    return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+    split: Tensor = x.unflatten(-1, (heads, -1))
+    return split.transpose(1, 2)
 
 
 def keys_values(layer: DecoderLayer, h: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
@@ -173,7 +181,8 @@ def finish_layer(
     )
     x = x + layer.o(attended.transpose(1, 2).flatten(2))
     h = normed(layer.mlp_norm, x)
-    return x + layer.down(F.silu(layer.gate(h)) * layer.up(h))
+    out: Tensor = x + layer.down(F.silu(layer.gate(h)) * layer.up(h))
+    return out
 
 
 def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query_at: Tensor | None) -> Pass:

@@ -18,7 +18,7 @@ from edge.reasoning_text import Waypoints, format_waypoints
 from tools.train.anchors import Anchor
 from tools.train.config_collect import TRACE_EVERY
 from tools.train.drive import Dataset, Drive
-from tools.train.language_batch import FrameTokens, Halves
+from tools.train.language_batch import FrameRows, FrameTokens, Halves
 
 FOLDER: Final = "tokens-mirrored"
 _SIDE: Final = re.compile(r"(?<!\ball )\b(?:left|right)\b", re.IGNORECASE)
@@ -72,12 +72,14 @@ class SecondsDataset(Dataset):
     mirrored: bool = False
 
     @staticmethod
-    def of(dataset: Dataset, *, mirrored: bool = False) -> SecondsDataset:
+    def of(  # type: ignore[override]  # makes one; the parent's picks drives
+        dataset: Dataset, *, mirrored: bool = False
+    ) -> SecondsDataset:
         """The seconds of a data set, or of its mirror image."""
         entries = tuple(replace(each, frames=-(-each.frames // TRACE_EVERY)) for each in dataset.entries)
         return SecondsDataset(dataset.folder, entries, mirrored)
 
-    def load(self, drive_id: str, *, pictures: bool = True) -> Seconds:  # type: ignore[override]
+    def load(self, drive_id: str, *, pictures: bool = True) -> Seconds:  # type: ignore[override]  # all that a token cache asks of a drive
         """One drive's. Raises DriveError."""
         return Seconds(super().load(drive_id, pictures=pictures), self.mirrored)
 
@@ -113,6 +115,6 @@ class Joined:
     tours: FrameTokens
     ids: frozenset[str]
 
-    def frames(self, drive_id: str) -> Halves:
+    def frames(self, drive_id: str) -> FrameRows:
         """As its part has them."""
         return (self.tours if drive_id in self.ids else self.others).frames(drive_id)

@@ -18,7 +18,7 @@ from tools.train.drive import Dataset, Drive
 from tools.train.drive_frames import DriveFrames
 from tools.train.imitation_data import States
 from tools.train.kv_cache import CachedState
-from tools.train.language_batch import FrameTokens, Halves
+from tools.train.language_batch import FrameRows, FrameTokens, Halves
 from tools.train.mirror import mirrored_text
 
 MIRROR: Final = "mirror-of-"
@@ -64,7 +64,7 @@ class MirroredDrives(Dataset):
     """A data set whose drives are in the mirror; ids are the same."""
 
     @staticmethod
-    def of(dataset: Dataset) -> MirroredDrives:
+    def of(dataset: Dataset) -> MirroredDrives:  # type: ignore[override]  # makes one; the parent's picks drives
         """The mirror of a data set."""
         return MirroredDrives(dataset.folder, dataset.entries)
 
@@ -82,7 +82,7 @@ def mirrored_frames(drive: DriveFrames) -> DriveFrames:
 class Seconds:
     """Tokens of whole seconds, by the number of the frame. Raises IndexError for another frame."""
 
-    def __init__(self, rows: Halves) -> None:
+    def __init__(self, rows: FrameRows) -> None:
         self._rows = rows
 
     def __getitem__(self, k: int) -> Halves:
@@ -108,7 +108,7 @@ class BothTokens:
     def __init__(self, plain: FrameTokens, mirror: MirrorTokens) -> None:
         self._plain, self._mirror = plain, mirror
 
-    def frames(self, drive_id: str) -> Halves | Seconds:
+    def frames(self, drive_id: str) -> FrameRows:
         """Indexed by frame."""
         of_mirror = drive_id.startswith(MIRROR)
         return self._mirror.frames(drive_id.removeprefix(MIRROR)) if of_mirror else self._plain.frames(drive_id)

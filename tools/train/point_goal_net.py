@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from export.model.action import projection
+from export.model.attention import projection
 from export.model.config import TicVlaConfig
 
 FORMAT: Final = "tic-vla-edge-point-goal/1"
@@ -53,7 +53,8 @@ class PointGoalNet(nn.Module):
         direction = goal / distance.clamp(min=1e-3)
         low = torch.cat([state, (distance / GOAL_SCALE_M).clamp(max=GOAL_MOST), direction], dim=-1)
         seen = self.convolutions(visual_tokens.transpose(1, 2))
-        return self.head(torch.cat([seen, self.low_dimensional(low)], dim=-1))
+        plans: Tensor = self.head(torch.cat([seen, self.low_dimensional(low)], dim=-1))
+        return plans
 
     def forward(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
         steps = self.out(self.features(visual_tokens, state, goal)).float()

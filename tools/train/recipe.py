@@ -122,7 +122,9 @@ def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recip
     kinds = {**STAGES, "dagger": DaggerConfig}
     for setting in overrides:
         _set(content, kinds, setting)
-    stages = {name: build(kind, filled(kind(), content.get(name, {})), f"[{name}]") for name, kind in kinds.items()}
+    stages: dict[str, Any] = {
+        name: build(kind, filled(kind(), content.get(name, {})), f"[{name}]") for name, kind in kinds.items()
+    }
     model = with_overrides(_model(content.get("model")), model_settings(overrides))
     name, seed = content.get("name"), content.get("seed")
     if not isinstance(name, str) or type(seed) is not int:
@@ -182,15 +184,20 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
     section, *path = key.split(".")
     if section not in kinds or not path:
         raise RecipeError(f"{where}: unknown key; {near(section, [*kinds, 'seed', 'model'])} as STAGE.field")
-    kind: Any = kinds[section]
+    kind: object = kinds[section]
     table = content.setdefault(section, {})
     if not isinstance(table, dict):
         raise RecipeError(f"[{section}]: expected a table, found {table!r}")
     for name in path[:-1]:
-        kind = field_types(kind).get(name) if dataclasses.is_dataclass(kind) else None
+        kind = _fields_of(kind).get(name)
         table[name] = dict(table.get(name, {}))
         table = table[name]
-    if not dataclasses.is_dataclass(kind) or path[-1] not in field_types(kind):
-        known = field_types(kind) if dataclasses.is_dataclass(kind) else ()
+    known = _fields_of(kind)
+    if path[-1] not in known:
         raise RecipeError(f"{where}: unknown key {path[-1]!r}; {near(path[-1], known)}")
-    table[path[-1]] = from_text(field_types(kind)[path[-1]], text, where)
+    table[path[-1]] = from_text(known[path[-1]], text, where)
+
+
+def _fields_of(kind: object) -> dict[str, Any]:
+    """Types of a dataclass's fields; none of another type."""
+    return field_types(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}

@@ -196,7 +196,7 @@ def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, firs
     whole = outcome == "reached" and count == len(frames.pose)
     future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.pupil)
     jpegs = frames.jpegs[:count]
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "jpeg": np.concatenate(jpegs),
         "jpeg_end": np.cumsum([len(jpeg) for jpeg in jpegs]).astype(np.int64),
         "pose": pose,

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from export.model.action import ActionExpert
 from export.model.network import TicVla
 from tools.train.action_tail import freeze_all_but_tail, load_tail, now_of, padded, tail, tail_parameters
 from tools.train.command_policy import CommandLimits, arc_command, entropy, log_prob, within_limits
@@ -158,7 +159,7 @@ class TailLearner(Learner):
             std = torch.exp(self.log_std.clamp(*LOG_STD_RANGE))
         return self._imitation * (((arc - wanted) / std) ** 2).sum(-1).mean()
 
-    def _arcs(self, rows: Tensor, expert: torch.nn.Module) -> Tensor:
+    def _arcs(self, rows: Tensor, expert: ActionExpert) -> Tensor:
         t = self._tensors
         now = now_of(expert, t["visual"][rows], t["state"][rows], t["latency"][rows])
         semantic, real = padded([self._semantic[number] for number in t["generation"][rows].tolist()])

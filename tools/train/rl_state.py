@@ -51,12 +51,13 @@ class State:
         self.optimiser = PpoOptimiser(learner, config.ppo)
         folder = job.run_dir.stage(STAGE)
         self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
+        numbers = asdict(config)
+        numbers.pop("jobs")
         content = {
-            "rl": asdict(config),
+            "rl": numbers,
             "seed": job.seed,
             "before": weights_sha256(learner.network),
         }
-        content["rl"].pop("jobs")
         self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
         self.iteration = 0
         self.steps = 0

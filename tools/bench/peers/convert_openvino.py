@@ -77,6 +77,8 @@ class QwenLayer(nn.Module):
 class Qwen(nn.Module):
     """The decoder as OpenVINO GenAI expects it: ids, mask, positions and beams in, logits of the last token out."""
 
+    inv_freq: Tensor
+
     def __init__(self, c: LanguageConfig) -> None:
         super().__init__()
         self.c = c

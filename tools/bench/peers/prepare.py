@@ -13,6 +13,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,10 @@ ASSETS = {
 }
 
 
+def _fill(write: Callable[..., None], workload: object, reference: Path, kind: str, folder: Path) -> None:
+    write(workload, reference, folder, kind)
+
+
 def stamp(packages: tuple[str, ...]) -> dict[str, Any]:
     """What a finished folder was made with."""
     return {"recipe": RECIPE, "versions": {name: importlib.metadata.version(name) for name in packages}}
@@ -94,9 +99,7 @@ def main(argv: list[str] | None = None) -> int:
         asset = ASSETS[name]
         sys.stderr.write(f"preparing {name}\n")
         write = getattr(importlib.import_module(asset.module), asset.function)
-        make(
-            root / name, stamp(asset.packages), lambda folder, a=asset, w=write: w(workload, reference, folder, a.kind)
-        )
+        make(root / name, stamp(asset.packages), partial(_fill, write, workload, reference, asset.kind))
     return 0
 
 

@@ -24,7 +24,8 @@ def in_form(module: nn.Module, form: str) -> nn.Module:
     if form == "int8":
         from torch.ao.quantization import quantize_dynamic
 
-        return quantize_dynamic(module, {nn.Linear}, dtype=torch.qint8)
+        quantised: nn.Module = quantize_dynamic(module, {nn.Linear}, dtype=torch.qint8)
+        return quantised
     return module.to(torch.bfloat16) if form == "bf16" else module
 
 

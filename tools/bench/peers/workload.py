@@ -50,7 +50,8 @@ class Workload:
         smooth = (1 - y) * ((1 - x) * corners[0, 0] + x * corners[0, 1])
         smooth = smooth + y * ((1 - x) * corners[1, 0] + x * corners[1, 1])
         noisy = smooth + rng.normal(0, 12, (px, px, 3))
-        return np.clip(noisy, 0, 255).astype(np.uint8)[None]
+        frame: npt.NDArray[np.uint8] = np.clip(noisy, 0, 255).astype(np.uint8)
+        return frame[None]
 
     def text_ids(self, count: int) -> npt.NDArray[np.int64]:
         """`count` ids of ordinary text tokens."""
