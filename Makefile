@@ -45,7 +45,7 @@ demos: .venv/.demo-installed
 		code=$$?; case $$code in 0) passed=$$((passed + 1));; 1) ;; *) exit $$code;; esac; \
 	done; echo "make: $$passed of 10 seeds passed, 9 are asked for"; test $$passed -ge 9
 
-# Every stage of tools/train/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
+# Every stage of tools/train/config/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
 nano: .venv/.demo-installed
 	@OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 )) $(BIN)/torchrun --nproc-per-node 2 -m tools.train.cli all --preset nano --out out/nano-run --resume
 	@$(BIN)/edge-train card --out out/nano-run --ship export/weights

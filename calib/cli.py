@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import Final
 
-from edge.cli import command_line
+from edge.core.cli import command_line
 
 JOBS: Final[Mapping[str, tuple[str, str]]] = {
     "latency": ("calib.latency", "measure how long generations take beside control, for edge-bench and edge-train"),

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.latency_load import Measured, MeasureError, measure
-from edge.artifact_files import ArtifactError
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -23,15 +24,14 @@ from edge.cli import (
     write_named,
     write_result,
 )
-from edge.device import read_device
-from edge.graph import GraphError
-from edge.latency_profile import LatencyError, LatencyProfile, load_profile
-from edge.manifest import load_artifacts
-from edge.power.meter import MEASURED
-from edge.prompt import InstructionError, check_instruction
-from edge.reasoning_loop import Mode
-from edge.stats import percentiles
-from export.calibration import CalibrationError, load_calibration
+from edge.core.device import read_device
+from edge.core.stats import percentiles
+from edge.inference.graph import GraphError
+from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile
+from edge.power.meters.meter import MEASURED
+from edge.reasoning.prompt import InstructionError, check_instruction
+from edge.run.reasoning_loop import Mode
+from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20
 """Generations that a profile is made of at least: fewer say nothing of the slow ones."""

@@ -10,20 +10,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from edge.artifact_files import ArtifactError
-from edge.frame import fit_frame
-from edge.geometry import SE2
-from edge.graph import GraphError
-from edge.language import ContextOverflowError, LanguageModel
-from edge.latency_profile import times_of
-from edge.manifest import Artifacts
-from edge.policy import Policy
-from edge.reasoning_loop import Mode, ReasoningLoop
-from edge.ring import EncodedFrame, TokenRing
-from edge.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
-from edge.semantic import SemanticSlot
-from edge.warm_up import warm_up
-from export.calibration import Clip
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.inference.graph import GraphError
+from edge.inference.language import ContextOverflowError, LanguageModel
+from edge.inference.latency_profile import times_of
+from edge.inference.policy import Policy
+from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
+from edge.inference.warm_up import warm_up
+from edge.run.reasoning_loop import Mode, ReasoningLoop
+from edge.state.frame import fit_frame
+from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot
+from export.evaluation.calibration import Clip
 
 WARM: Final = 3
 """Generations that are left out: what they wait for is not known before there were some."""
@@ -117,7 +117,7 @@ def measure(
     Raises ArtifactError, InstructionError, MeasureError.
     """
     # Here: they load every robot's protocol, which no other job of `edge-calib` needs.
-    from edge.assembly import HISTORY_MARGIN_S
+    from edge.run.assembly import HISTORY_MARGIN_S
     from edge.runner import SWITCH_INTERVAL_S
 
     runtime = artifacts.runtime

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from edge.camera_geometry import Attitude, CameraGeometry
-from edge.cli import (
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -30,14 +29,15 @@ from edge.cli import (
     write_named,
     write_result,
 )
-from edge.dead_reckoning import Interval, OdometryModel, integrate, split
-from edge.drift_rate import Comparison, DriftMonitor
-from edge.geometry import SE2, interpolate, wrap_angle
-from edge.odometry_calibration import CalibrationError, OdometryCalibration
-from edge.odometry_gate import Increment, OdometryGate, OdometryInputs
-from edge.recording import RecordingError, jpeg_bytes, read_messages
-from edge.visual_odometry import VisualMotion, VisualOdometry, grey_frame
-from firmware_bridge.config import ConfigError, load_robot_config
+from edge.core.geometry import SE2, interpolate, wrap_angle
+from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from edge.odometry.calibration import CalibrationError, OdometryCalibration
+from edge.odometry.camera_geometry import Attitude, CameraGeometry
+from edge.odometry.dead_reckoning import Interval, OdometryModel, integrate, split
+from edge.odometry.drift_rate import Comparison, DriftMonitor
+from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
+from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
+from firmware_bridge.core.config import ConfigError, load_robot_config
 
 Array = npt.NDArray[np.float64]
 EPILOG = """examples:

@@ -17,9 +17,9 @@ else:
 
 from calib.power_fit import STAGES, Fit, FitError, Phase, fit_energy
 from calib.power_load import Counts, EnergyLog, Load, run_phases
-from calib.toml_text import toml_text
-from edge.artifact_files import ArtifactError, read_manifest
-from edge.cli import (
+from edge.artifacts.files import ArtifactError, read_manifest
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -29,18 +29,18 @@ from edge.cli import (
     write_named,
     write_result,
 )
-from edge.device import read_device
-from edge.graph import GraphError
-from edge.manifest import Artifacts, load_artifacts
-from edge.power.meter import MEASURED, MODELLED, MeterError, PowerMeter
-from edge.power.modelled import ModelledMeter
-from edge.power.plan import PowerModel, PowerPlan, read_power_plan
-from edge.power.select import open_meter
-from edge.power.sysfs import SYSFS
-from export.measure import measured_point
-from export.target import Target, TargetError, parse_target
-from export.target_types import Figure, Measured
-from export.typed import plain
+from edge.core.device import read_device
+from edge.core.sysfs import SYSFS
+from edge.inference.graph import GraphError
+from edge.power.governor.plan import PowerModel, PowerPlan, read_power_plan
+from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter
+from edge.power.meters.modelled import ModelledMeter
+from edge.power.meters.select import open_meter
+from export.core.typed import plain
+from export.plan.measure import measured_point
+from export.target.file import Target, TargetError, parse_target
+from export.target.sections import Figure, Measured
+from reporting.toml_text import toml_text
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")
 

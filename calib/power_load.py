@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 
 from calib.power_fit import STAGES, Phase
-from edge.geometry import SE2
-from edge.language import LanguageModel
-from edge.manifest import Artifacts
-from edge.policy import Policy
-from edge.power.meter import MeterError, PowerMeter, PowerSample
-from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
-from edge.ring import EncodedFrame
-from edge.semantic import SemanticState
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
+from edge.state.ring import EncodedFrame
+from edge.state.semantic import SemanticState
 
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 READ_S: Final = 0.05

@@ -14,11 +14,10 @@ from types import FrameType
 
 import cv2
 
-from edge import engines
-from edge.arming import RefusedError, StoppedEarlyError
-from edge.artifact_files import ArtifactError
-from edge.assembly import RunOptions
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.artifacts.trust import STATE_DIRECTORY, KeyFileError, Trust
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -29,18 +28,19 @@ from edge.cli import (
     command_line,
     write_result,
 )
-from edge.instructions import check_first_instruction
-from edge.manifest import load_artifacts
-from edge.odometry_calibration import CalibrationError
-from edge.prompt import InstructionError
-from edge.reasoning_loop import Mode
-from edge.recording import parts
-from edge.release import ReleaseDelayError, parse_release_delay
-from edge.session import RunSession
-from edge.terminal import operator_lines
-from edge.trust import STATE_DIRECTORY, KeyFileError, Trust
+from edge.core.terminal import operator_lines
+from edge.flightlog.reader import parts
+from edge.inference import engines
+from edge.inference.release import ReleaseDelayError, parse_release_delay
+from edge.odometry.calibration import CalibrationError
+from edge.reasoning.prompt import InstructionError
+from edge.run.arming import RefusedError, StoppedEarlyError
+from edge.run.assembly import RunOptions
+from edge.run.instructions import check_first_instruction
+from edge.run.reasoning_loop import Mode
+from edge.run.session import RunSession
 from firmware_bridge.client import BridgeUnavailable
-from firmware_bridge.config import ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.unitree.dds import DdsError
 
 EXAMPLES = """examples:

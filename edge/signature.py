@@ -1,4 +1,4 @@
-"""Sign artifacts: make keys, write `manifest.sig` and check it as a robot does (`edge.trust`).
+"""Sign artifacts: make keys, write `manifest.sig` and check it as a robot does (`edge.artifacts.trust`).
 
 Keys are PEM files that OpenSSL reads too. The counter belongs to the key: number the releases that a key signs in one
 row, whatever the model (a date such as 20260131 will do).
@@ -15,10 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edge.artifact_files import SIGNATURE_NAME, ArtifactError, parse_manifest, read_manifest_bytes
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED, check_result_target, command_line, write_result
-from edge.manifest import load_artifacts
-from edge.trust import (
+from edge.artifacts.files import SIGNATURE_NAME, ArtifactError, parse_manifest, read_manifest_bytes
+from edge.artifacts.manifest import load_artifacts
+from edge.artifacts.trust import (
     MAX_RELEASE,
     SCHEMA,
     KeyFileError,
@@ -30,6 +29,7 @@ from edge.trust import (
     signed_message,
     write_durably,
 )
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED, check_result_target, command_line, write_result
 
 EXAMPLES = """examples:
   python -m edge.signature keygen --key release.pem           # also writes release.pem.pub, which goes to the robots

@@ -15,8 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
-from edge.artifact_files import ArtifactError
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -26,22 +27,21 @@ from edge.cli import (
     named_file,
     write_result,
 )
-from edge.manifest import load_artifacts
-from export.artifacts import build_artifacts, check_replaceable, verify_directory
-from export.calibration import CalibrationError, load_calibration
-from export.gates import GateError
-from export.job import Asked, Job, WeightSource
+from export.core.cache import StageCache, default_cache_dir, open_cache
+from export.core.settings import model_settings, target_settings
+from export.evaluation.calibration import CalibrationError, load_calibration
+from export.evaluation.gates import GateError
 from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_for, with_overrides
 from export.model.weights import WeightsError, save_weights
-from export.pipeline import build_stages
-from export.plan import PlanError, plan
-from export.plan_table import plan_lines, plan_table
-from export.progress import Progress, peak_rss_bytes
-from export.settings import model_settings, target_settings
-from export.stages import StageCache, default_cache_dir, open_cache
-from export.target import Target, TargetError, list_targets, load_target, with_settings
-from export.verify import job_of
+from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
+from export.pipeline.build import build_stages
+from export.pipeline.job import Asked, Job, WeightSource
+from export.pipeline.verify import job_of
+from export.plan.plan import PlanError, plan
+from export.plan.table import plan_lines, plan_table
+from export.target.file import Target, TargetError, list_targets, load_target, with_settings
+from reporting.build_progress import Progress, peak_rss_bytes
 
 COMMAND = "edge-export"
 DEFAULT_TARGET, DEFAULT_MODEL = "cpu", "nano"

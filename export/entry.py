@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge.cli import EXIT_INTERRUPTED, run_with_extra
+from edge.core.cli import EXIT_INTERRUPTED, run_with_extra
 
 
 def main() -> int:

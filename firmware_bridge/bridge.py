@@ -23,17 +23,17 @@ from pathlib import Path
 from typing import Final
 
 from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
-from firmware_bridge.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
-from firmware_bridge.core import BridgeCore
+from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.core.rules import BridgeCore
+from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
 from firmware_bridge.latch_file import LatchFile, read_latch
-from firmware_bridge.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.line_log import LineLog
-from firmware_bridge.link import BridgeStatus
 from firmware_bridge.notify import Notifier
 from firmware_bridge.output_file import check_output, write_descriptor, write_output
-from firmware_bridge.step_types import Call, Inputs, Move, Outputs
-from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.unitree.late_interface import AbsentRobot, is_interface_up
+from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.robot_link import RobotLink
 
 _OPERATORS: Final = 4  # at a time

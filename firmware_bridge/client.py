@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.link import (
+from firmware_bridge.core.link import (
     MAX_DATAGRAM_BYTES,
     Arm,
     BridgeStatus,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.config import ConfigError, runtime_dir
-from firmware_bridge.link import MAX_DATAGRAM_BYTES, BridgeStatus, LinkError, Message, decode, encode
+from firmware_bridge.core.config import ConfigError, runtime_dir
+from firmware_bridge.core.link import MAX_DATAGRAM_BYTES, BridgeStatus, LinkError, Message, decode, encode
 
 _STATUS_PERIOD_NS: Final = 100_000_000
 _MAX_DATAGRAMS_A_STEP: Final = 64

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
-from firmware_bridge.config import OPERATOR_SUFFIX
-from firmware_bridge.link import BridgeStatus
+from firmware_bridge.core.config import OPERATOR_SUFFIX
+from firmware_bridge.core.link import BridgeStatus
 
 CONFIRM_S: Final = 1.0
 _STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again

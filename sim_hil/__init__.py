@@ -1,0 +1,1 @@
+"""The simulated robots behind their real protocols, the benchmark, and long runs."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from edge.manifest import Artifacts, load_artifacts
-from export.stages import StageCache, open_cache
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from export.core.cache import StageCache, open_cache
 
 # How long an example takes says nothing about it on a shared machine.
 settings.register_profile("tests", deadline=None)

@@ -10,18 +10,18 @@ from typing import Any
 import pytest
 
 from edge import runner
-from edge.cli import EXIT_CHECK_FAILED
-from edge.control_loop import ControlStatistics
-from edge.replay import Tolerance, verdict
-from edge.replay_policy import Comparison
-from edge.run_result import run_result
-from edge.stats import Samples
+from edge.core.cli import EXIT_CHECK_FAILED
+from edge.core.stats import Samples
+from edge.flightlog.replay.command import Tolerance, verdict
+from edge.flightlog.replay.policy import Comparison
+from edge.run.control_loop import ControlStatistics
+from edge.run.result import run_result
 from sim_hil.benchmark import cli as bench_cli
-from sim_hil.benchmark import validate
-from sim_hil.benchmark.bench_run import BenchRun
-from tests import synthetic_run
-from tests.processes import GO2_SIM
-from tools.bench import lockstep, people, render
+from sim_hil.benchmark.suite import validate
+from sim_hil.benchmark.workers.bench_run import BenchRun
+from tests.support.processes import GO2_SIM
+from tests.support.runner import synthetic_run
+from tools.bench.sim import lockstep, people, render
 from tools.faults.report import RowResult, result
 from tools.faults.rows import rows
 from tools.report.checks import acceptance

@@ -17,15 +17,15 @@ from pathlib import Path
 import pytest
 import tomllib
 
-import edge.cli
-import edge.doctor
+import edge.core.cli
+import edge.deploy.doctor.command
 import edge.signature
 import export.cli
 import firmware_bridge.bridge
 import sim_hil.layouts.__main__
 import tools.bench.governor
 import tools.train.cli
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
 from firmware_bridge import output_file
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +58,7 @@ COMMANDS: dict[str, tuple[Command, int]] = {
         lambda where, _: tools.train.cli.main(["all", "--preset", "tiny", "--dry-run", "--json", where]),
         EXIT_DONE,
     ),
-    "edge-doctor": (lambda where, _: edge.doctor.main(["--ticks", "0", "--json", where]), EXIT_DONE),
+    "edge-doctor": (lambda where, _: edge.deploy.doctor.command.main(["--ticks", "0", "--json", where]), EXIT_DONE),
     "signature": (keygen, EXIT_DONE),
     "layouts": (layouts, EXIT_DONE),
     "governor": (lambda where, _: tools.bench.governor.main(["--seconds", "61", "--json", where]), EXIT_DONE),
@@ -207,7 +207,7 @@ def test_a_link_to_standard_output_is_written_after_what_is_there(tmp_path: Path
     log, link = tmp_path / "log", tmp_path / "stdout"  # as /dev/stdout is: the machine's own is never put at risk
     log.write_text("before\n")
     link.symlink_to("/proc/self/fd/1")
-    code = f"from edge.cli import write_result; write_result({str(link)!r}, {{'a': 1}})"
+    code = f"from edge.core.cli import write_result; write_result({str(link)!r}, {{'a': 1}})"
     subprocess.run(["sh", "-c", f'"$0" -c "$1" {how} "$2"', sys.executable, code, str(log)], check=True, timeout=60)
     text = log.read_text()
     assert text.startswith("before") == (how == ">>")
@@ -236,7 +236,7 @@ def test_standard_output_on_a_full_disk_is_one_line_and_exit_code_1(arguments: t
 
 @AS_ROOT
 def test_a_trace_line_by_line_goes_through_a_device(tmp_path: Path) -> None:
-    with edge.cli.open_stream(node(tmp_path / "null", 3)) as stream:
+    with edge.core.cli.open_stream(node(tmp_path / "null", 3)) as stream:
         stream.write("a line\n")
     assert stat.S_ISCHR((tmp_path / "null").lstat().st_mode)
 
@@ -244,12 +244,12 @@ def test_a_trace_line_by_line_goes_through_a_device(tmp_path: Path) -> None:
 def test_a_trace_into_a_fifo_without_a_reader_does_not_wait(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     with pytest.raises(OSError, match="no process reads"):
-        edge.cli.open_stream(tmp_path / "fifo")
+        edge.core.cli.open_stream(tmp_path / "fifo")
 
 
 @AS_ROOT
 def test_a_library_writes_through_a_device_too(tmp_path: Path) -> None:
-    with edge.cli.named_file(node(tmp_path / "null", 3)) as path:
+    with edge.core.cli.named_file(node(tmp_path / "null", 3)) as path:
         path.write_bytes(b"weights")
     assert stat.S_ISCHR((tmp_path / "null").lstat().st_mode)
 
@@ -287,10 +287,10 @@ def test_no_command_writes_to_a_named_output_by_itself(path: Path) -> None:
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
 BEHIND = {  # entry modules that import the command only when its packages are installed
     "export.entry": "export.cli",
-    "sim_hil.entry": "sim_hil.hil",
+    "sim_hil.hil.entry": "sim_hil.hil.command",
     "sim_hil.benchmark.entry": "sim_hil.benchmark.cli",
     "sim_hil.soak.entry": "sim_hil.soak.cli",
-    "tools.train.entry": "tools.train.cli",
+    "tools.train.pipeline.entry": "tools.train.cli",
 }
 
 

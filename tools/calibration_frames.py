@@ -16,12 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
-from edge.geometry import SE2, wrap_angle
-from export.calibration import CLIP_S, Frame
-from sim_hil.camera import CameraWorld
-from sim_hil.scene import load_scene
-from sim_hil.simulation import Simulation, SportAction
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
+from edge.core.geometry import SE2, wrap_angle
+from export.evaluation.calibration import CLIP_S, Frame
+from sim_hil.scene.scene import load_scene
+from sim_hil.simulation.camera import CameraWorld
+from sim_hil.simulation.physics import Simulation, SportAction
 
 WIDTH, HEIGHT = 320, 180
 JPEG_QUALITY = 82

@@ -16,14 +16,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from edge.artifact_files import MANIFEST_NAME
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
+from edge.artifacts.files import MANIFEST_NAME
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
 from export.checkpoint.coverage import CheckpointError
+from export.checkpoint.shipped import shipped_weights
 from export.model.config import PRESETS
-from export.shipped import shipped_weights
+from reporting.progress_line import Progress, TraceTail
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir
-from tools.progress import Progress, TraceTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
 from tools.report.run_data import Record, ReportError

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import sys
 
-from edge.faults import FAULTS, NOT_HERE, Action, Fault
+from edge.safety.faults.table import FAULTS, NOT_HERE, Action, Fault
 
 HEAD = """# What can go wrong
 
-Made from `edge/faults.py` by `python -m tools.fault_table`; do not edit. *Row* is the row of the project's fault
+Made from `edge/safety/faults/table.py` by `python -m tools.fault_table`; do not edit.
+*Row* is the row of the project's fault
 matrix. *Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen`
 holds for pictures that are equal byte for byte. A scene that stays the same under noise, a clock or a new JPEG
 encoding is found by distance, after about 0.25 m or 12° of motion. What is done:

@@ -12,15 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
-from edge.findings import Finding
-from edge.power.battery import BatteryReading, ReadBattery
-from edge.power.governor import LEVELS as GOVERNOR_LEVELS
-from edge.power.governor import OFF, Governor, GovernorInputs, GovernorOutputs
-from edge.power.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
-from edge.power.overcurrent import OverCurrentEvents
-from edge.power.statistics import PowerStatistics
-from edge.power.thermal import ThermalReader, ThermalState
-from edge.reasoning_budget import ReasoningBudget
+from edge.power.governor.governor import LEVELS as GOVERNOR_LEVELS
+from edge.power.governor.governor import OFF, Governor, GovernorInputs, GovernorOutputs
+from edge.power.governor.statistics import PowerStatistics
+from edge.power.meters.battery import BatteryReading, ReadBattery
+from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
+from edge.power.meters.overcurrent import OverCurrentEvents
+from edge.power.meters.thermal import ThermalReader, ThermalState
+from edge.safety.faults.findings import Finding
+from edge.state.reasoning_budget import ReasoningBudget
 
 PERIOD_S: Final = 0.1
 STALE_NS: Final = 500_000_000

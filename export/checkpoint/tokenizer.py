@@ -9,8 +9,8 @@ from tokenizers import Tokenizer
 from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.sources import inside
 from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
-from export.model.tokenizer import NANO_TOKENIZER
-from export.model.tokenizer_1b import TokenizerError, build_tokenizer
+from export.model.tokenizers.internvl import TokenizerError, build_tokenizer
+from export.model.tokenizers.nano import NANO_TOKENIZER
 
 TOKENIZER = "tokenizer.json"
 MAX_TOKENIZER_BYTES = 64 << 20

@@ -1,0 +1,1 @@
+"""Writes the network's ONNX graphs node by node."""

@@ -15,7 +15,7 @@ from export.graphs.writer import Array, GraphWriter
 from export.model.action import ActionExpert
 from export.model.attention import CrossAttentionLayer, KeyValue
 from export.model.config import TicVlaConfig
-from export.precision import Precision
+from export.quantize.precision import Precision
 
 TOKENS = "T"
 

@@ -16,7 +16,7 @@ from export.graphs.vision import write_vision
 from export.graphs.writer import Ranges
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
-from export.precision import Precision, bits
+from export.quantize.precision import Precision, bits
 
 FORMS = ("fused", "plain")
 """`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""

@@ -17,7 +17,7 @@ from torch import nn
 from export.graphs.vision import array, fold_tokens, layer_norm
 from export.graphs.writer import Array, GraphWriter, most_exact
 from export.model.language import DecoderLayer, LanguageModel
-from export.precision import Precision
+from export.quantize.precision import Precision
 
 
 @dataclass(frozen=True)

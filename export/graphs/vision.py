@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from export.graphs.writer import Array, GraphWriter, Ranges
 from export.model.vision import VisionBlock, VisionEncoder
-from export.precision import Precision
+from export.quantize.precision import Precision
 
 
 def array(tensor: Tensor) -> Array:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from export.precision import PRECISIONS, Precision, block_size
-from export.quantize import quantise_blocks, quantise_channels
+from export.quantize.precision import PRECISIONS, Precision, block_size
+from export.quantize.weights import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
 Constant = Array | np.generic | Sequence[int] | Sequence[Sequence[int]] | int

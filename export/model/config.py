@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.reasoning_text import WAYPOINT_TIMES_S
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
 
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""

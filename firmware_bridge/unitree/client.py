@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from firmware_bridge.config import RobotConfig
+from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.unitree.dds import Bus, take_each
-from firmware_bridge.unitree.idl import SportModeState_
-from firmware_bridge.unitree.idl_low import LowState_
-from firmware_bridge.unitree.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
+from firmware_bridge.unitree.messages.idl import SportModeState_
+from firmware_bridge.unitree.messages.idl_low import LowState_
+from firmware_bridge.unitree.messages.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
+from firmware_bridge.unitree.messages.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
 from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.rpc import RpcClient, RpcError
-from firmware_bridge.unitree.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
 
 __all__ = ["BatteryState", "CameraError", "Go2Reader", "RobotState", "robot_state"]
 

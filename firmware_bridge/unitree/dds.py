@@ -15,7 +15,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from firmware_bridge.config import DdsConfig
+from firmware_bridge.core.config import DdsConfig
 
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
 DECODE_ERRORS: Final = (struct.error, ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from firmware_bridge.unitree.ids import REMOTE_KEYS
+from firmware_bridge.unitree.messages.ids import REMOTE_KEYS
 
 TOGETHER_NS: Final = 500_000_000
 """Keys pressed within this time of each other count as one combination: nobody presses two keys in one 20 ms sample,

@@ -11,9 +11,9 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from firmware_bridge.unitree import idl
 from firmware_bridge.unitree.dds import DDS_ERRORS, MAX_SAMPLE_BYTES, Bus, take_each
-from firmware_bridge.unitree.ids import request_topic, response_topic
+from firmware_bridge.unitree.messages import idl
+from firmware_bridge.unitree.messages.ids import request_topic, response_topic
 
 MAX_DATA_CHARS: Final = 64 * 1024
 MAX_BINARY_BYTES: Final = 8 * 1024 * 1024  # a 720p JPEG is about 0.15 MB

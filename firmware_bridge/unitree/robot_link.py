@@ -8,16 +8,16 @@ from typing import Any, Final
 
 from cyclonedds.sub import DataReader
 
-from firmware_bridge.config import RobotConfig
-from firmware_bridge.step_types import Call, Move, Report
-from firmware_bridge.unitree import ids
+from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.core.step_types import Call, Move, Report
 from firmware_bridge.unitree.dds import Bus, take_each
-from firmware_bridge.unitree.idl import Request_, SportModeState_, WirelessController_
-from firmware_bridge.unitree.idl_low import LowState_
+from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.messages.idl import Request_, SportModeState_, WirelessController_
+from firmware_bridge.unitree.messages.idl_low import LowState_
+from firmware_bridge.unitree.messages.state import RobotState, StampOrder, battery_state, robot_state, within
 from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.remote import StopKeys
 from firmware_bridge.unitree.requests import Requester, move_parameter
-from firmware_bridge.unitree.state import RobotState, StampOrder, battery_state, robot_state, within
 
 _MAX_UNANSWERED: Final = 32
 _MAX_VERSION_CHARS: Final = 40

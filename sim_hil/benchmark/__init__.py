@@ -1,1 +1,1 @@
-"""The DynaNav benchmark: episodes as data, how they are run, and what is measured."""
+"""The DynaNav benchmark: `edge-bench` and its parts."""

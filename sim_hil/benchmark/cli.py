@@ -14,8 +14,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from edge.artifact_files import ArtifactError
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -25,10 +25,8 @@ from edge.cli import (
     command_line,
     write_result,
 )
-from firmware_bridge.config import ConfigError
-from sim_hil.benchmark.bench_run import BenchRun, bench_result, choose
-from sim_hil.benchmark.cluster import ClusterError, ClusterJobs
-from sim_hil.benchmark.conditions import (
+from firmware_bridge.core.config import ConfigError
+from sim_hil.benchmark.conditions.conditions import (
     BASELINES,
     CLOCKS,
     DEFAULT_LATENCY_S,
@@ -39,18 +37,20 @@ from sim_hil.benchmark.conditions import (
     ConditionsError,
     PolicySpec,
 )
-from sim_hil.benchmark.episode import SuiteError, load_suite, suite_names
-from sim_hil.benchmark.external_protocol import Address, ExternalError
-from sim_hil.benchmark.jobs import Backend, RefusedRunError
-from sim_hil.benchmark.latency import LatencyError, LatencyProfile, parse_latency
-from sim_hil.benchmark.local_jobs import LocalJobs
-from sim_hil.benchmark.progress import BenchProgress
-from sim_hil.benchmark.report import write_report
-from sim_hil.benchmark.rewording import reworded
-from sim_hil.benchmark.store import ResultStore, StoreError
-from sim_hil.benchmark.task import VIDEO_CHOICES
-from sim_hil.realtime.episode import check_realtime, drivable
-from sim_hil.scene import SceneError
+from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
+from sim_hil.benchmark.conditions.rewording import reworded
+from sim_hil.benchmark.policies.external_protocol import Address, ExternalError
+from sim_hil.benchmark.results.report import write_report
+from sim_hil.benchmark.results.store import ResultStore, StoreError
+from sim_hil.benchmark.suite.episode import SuiteError, load_suite, suite_names
+from sim_hil.benchmark.workers.bench_run import BenchRun, bench_result, choose
+from sim_hil.benchmark.workers.cluster import ClusterError, ClusterJobs
+from sim_hil.benchmark.workers.jobs import Backend, RefusedRunError
+from sim_hil.benchmark.workers.local_jobs import LocalJobs
+from sim_hil.benchmark.workers.progress import BenchProgress
+from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
+from sim_hil.benchmark.workers.task import VIDEO_CHOICES
+from sim_hil.scene.scene import SceneError
 
 EXAMPLES = """examples:
   edge-bench --suite dynanav --policy expert --jobs 2 --out out/expert
@@ -133,11 +133,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Command line; see EXAMPLES for the exit codes."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if argv and argv[0] in ("compare", "report"):
-        from sim_hil.benchmark import compare
+        from sim_hil.benchmark.results import compare
 
         return compare.main(argv)
     if argv and argv[0] == "validate":
-        from sim_hil.benchmark import validate
+        from sim_hil.benchmark.suite import validate
 
         return int(validate.main(argv[1:]))
     args = parser().parse_args(argv)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edge.cli import run_with_extra
+from edge.core.cli import run_with_extra
 
 
 def main() -> int:

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE
-from sim_hil.benchmark.external_protocol import (
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
+from sim_hil.benchmark.policies.external_protocol import (
     PROTOCOL,
     VERSION,
     Address,

@@ -13,7 +13,7 @@ from sim_hil.layouts.office import office
 from sim_hil.layouts.plan import LayoutError
 from sim_hil.layouts.sidewalk import sidewalk
 from sim_hil.layouts.warehouse import warehouse
-from sim_hil.scene import Scene, SceneError
+from sim_hil.scene.scene import Scene, SceneError
 
 __all__ = ["BENCHMARK_SEEDS", "KINDS", "LayoutError", "generate", "is_reserved", "problems"]
 

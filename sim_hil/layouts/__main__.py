@@ -6,12 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from edge.cli import check_result_target, command_line, write_named, write_result
+from edge.core.cli import check_result_target, command_line, write_named, write_result
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
-from sim_hil.scene import Scene
-from sim_hil.scene_map import draw_map
-from sim_hil.scene_write import scene_to_toml
-from sim_hil.textures import png_bytes
+from sim_hil.scene.map import draw_map
+from sim_hil.scene.scene import Scene
+from sim_hil.scene.writer import scene_to_toml
+from sim_hil.world.drawing.textures import png_bytes
 
 _EXAMPLES = f"""examples:
   python -m sim_hil.layouts hospital --seed 4711 --out hospital_4711.toml --map hospital_4711.png

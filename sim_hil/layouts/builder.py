@@ -9,18 +9,7 @@ from math import atan2, cos, degrees, hypot, pi, radians, sin
 import numpy as np
 
 from sim_hil.layouts.plan import WALL_THICKNESS_M, Border, LayoutError, Rect, Vec2, shared_border, wall_lines
-from sim_hil.scene import (
-    KINDS,
-    SKY,
-    Area,
-    Floor,
-    Place,
-    Scene,
-    SceneObject,
-    Terrain,
-    Vec3,
-    Wall,
-)
+from sim_hil.scene.scene import KINDS, SKY, Area, Floor, Place, Scene, SceneObject, Terrain, Vec3, Wall
 
 # Colours that have a name: what an instruction calls red must be red.
 COLOURS: dict[str, Vec3] = {

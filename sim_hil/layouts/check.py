@@ -7,8 +7,8 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.nav_grid import NavGrid
-from sim_hil.scene import Box, Scene
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Box, Scene
 
 ROBOT_RADIUS_M = 0.4
 PERSON_RADIUS_M = 0.25

@@ -7,7 +7,7 @@ from math import pi
 from sim_hil.layouts.builder import Builder, Room
 from sim_hil.layouts.plan import WALL_THICKNESS_M, Border, Rect
 from sim_hil.layouts.skeleton import Building
-from sim_hil.scene import KINDS, SceneObject
+from sim_hil.scene.scene import KINDS, SceneObject
 
 _LINTEL_M = 2.15  # underside
 _SHORT = {"desk": "desk"}  # what people call it, where its kind says more

@@ -11,7 +11,7 @@ from sim_hil.layouts.builder import Builder, Room
 from sim_hil.layouts.furnish import corridor_ends, door, lights, named, outer_windows, sit_on, wide_opening
 from sim_hil.layouts.plan import LayoutError, Rect
 from sim_hil.layouts.skeleton import Bones, Building, raise_bones
-from sim_hil.scene import Scene
+from sim_hil.scene.scene import Scene
 
 _BONES = Bones(
     length_m=(38.0, 42.0),

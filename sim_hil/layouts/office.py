@@ -13,7 +13,7 @@ from sim_hil.layouts.builder import Builder, Room
 from sim_hil.layouts.furnish import corridor_ends, door, lights, lintel, named, outer_windows, sit_on, wide_opening
 from sim_hil.layouts.plan import LayoutError, Rect, shared_border
 from sim_hil.layouts.skeleton import Bones, Building, raise_bones
-from sim_hil.scene import Scene
+from sim_hil.scene.scene import Scene
 
 _BONES = Bones(
     length_m=(33.0, 37.0),

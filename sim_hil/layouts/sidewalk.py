@@ -13,7 +13,7 @@ from sim_hil.layouts.builder import Builder, Room
 from sim_hil.layouts.furnish import named, sit_on
 from sim_hil.layouts.plan import LayoutError, Rect
 from sim_hil.layouts.square import park, plaza
-from sim_hil.scene import Floor, Scene, SceneObject, Terrain
+from sim_hil.scene.scene import Floor, Scene, SceneObject, Terrain
 
 _SHOPS = ("BAKERY", "CAFE", "BOOKS", "FLOWERS", "PIZZA", "TOYS", "BANK", "SHOES", "MUSIC", "BIKES")
 _SHOP_COLOURS = ("red", "blue", "green", "yellow", "orange", "purple", "white", "pink")

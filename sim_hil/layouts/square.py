@@ -7,7 +7,7 @@ from math import atan2, cos, hypot, pi, radians, sin, tan
 from sim_hil.layouts.builder import Builder
 from sim_hil.layouts.furnish import named, sit_on
 from sim_hil.layouts.plan import LayoutError, Rect
-from sim_hil.scene import Terrain
+from sim_hil.scene.scene import Terrain
 
 _PARASOLS = ("red", "blue", "yellow", "green", "orange", "purple")
 _RISE_M = 0.3

@@ -12,7 +12,7 @@ import numpy as np
 from sim_hil.layouts.builder import Builder, Room
 from sim_hil.layouts.furnish import lights, named
 from sim_hil.layouts.plan import Rect
-from sim_hil.scene import Scene, Wall
+from sim_hil.scene.scene import Scene, Wall
 
 _RACK_DEPTH_M = 1.1
 _MARGIN_M = 0.1  # between the outermost racks and the walls' centre lines

@@ -15,8 +15,8 @@ from pathlib import Path
 from types import TracebackType
 
 import firmware_bridge
-from firmware_bridge.config import BRIDGE_PRIORITY
-from sim_hil.faults.client import FaultClient
+from firmware_bridge.core.config import BRIDGE_PRIORITY
+from sim_hil.protocols.fault_client import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
 ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
@@ -26,7 +26,7 @@ ARMED_LINE = "armed and driving"
 # Run as modules of this interpreter, so that any virtual environment will do, activated or not.
 COMMANDS: Mapping[str, Sequence[str]] = {
     "edge-export": (sys.executable, "-m", "export.cli"),
-    "edge-hil": (sys.executable, "-m", "sim_hil.hil"),
+    "edge-hil": (sys.executable, "-m", "sim_hil.hil.command"),
     "edge-bridge": (sys.executable, "-m", "firmware_bridge.bridge"),
     "edge-run": (sys.executable, "-m", "edge.runner"),
 }
@@ -34,7 +34,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0
 GRACE_S = 12.0
-"""The runner may take 7 s to end (edge.session.END_S)."""
+"""The runner may take 7 s to end (edge.run.session.END_S)."""
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from edge.artifact_files import ArtifactError
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -21,26 +22,25 @@ from edge.cli import (
     command_line,
     write_result,
 )
-from edge.manifest import load_artifacts
-from firmware_bridge.config import load_robot_config
-from sim_hil.hil import stop_signals
-from sim_hil.odometry_noise import LEVELS
+from firmware_bridge.core.config import load_robot_config
+from sim_hil.hil.command import stop_signals
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
-from sim_hil.scene import SceneError, load_scene
-from sim_hil.soak import budget as budgets
-from sim_hil.soak import schedule
-from sim_hil.soak.budget import PASS, UNDECIDED, BudgetLine
-from sim_hil.soak.measures import names
-from sim_hil.soak.moments import keep_moments
+from sim_hil.robots.odometry_noise import LEVELS
+from sim_hil.scene.scene import SceneError, load_scene
+from sim_hil.soak.drive import schedule
+from sim_hil.soak.drive.schedule import FaultMenu, SoakInputError
 from sim_hil.soak.report import write_report
-from sim_hil.soak.schedule import FaultMenu, SoakInputError
-from sim_hil.soak.soak_run import SoakFolder, SoakOptions, run_legs, soak_result
+from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
+from sim_hil.soak.verdict import budget as budgets
+from sim_hil.soak.verdict.budget import PASS, UNDECIDED, BudgetLine
+from sim_hil.soak.verdict.measures import names
+from sim_hil.soak.verdict.moments import keep_moments
 
 MODES: Final = ("async", "sync", "no-reasoning")
 PLAIN_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
-"""Untrained weights drive into walls. Below 0.2 m/s (edge.odometry_gate) that does not end the run for good, so that
+"""Untrained weights drive into walls. Below 0.2 m/s (edge.odometry.gate) that does not end the run for good, so that
 the runner lives long enough to show whether it grows."""
 _UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
@@ -51,7 +51,7 @@ EXAMPLES = """examples:
   edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
 
 A leg is one stack (edge-hil, edge-bridge, edge-run) in one scene; within it the runner goes on from task to task.
-The default budget and faults: sim_hil/soak/budget.toml and faults.toml; copy and change them.
+The default budget and faults: sim_hil/soak/verdict/budget.toml and faults.toml; copy and change them.
 exit codes: 0 the budget is kept, 1 it is not, a line of it is undecided or nothing could be run, 2 bad arguments or
             input, 3 refused (artifacts), 130 interrupted (the report of what there is is written)
 """

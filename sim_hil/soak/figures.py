@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from sim_hil.report_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
-from sim_hil.scene import Scene
-from sim_hil.scene_map import draw_map, draw_mark, draw_path, map_view
-from sim_hil.soak.measures import BRIDGE_PERIOD_MS, MIB
+from reporting.plot_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
+from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
+from sim_hil.scene.scene import Scene
+from sim_hil.soak.verdict.measures import BRIDGE_PERIOD_MS, MIB
 
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]

@@ -8,15 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge import page
-from edge.cli import write_whole
-from edge.stats import percentiles
-from sim_hil.report_style import delay_histogram
-from sim_hil.scene import SceneError, load_scene
+from edge.core.cli import write_whole
+from edge.core.stats import percentiles
+from reporting import page
+from reporting.plot_style import delay_histogram
+from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak import figures
-from sim_hil.soak.budget import FAIL, PASS, UNDECIDED
-from sim_hil.soak.moments import Moment, read_moments
-from sim_hil.soak.soak_run import SoakFolder
+from sim_hil.soak.run import SoakFolder
+from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED
+from sim_hil.soak.verdict.moments import Moment, read_moments
 
 REPORT: Final = "report.html"
 SHOWN_MAPS: Final = 12

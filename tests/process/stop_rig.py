@@ -15,10 +15,10 @@ from cyclonedds.domain import DomainParticipant
 
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.operate import operate
-from firmware_bridge.unitree import ids
 from firmware_bridge.unitree.dds import Bus
-from tests.fake_go2 import FakeGo2
-from tests.processes import GO2_SIM, REPOSITORY, HostStall, Running, running, wait_for
+from firmware_bridge.unitree.messages import ids
+from tests.support.processes import GO2_SIM, REPOSITORY, HostStall, Running, running, wait_for
+from tests.support.robot.fake_go2 import FakeGo2
 
 ZERO = (0.0, 0.0, 0.0)
 STANDING_UP = frozenset({ids.STAND_UP, ids.RECOVERY_STAND, ids.BALANCE_STAND})

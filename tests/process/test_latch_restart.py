@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.fake_go2 import FakeGo2
 from tests.process.stop_rig import L2, B, HostStall, Rig
-from tests.processes import Running, check_stop_latency, wait_for
+from tests.support.processes import Running, check_stop_latency, wait_for
+from tests.support.robot.fake_go2 import FakeGo2
 
 MANY = 20
 

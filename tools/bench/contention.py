@@ -26,13 +26,13 @@ from rich.console import Console
 from rich.table import Table
 
 from edge import runner
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from edge.geometry import SE2
-from edge.policy import Policy
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.geometry import SE2
+from edge.flightlog.reader import RecordingError, read_messages
+from edge.inference.policy import Policy
 from edge.power.monitor import PowerMonitor
-from edge.reasoning_budget import UNLIMITED, ReasoningBudget
-from edge.recording import RecordingError, read_messages
-from edge.semantic import SemanticState
+from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
 from tools.demo import INSTRUCTION

@@ -3,8 +3,8 @@
     python -m tools.bench.drift --walks 50 --jobs 2 --json out/bench/drift.json
 
 Every walk is the simulated Go2 under physics in the corridor with its camera; its odometry is then made to drift at the
-paper's two levels (table 14), as `sim_hil.odometry_noise` does. Compared over windows of 5 s: the robot's own motion
-offset, the estimator's, and the truth. Exit code 1 when a bound of `GATES` is not kept.
+paper's two levels (table 14), as `sim_hil.robots.odometry_noise` does. Compared over windows of 5 s: the robot's own
+motion offset, the estimator's, and the truth. Exit code 1 when a bound of `GATES` is not kept.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from edge.drift_rate import Comparison, DriftMonitor
-from edge.geometry import SE2, wrap_angle
-from edge.odometry import DriftConfig, DriftEstimator, OdometryInputs
-from sim_hil.odometry_noise import LEVELS, OdometryNoise
-from sim_hil.scene import load_scene
-from tools.bench.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.geometry import SE2, wrap_angle
+from edge.odometry.drift_rate import Comparison, DriftMonitor
+from edge.odometry.estimator import DriftConfig, DriftEstimator, OdometryInputs
+from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
+from sim_hil.scene.scene import load_scene
+from tools.bench.sim.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
 
 WINDOW_NS = 5_000_000_000
 EVERY_NS = 1_000_000_000

@@ -21,13 +21,13 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from edge.power.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
-from edge.power.plan import PowerPlan, power_plan
-from edge.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.power.governor.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
+from edge.power.governor.plan import PowerPlan, power_plan
+from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from export.model.config import PRESETS
-from export.plan import plan
-from export.target import load_target
+from export.plan.plan import plan
+from export.target.file import load_target
 
 WINDOW_S, SETTLE_S, TOLERANCE, LENGTH_S = 10.0, 30.0, 0.02, 600.0
 NOISE, LOST = 0.02, 0.01

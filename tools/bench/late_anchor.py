@@ -20,18 +20,18 @@ from typing import Any
 
 import numpy as np
 
-from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
-from edge.geometry import SE2
-from edge.language import LanguageModel
-from edge.manifest import Artifacts, load_artifacts
-from edge.policy import Policy
-from edge.reasoning_loop import ReasoningLoop
-from edge.ring import EncodedFrame, TokenRing
-from edge.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, run_as, schedule_for
-from edge.semantic import SemanticSlot
-from edge.stats import percentiles
-from export.measure import INSTRUCTION
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.geometry import SE2
+from edge.core.stats import percentiles
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, run_as, schedule_for
+from edge.run.reasoning_loop import ReasoningLoop
+from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot
+from export.plan.measure import INSTRUCTION
 
 CAMERA_LEAD = 0.5
 """Share of a period by which a frame is captured before its tick, as the runner asks for it."""

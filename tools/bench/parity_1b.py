@@ -27,16 +27,16 @@ from rich.console import Console
 from rich.table import Table
 from tokenizers import Tokenizer
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from edge.geometry import SE2
-from edge.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
-from edge.ring import EncodedFrame
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.geometry import SE2
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
+from edge.state.ring import EncodedFrame
 from export.checkpoint import load_checkpoint, tokenizer_for
 from export.graphs.build import write_graph
 from export.graphs.language import cache_names
 from export.model.config import TicVlaConfig
 from export.model.config_file import config_for
-from export.precision import Precision
+from export.quantize.precision import Precision
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
-from edge.graph import DTYPES, Array
-from edge.manifest import Artifacts, load_artifacts
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
+from edge.inference.graph import DTYPES, Array
 
 CALLS = {"vision_encoder": 5, "language_model": 10, "language_model.prefill": 5, "language_model.decode": 40}
 KERNEL = "_kernel_time"

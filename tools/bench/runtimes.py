@@ -29,9 +29,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from edge.artifact_files import ArtifactError
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
-from edge.manifest import load_artifacts
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
 from tools.bench.peers.contenders import EVERYTHING, OURS, Contender, chosen
 from tools.bench.peers.process import ROOT, MemoryWatch, Peak, Worker, WorkerError, worker_command
 from tools.bench.peers.rounds import Round, run_rounds
@@ -62,7 +62,7 @@ class Bench:
         assets = sorted({asset for c in self.contenders for asset in c.assets})
         if not assets:
             return
-        command = [str(self.args.peers_venv / "bin" / "python"), "-m", "tools.bench.peers.prepare"]
+        command = [str(self.args.peers_venv / "bin" / "python"), "-m", "tools.bench.peers.models.prepare"]
         command += ["--model", self.model, "--cache", str(self.args.cache.resolve()), *assets]
         log = self.args.out / "prepare.log"
         sys.stderr.write(f"preparing the peers' models (once; log: {log})\n")

@@ -17,7 +17,7 @@ import sys
 import time
 from pathlib import Path
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
 from tools.demo import INSTRUCTION

@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge.artifact_files import ArtifactError, read_manifest
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
-from edge.geometry import SE2
-from edge.manifest import load_artifacts
-from edge.policy import Policy
-from edge.semantic import SemanticState
+from edge.artifacts.files import ArtifactError, read_manifest
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
+from edge.core.geometry import SE2
+from edge.inference.policy import Policy
+from edge.state.semantic import SemanticState
 from export.model.config_file import config_for
 from export.model.network import build
 

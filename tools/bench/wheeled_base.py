@@ -23,9 +23,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from sim_hil.carter_odometry import WheelCalibration
-from tools.bench.wheeled_course import World, forward_mps
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from sim_hil.robots.carter.wheel_odometry import WheelCalibration
+from tools.bench.sim.wheeled_course import World, forward_mps
 
 Row = dict[str, object]
 Result = TypeVar("Result")

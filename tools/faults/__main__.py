@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from edge.cli import (
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -27,15 +27,15 @@ from edge.cli import (
     command_line,
     write_result,
 )
-from edge.recorder import space_refusal
-from sim_hil.faults.client import FaultError
+from edge.flightlog.recorder import space_refusal
+from sim_hil.protocols.fault_client import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.stack import free_domain, socket_dir
+from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, result, show
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row, rows
-from tools.host_stall import HostStall
 from tools.report.machine import machine_facts
 
 EXAMPLES = """examples:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from edge.geometry import SE2, wrap_angle
+from edge.core.geometry import SE2, wrap_angle
 
 SPEED_MPS = 0.7
 """Above half of the robot file's limit, so that a halved limit shows."""

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 from edge import runner
-from edge.geometry import SE2
-from edge.graph import GraphError
-from edge.language import LanguageModel
-from edge.log_part import PartFile
-from edge.policy import Policy
-from edge.reasoning_text import format_waypoints
+from edge.core.geometry import SE2
+from edge.flightlog.part import PartFile
+from edge.inference.graph import GraphError
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.state.reasoning_text import format_waypoints
 from tools.faults import circle
 from tools.faults.switches import Switches
 

@@ -7,10 +7,10 @@ import signal
 import time
 from dataclasses import asdict, dataclass, field
 
-from tools.faults.heard import Heard, first_lasting, longest_gap_ms, moves
+from tools.faults.host_stall import HostStall
+from tools.faults.received import Heard, first_lasting, longest_gap_ms, moves
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row
-from tools.host_stall import HostStall
 
 PHASE_S = 0.1
 """An injection falls anywhere in a tick."""

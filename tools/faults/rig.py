@@ -12,13 +12,13 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from firmware_bridge.config import RobotConfig, load_robot_config
-from sim_hil.faults.client import FaultClient, FaultError
+from firmware_bridge.core.config import RobotConfig, load_robot_config
+from sim_hil.protocols.fault_client import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError, tail
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
 from tools.demo import INSTRUCTION
 from tools.faults.circle import SPEED_MPS
-from tools.faults.heard import Hearing, Tail
+from tools.faults.received import Hearing, Tail
 
 READY_TIMEOUT_S = 90.0
 MOVING_TIMEOUT_S = 60.0

@@ -12,9 +12,9 @@ import signal
 import sys
 import time
 
-from firmware_bridge.config import DdsConfig
-from firmware_bridge.unitree import ids
+from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 
 _FIND_TIMEOUT_S = 10.0

@@ -10,8 +10,8 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
-from edge.faults import FAULTS, Action
-from sim_hil.faults.client import TIMEOUT_S
+from edge.safety.faults.table import FAULTS, Action
+from sim_hil.protocols.fault_client import TIMEOUT_S
 from tools.faults.rig import Rig
 
 BRIDGE_STOP_MS = 300

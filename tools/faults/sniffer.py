@@ -15,12 +15,12 @@ import sys
 import time
 from pathlib import Path
 
-from edge.cli import command_line, open_stream
-from firmware_bridge.config import DdsConfig
-from firmware_bridge.unitree import ids
+from edge.core.cli import command_line, open_stream
+from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus, take_each
-from firmware_bridge.unitree.idl import Request_
-from sim_hil.unitree.sport import parse_move
+from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.messages.idl import Request_
+from sim_hil.protocols.unitree.services.sport import parse_move
 
 _WAIT_NS = 50_000_000
 _DEPTH = 256

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Installs `far-unitree-sdk`, a Python binding of the robot maker's C++ SDK (unitree_sdk2 with its own Cyclone DDS 0.10.2
-# inside), into a virtual environment of its own, for tests/test_interop_far_sdk.py. Linux x86_64, Python 3.11.
+# inside), into a virtual environment of its own, for tests/process/interop/test_interop_far_sdk.py. Linux x86_64, Python 3.11.
 #
 #   tools/interop/install_far_sdk.sh DIR
-#   TIC_VLA_FAR_PYTHON=DIR/venv/bin/python pytest tests/test_interop_far_sdk.py
+#   TIC_VLA_FAR_PYTHON=DIR/venv/bin/python pytest tests/process/interop/test_interop_far_sdk.py
 #
 # The session runs in network namespaces (root): the binding speaks on DDS domain 0 only, which may be a real robot's.
 set -eu

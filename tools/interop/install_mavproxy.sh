@@ -1,9 +1,9 @@
 #!/bin/sh
 # Installs MAVProxy, a ground station on the command line (GPL; only run, never imported), into a virtual environment of
-# its own, for tests/test_mavlink_mavproxy.py.
+# its own, for tests/process/interop/test_mavlink_mavproxy.py.
 #
 #   tools/interop/install_mavproxy.sh DIR
-#   TIC_VLA_MAVPROXY=DIR/venv/bin/mavproxy.py pytest tests/test_mavlink_mavproxy.py
+#   TIC_VLA_MAVPROXY=DIR/venv/bin/mavproxy.py pytest tests/process/interop/test_mavlink_mavproxy.py
 set -eu
 
 if [ $# -ne 1 ]; then

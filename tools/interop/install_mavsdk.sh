@@ -1,9 +1,9 @@
 #!/bin/sh
 # Installs MAVSDK (its server in C++ and its Python client, unmodified) into a virtual environment of its own, for
-# tests/test_mavlink_mavsdk.py. Linux x86_64.
+# tests/process/interop/test_mavlink_mavsdk.py. Linux x86_64.
 #
 #   tools/interop/install_mavsdk.sh DIR
-#   TIC_VLA_MAVSDK_PYTHON=DIR/venv/bin/python pytest tests/test_mavlink_mavsdk.py
+#   TIC_VLA_MAVSDK_PYTHON=DIR/venv/bin/python pytest tests/process/interop/test_mavlink_mavsdk.py
 set -eu
 
 if [ $# -ne 1 ]; then

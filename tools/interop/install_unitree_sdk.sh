@@ -1,11 +1,11 @@
 #!/bin/sh
 # Installs the robot maker's own Python SDK, unmodified, into a virtual environment of its own, for
-# tests/test_interop_unitree_sdk.py. It needs Cyclone DDS 0.10.2 (the robot's version), which has no wheel: Debian
+# tests/process/interop/test_interop_unitree_sdk.py. It needs Cyclone DDS 0.10.2 (the robot's version), which has no wheel: Debian
 # bookworm packages the library, and the Python binding is built against it.
 #
 #   sudo apt-get install --no-install-recommends cyclonedds-dev cyclonedds-tools gcc python3-dev
 #   tools/interop/install_unitree_sdk.sh DIR
-#   TIC_VLA_SDK_PYTHON=DIR/venv/bin/python pytest tests/test_interop_unitree_sdk.py
+#   TIC_VLA_SDK_PYTHON=DIR/venv/bin/python pytest tests/process/interop/test_interop_unitree_sdk.py
 #
 # Keep DIR: the binding loads DIR/prefix/lib/libddsc.so at run time.
 # `unitree-sdk2py-dimos` 1.0.3 is unitreerobotics/unitree_sdk2_python as a package: core/, rpc/, go2/, idl/, comm/ and

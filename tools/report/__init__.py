@@ -1,0 +1,1 @@
+"""The demo's report: acceptance checks, figures and numbers from the files of one run."""

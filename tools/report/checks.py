@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_hil.report_style import percentile
+from reporting.plot_style import percentile
 from tools.report.run_data import FlightLog, Record, RunData, Trace
 
 DELTA_T_TOLERANCE_MS = 1.0

@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge import page
-from edge.cli import OutputError, command_line, write_result, write_whole
+from edge.core.cli import OutputError, command_line, write_result, write_whole
+from reporting import page
 from tools.report import figures
 from tools.report.checks import Check, acceptance
 from tools.report.numbers import Number, delay_at_call, headline, numbers

@@ -12,7 +12,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import StrMethodFormatter
 
-from sim_hil.report_style import (
+from reporting.plot_style import (
     COMMAND,
     INK,
     MUTED,

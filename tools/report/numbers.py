@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from sim_hil.report_style import percentile
+from reporting.plot_style import percentile
 from tools.report.checks import goal_distance_m, moved_under_command_m
 from tools.report.run_data import Record, RunData, odometry_in_world, truth_at
 

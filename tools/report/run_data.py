@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.recording import RecordingError, jpeg_bytes, read_messages
+from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 
 Record = dict[str, Any]
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-from edge.artifact_files import ArtifactError
-from edge.cli import (
+from edge.artifacts.files import ArtifactError
+from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
@@ -29,23 +29,23 @@ from edge.cli import (
     write_result,
     write_whole,
 )
-from edge.latency_profile import load_profile
-from export.progress import duration, peak_rss_bytes
-from tools.benchmark_runs import RunsError
-from tools.train import budget, chain
-from tools.train.chain import Step, is_done, may_begin, run_step, steps_of
-from tools.train.curves import draw_curves
-from tools.train.distributed import SINGLE, Ranks, leave, ranks_of_environment
-from tools.train.exported import ExportError
-from tools.train.job import StageFailedError, StageJob, StopFlag
-from tools.train.model_card import ship, write_card
-from tools.train.network_file import START, import_start
-from tools.train.optim import computes_bf16
-from tools.train.own_drives import take_drives
-from tools.train.recipe import Recipe, load_recipe, recipe_names, stage_seed
-from tools.train.run_dir import RunDir
-from tools.train.show import progress_for
-from tools.train.variants import VARIANTS
+from edge.inference.latency_profile import load_profile
+from reporting.build_progress import duration, peak_rss_bytes
+from sim_hil.benchmark.runs import RunsError
+from tools.train.config.recipe import Recipe, load_recipe, recipe_names, stage_seed
+from tools.train.config.variants import VARIANTS
+from tools.train.pipeline import budget, chain
+from tools.train.pipeline.chain import Step, is_done, may_begin, run_step, steps_of
+from tools.train.pipeline.model_card import ship, write_card
+from tools.train.run.curves import draw_curves
+from tools.train.run.distributed import SINGLE, Ranks, leave, ranks_of_environment
+from tools.train.run.exported import ExportError
+from tools.train.run.job import StageFailedError, StageJob, StopFlag
+from tools.train.run.network_file import START, import_start
+from tools.train.run.optim import computes_bf16
+from tools.train.run.own_drives import take_drives
+from tools.train.run.progress_display import progress_for
+from tools.train.run.run_dir import RunDir
 
 COMMAND: Final = "edge-train"
 COMMANDS: Final = (*chain.ALL, "all", "card")

@@ -22,7 +22,7 @@ class Contender:
     parts: tuple[str, ...]
     options: Mapping[str, str] = field(default_factory=dict)
     assets: tuple[str, ...] = ()
-    """What `tools.bench.peers.prepare` has to have made."""
+    """What `tools.bench.peers.models.prepare` has to have made."""
     memory_only: bool = False
     """Started only to see how much memory all parts take together."""
 

@@ -26,7 +26,7 @@ class WorkerError(RuntimeError):
 
 def worker_command(python: Path, stack: str) -> list[str]:
     """Command of a stack's worker under an interpreter."""
-    return [str(python), "-m", f"tools.bench.peers.{stack}_worker"]
+    return [str(python), "-m", f"tools.bench.peers.workers.{stack}_worker"]
 
 
 @dataclass

@@ -9,9 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from edge.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
-from tools.train.dataset import DatasetWriter
-from tools.train.drive import DriveError, Entry
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.drives.drive import DriveError, Entry
 from tools.train.importers import gnd, scand
 from tools.train.importers.cut import drives
 from tools.train.importers.recording import ImportedError

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.train.config_collect import RATE_HZ, TRACE_EVERY
-from tools.train.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
-from tools.train.futures import driven_future
+from tools.train.config.collect import RATE_HZ, TRACE_EVERY
+from tools.train.drives.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
+from tools.train.drives.futures import driven_future
+from tools.train.drives.windows import EPISODE_S, relative
 from tools.train.importers.recording import ImportedError, Recording, Words, read_picture
-from tools.train.windows import EPISODE_S, relative
 
 Array = NDArray[np.float64]
 

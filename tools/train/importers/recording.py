@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.jpeg import MAX_BYTES, jpeg_refusal
+from edge.core.jpeg import MAX_BYTES, jpeg_refusal
 
 TEXTS: Final = "texts.json"
 MAX_TABLE_BYTES: Final = 200_000_000

@@ -1,0 +1,1 @@
+"""Files of an artifact directory, verified before anything in them is opened."""

@@ -1,0 +1,373 @@
+"""The artifact directory's manifest: verified before anything in the directory is opened (design §5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edge.artifacts.external_data import ExternalDataError, external_data
+from edge.artifacts.files import (
+    MANIFEST_NAME,
+    SEAL,
+    SIGNATURE_NAME,
+    ArtifactError,
+    FileIdentity,
+    check_entry,
+    hash_file,
+    parse_manifest,
+    read_file,
+    read_manifest_bytes,
+)
+from edge.artifacts.provider_options import wrong_option
+from edge.artifacts.trust import Trust
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
+from firmware_bridge.core.config import BRIDGE_PRIORITY
+
+LANGUAGE_WHOLE = ("language_model",)
+LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+_POSITIVE = frozenset(
+    {
+        "image_px",
+        "frame_tokens",
+        "kv_dim",
+        "max_context",
+        "max_new_tokens",
+        "prefill_chunk_tokens",
+        "tick_period_ms",
+        "step_s",
+    }
+)
+
+_LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
+
+
+@dataclass(frozen=True)
+class TensorContract:
+    """Name, element type and shape of a graph's input or output; free axes are named."""
+
+    name: str
+    dtype: str
+    shape: tuple[int | str, ...]
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """How a graph is opened: ONNX Runtime's execution provider, its options, threads."""
+
+    provider: str
+    options: Mapping[str, str]
+    threads: int | None
+    """Intra-op threads; None leaves them to the runner."""
+    engine: bool
+    """The provider compiles an engine, which has to be built on the device before any run."""
+
+
+@dataclass(frozen=True)
+class GraphContract:
+    """What one graph file takes and gives."""
+
+    file: str
+    data_files: tuple[str, ...]
+    """Files beside it that hold its large weights."""
+    inputs: tuple[TensorContract, ...]
+    outputs: tuple[TensorContract, ...]
+    session: SessionConfig
+
+    @property
+    def caches(self) -> tuple[TensorContract, ...]:
+        """The KV buffers among the inputs."""
+        return tuple(tensor for tensor in self.inputs if tensor.name.startswith("past_key_values."))
+
+    def input(self, name: str) -> TensorContract:
+        """The input of that name; raises ArtifactError."""
+        return self._find(self.inputs, name)
+
+    def output(self, name: str) -> TensorContract:
+        """The output of that name; raises ArtifactError."""
+        return self._find(self.outputs, name)
+
+    def _find(self, tensors: tuple[TensorContract, ...], name: str) -> TensorContract:
+        for tensor in tensors:
+            if tensor.name == name:
+                return tensor
+        raise ArtifactError(f"{self.file}: no tensor {name!r} in the manifest's I/O contract")
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """What the runner needs to know of the model beyond its graphs."""
+
+    image_px: int
+    frame_tokens: int
+    kv_dim: int
+    max_context: int
+    max_new_tokens: int
+    prefill_chunk_tokens: int
+    frame_offsets_s: tuple[float, ...]
+    tick_period_ms: int
+    step_s: float
+    im_start_id: int
+    im_end_id: int
+    img_start_id: int
+    img_end_id: int
+    img_context_id: int
+    control_cores: tuple[int, ...]
+    """Processor cores of the control thread; empty: the runner decides by those it finds."""
+    reasoning_cores: tuple[int, ...]
+    control_priority: int
+    """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in _POSITIVE and value <= 0:
+                raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {value}")
+        if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
+            raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
+        if self.control_priority >= BRIDGE_PRIORITY:
+            raise ArtifactError(
+                f"{MANIFEST_NAME}: runtime.control_priority {self.control_priority}, expected 0 to "
+                f"{BRIDGE_PRIORITY - 1}, below the bridge's {BRIDGE_PRIORITY}: export again with "
+                f"--set runtime.control_priority=50"
+            )
+
+
+@dataclass(frozen=True)
+class Artifacts:
+    """A verified directory: the bytes that were hashed are the bytes that will be run."""
+
+    directory: Path
+    manifest_sha256: str
+    target: str
+    model_name: str
+    trained: bool
+    runtime: RuntimeConfig
+    graphs: Mapping[str, GraphContract]
+    contents: Mapping[str, bytes]
+    """Every file but the graphs' data files."""
+    identities: Mapping[str, FileIdentity]
+    """The data files as they were when they were hashed."""
+    release: int | None = None
+    """Release counter of the signature that was asked for; None: none was."""
+
+    @property
+    def language_graphs(self) -> tuple[str, ...]:
+        """The language model's graphs: one, or the pair of prefill and decode."""
+        return LANGUAGE_WHOLE if LANGUAGE_WHOLE[0] in self.graphs else LANGUAGE_PAIR
+
+    @property
+    def guided_by_waypoints(self) -> bool:
+        """Whether the action expert is given the waypoints that were written, instead of last-layer K‖V."""
+        return any(tensor.name == "waypoints" for tensor in self.graphs["semantic_context"].inputs)
+
+    def check_unchanged(self, names: Iterable[str]) -> None:
+        """Raise ArtifactError if a data file is not the one that was hashed any more."""
+        for name in names:
+            path = self.directory / name
+            try:
+                same = FileIdentity.of(path) == self.identities[name]
+            except OSError:
+                same = False
+            if not same:
+                raise ArtifactError(f"{path}: changed while it was being opened; start again")
+
+
+def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
+    """Verify every file's size and SHA-256, the schema version and the I/O contract; raises ArtifactError.
+
+    With `trust`, the signature comes first, before the manifest is even parsed, and the release is remembered last.
+    """
+    raw = read_manifest_bytes(directory)
+    release = None if trust is None else trust.check(directory, raw)
+    manifest = parse_manifest(directory, raw)
+    files = _section(manifest, "files")
+    for name, entry in files.items():
+        check_entry(name, entry)
+    data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
+    contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
+    identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
+    known = {*files, MANIFEST_NAME, SIGNATURE_NAME}
+    unlisted = sorted(path.name for path in directory.iterdir() if path.name not in known)
+    if unlisted:
+        raise ArtifactError(f"{directory / unlisted[0]}: not listed in the manifest; export again into a new directory")
+    pair = all(name in _section(manifest, "graphs") for name in LANGUAGE_PAIR)
+    graphs = {
+        name: _graph(manifest, name, contents, identities)
+        for name in (
+            "vision_encoder",
+            *(LANGUAGE_PAIR if pair else LANGUAGE_WHOLE),
+            "semantic_context",
+            "action_expert",
+        )
+    }
+    surplus = sorted(set(_section(manifest, "graphs")) - set(graphs))
+    if surplus:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is not one that the runner knows")
+    if "tokenizer.json" not in contents:
+        raise ArtifactError(f"{directory}: tokenizer.json is missing from the manifest")
+    model = _section(manifest, "model")
+    artifacts = Artifacts(
+        directory=directory,
+        manifest_sha256=str(manifest[SEAL]),
+        target=str(manifest["target"]),
+        model_name=str(model.get("name")),
+        trained=model.get("trained") is True,
+        runtime=_runtime(_section(manifest, "runtime")),
+        graphs=graphs,
+        contents=contents,
+        identities=identities,
+        release=release,
+    )
+    check_contract(artifacts)
+    for graph in graphs.values():
+        _check_external_data(graph, contents[graph.file], identities)
+    if trust is not None and release is not None:
+        trust.accept(release)
+    return artifacts
+
+
+def _check_external_data(graph: GraphContract, content: bytes, identities: Mapping[str, FileIdentity]) -> None:
+    """Weights outside a graph lie in the data files that the manifest lists for it, and inside those."""
+    try:
+        for data in external_data(content):
+            if data.location not in graph.data_files:
+                raise ExternalDataError(f"weights in {data.location!r}, which the manifest does not list for it")
+            size = identities[data.location].size
+            if data.offset + (data.length or 0) > size:
+                raise ExternalDataError(f"weights beyond the {size} bytes of {data.location}")
+    except ExternalDataError as error:
+        raise ArtifactError(f"{graph.file}: {error}; export again") from error
+
+
+def _section(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
+    section = manifest[name]
+    if not isinstance(section, dict):
+        raise ArtifactError(f"{MANIFEST_NAME}: {name} must be an object")
+    return section
+
+
+def _data_files(graph: Any) -> list[str]:
+    """Data files that a graph's entry names; raises ArtifactError."""
+    names = graph.get("data_files") if isinstance(graph, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ArtifactError(f"{MANIFEST_NAME}: every graph must list its data_files")
+    return names
+
+
+def _tensors(graph: str, entry: Mapping[str, Any], key: str) -> tuple[TensorContract, ...]:
+    tensors: list[TensorContract] = []
+    declared = entry.get(key)
+    if not isinstance(declared, list):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph} has no {key}")
+    for item in declared:
+        if not isinstance(item, dict) or set(item) != {"name", "dtype", "shape"} or not isinstance(item["shape"], list):
+            raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: {key} must be name, dtype and shape")
+        tensors.append(TensorContract(str(item["name"]), str(item["dtype"]), tuple(item["shape"])))
+    return tuple(tensors)
+
+
+def _graph(
+    manifest: Mapping[str, Any], name: str, contents: Mapping[str, bytes], identities: Mapping[str, FileIdentity]
+) -> GraphContract:
+    entry = _section(manifest, "graphs").get(name)
+    if not isinstance(entry, dict):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {name} is missing")
+    file = str(entry.get("file"))
+    missing = [n for n in (file, *_data_files(entry)) if n not in contents and n not in identities]
+    if missing or file not in contents:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {name}: file {[*missing, file][0]!r} is not among the files")
+    inputs, outputs = _tensors(name, entry, "inputs"), _tensors(name, entry, "outputs")
+    return GraphContract(file, tuple(_data_files(entry)), inputs, outputs, _session(name, entry.get("session")))
+
+
+def _session(graph: str, entry: Any) -> SessionConfig:
+    known = {"provider": str, "options": dict, "threads": int | None, "engine": bool}
+    if not isinstance(entry, dict) or set(entry) != set(known):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session must give {', '.join(known)}")
+    wrong = [key for key, kind in known.items() if not isinstance(entry[key], kind)]
+    options = entry["options"]
+    if wrong or not all(isinstance(value, str) for value in options.values()):
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session {[*wrong, 'options'][0]} is of the wrong type")
+    refused = wrong_option(entry["provider"], options)
+    if refused is not None:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session {refused}")
+    threads = entry["threads"]
+    if threads is not None and not 1 <= threads <= 256:
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: session threads {threads}, expected 1 to 256")
+    return SessionConfig(entry["provider"], options, threads, entry["engine"])
+
+
+def _runtime(section: dict[str, Any]) -> RuntimeConfig:
+    fields = RuntimeConfig.__dataclass_fields__
+    if set(section) != set(fields):
+        raise ArtifactError(f"{MANIFEST_NAME}: runtime has {sorted(section)}, expected {sorted(fields)}")
+    lists = {key: section[key] for key in _LISTS}
+    numbers = {key: value for key, value in section.items() if key not in lists}
+    if not all(isinstance(values, list) and len(values) <= 1024 for values in lists.values()) or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6
+        for v in [*numbers.values(), *(v for values in lists.values() for v in values)]
+    ):
+        raise ArtifactError(f"{MANIFEST_NAME}: runtime values must be numbers that are not negative")
+    values: dict[str, Any] = {key: value if key == "step_s" else int(value) for key, value in numbers.items()}
+    values |= {key: tuple((float if key == "frame_offsets_s" else int)(v) for v in lists[key]) for key in _LISTS}
+    return RuntimeConfig(**values)
+
+
+def check_contract(artifacts: Artifacts) -> None:
+    """The graphs must fit one another and the runner: names, types and widths; raises ArtifactError."""
+    vision, context, action = (artifacts.graphs[n] for n in ("vision_encoder", "semantic_context", "action_expert"))
+    first, last = (artifacts.graphs[name] for name in (artifacts.language_graphs[0], artifacts.language_graphs[-1]))
+    runtime = artifacts.runtime
+    tokens = vision.output("visual_tokens")
+    expected: list[tuple[GraphContract, TensorContract, str, tuple[int | str, ...]]] = [
+        (vision, vision.input("frame"), "uint8", (1, runtime.image_px, runtime.image_px, 3)),
+        (vision, tokens, "float", (1, *tokens.shape[1:])),
+        (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
+        (first, first.input("image_offset"), "int64", (1,)),
+        (last, last.output("next_token"), "int64", (1, 1)),
+        (context, *_guidance(artifacts)),
+        (action, action.input("visual_tokens"), "float", tokens.shape),
+        (action, action.input("state"), "float", (1, 3)),
+        (action, action.input("latency"), "float", (1, 4)),
+        *((action, action.input(tensor.name), *_form(tensor)) for tensor in context.outputs),
+    ]
+    for graph in (first, last):
+        expected += [
+            (graph, graph.input("input_ids"), "int64", (1, "S")),
+            (graph, graph.input("seqlens_k"), "int32", (1,)),
+            (graph, graph.input("total_sequence_length"), "int32", ()),
+            (graph, graph.output("last_layer_kv"), "float", (1, "S", runtime.kv_dim)),
+        ]
+        for cache in graph.caches:
+            present = graph.output(cache.name.replace("past_key_values", "present"))
+            # Every buffer is bound as input and output at once, and the two graphs of a pair fill the same ones.
+            expected += [(graph, present, cache.dtype, cache.shape), (first, first.input(cache.name), *_form(cache))]
+    for graph, tensor, dtype, shape in expected:
+        if tensor.dtype != dtype or tensor.shape != shape:
+            raise ArtifactError(
+                f"{graph.file}: {tensor.name} is {tensor.dtype}{list(tensor.shape)}, "
+                f"the runner expects {dtype}{list(shape)}"
+            )
+    if not last.caches or len(first.caches) != len(last.caches):
+        raise ArtifactError(f"{last.file}: {len(last.caches)} KV buffers, {first.file} has {len(first.caches)}")
+    trajectory = action.output("trajectory")
+    if trajectory.dtype != "float" or len(trajectory.shape) != 3 or trajectory.shape[2] != 3:
+        raise ArtifactError(f"{action.file}: trajectory is {list(trajectory.shape)}, the runner expects [1, steps, 3]")
+    steps = trajectory.shape[1]
+    if not isinstance(steps, int) or steps * runtime.step_s < 1.0:
+        raise ArtifactError(
+            f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at"
+        )
+
+
+def _guidance(artifacts: Artifacts) -> tuple[TensorContract, str, tuple[int | str, ...]]:
+    """What the semantic context is made from, and the form that the runner gives it in."""
+    context = artifacts.graphs["semantic_context"]
+    if artifacts.guided_by_waypoints:
+        return context.input("waypoints"), "float", (1, len(WAYPOINT_TIMES_S), 2)
+    return context.input("last_layer_kv"), "float", (1, "T", artifacts.runtime.kv_dim)
+
+
+def _form(tensor: TensorContract) -> tuple[str, tuple[int | str, ...]]:
+    return tensor.dtype, tensor.shape

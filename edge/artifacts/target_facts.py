@@ -1,0 +1,123 @@
+"""What a manifest says of the device it was made for: the target's own figures and the plan, read with care."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from edge.artifacts.files import MANIFEST_NAME, ArtifactError
+
+GIB = 1 << 30
+
+
+@dataclass(frozen=True)
+class TargetFacts:
+    """The device that artifacts were exported for (`provenance.target`)."""
+
+    name: str
+    architectures: tuple[str, ...]
+    cores: int
+    memory_bytes: int
+    """Memory that the model shares with everything else; a graphics card's own where it has its own."""
+    available_bytes: int
+    """Of it, what is left for this program."""
+    min_l4t: str | None
+    power_mode: str
+    budget_w: float | None
+    own_memory: bool = False
+    """The memory is a graphics card's own; the machine's is not known."""
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.architectures or not self.power_mode:
+            raise ArtifactError(f"{MANIFEST_NAME}: provenance.target names no device, architecture or power mode")
+        if self.cores < 1 or not 0 < self.available_bytes <= self.memory_bytes:
+            raise ArtifactError(
+                f"{MANIFEST_NAME}: provenance.target has {self.cores} cores, {self.available_bytes} of "
+                f"{self.memory_bytes} bytes available: expected positive numbers that fit"
+            )
+
+
+@dataclass(frozen=True)
+class PlanFacts:
+    """What the plan expects of the device (`plan`)."""
+
+    period_ms: float
+    tick_ms: float
+    """A tick with reasoning beside it."""
+    tick_alone_ms: float
+    tick_error: float
+    """Relative half width of the tick's error bar; 0 if the plan gives none."""
+    prompt_tokens: int
+    memory_bytes: int
+    tagged: str
+    """`measured` or `modelled`."""
+
+    def __post_init__(self) -> None:
+        for name in ("period_ms", "tick_ms", "tick_alone_ms", "prompt_tokens", "memory_bytes"):
+            if getattr(self, name) <= 0:
+                raise ArtifactError(f"{MANIFEST_NAME}: plan.{name} must be positive, found {getattr(self, name)}")
+
+
+def target_facts(manifest: Mapping[str, Any]) -> TargetFacts | None:
+    """Facts of a manifest's target; None where it was written without one. Raises ArtifactError."""
+    target = _mapping(manifest, "provenance").get("target")
+    if target is None:
+        return None
+    if not isinstance(target, dict):
+        raise ArtifactError(f"{MANIFEST_NAME}: provenance.target must be an object")
+    device, power = _mapping(target, "device"), _mapping(target, "power")
+    memory_gib, reserved_gib = _number(device, "memory_gib"), _number(device, "reserved_gib")
+    architectures = target.get("arch")
+    if not isinstance(architectures, list) or not all(isinstance(name, str) for name in architectures):
+        raise ArtifactError(f"{MANIFEST_NAME}: provenance.target.arch must be a list of names")
+    return TargetFacts(
+        name=_text(target, "name") or "",
+        architectures=tuple(architectures),
+        cores=round(_number(device, "cores")),
+        memory_bytes=round(memory_gib * GIB),
+        available_bytes=round((memory_gib - reserved_gib) * GIB),
+        min_l4t=_text(device, "min_l4t"),
+        power_mode=_text(power, "mode") or "",
+        budget_w=None if power.get("budget_w") is None else _number(power, "budget_w"),
+        # Jetsons are the only graphics processors here that compute in the machine's own memory.
+        own_memory=_text(device, "compute_capability") is not None and _text(device, "min_l4t") is None,
+    )
+
+
+def plan_facts(manifest: Mapping[str, Any]) -> PlanFacts | None:
+    """Facts of a manifest's plan; None where it was written without one. Raises ArtifactError."""
+    plan = _mapping(manifest, "plan")
+    if not plan:
+        return None
+    return PlanFacts(
+        period_ms=_number(plan, "period_ms"),
+        tick_ms=_number(plan, "tick_ms"),
+        tick_alone_ms=_number(plan, "tick_alone_ms"),
+        tick_error=0.0 if plan.get("tick_error") is None else _number(plan, "tick_error"),
+        prompt_tokens=round(_number(plan, "prompt_tokens")),
+        memory_bytes=round(_number(plan, "memory_bytes")),
+        tagged=_text(plan, "tagged") or "modelled",
+    )
+
+
+def _mapping(holder: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = holder.get(key)
+    if not isinstance(value, dict):
+        raise ArtifactError(f"{MANIFEST_NAME}: {key} must be an object; export again")
+    return value
+
+
+def _number(holder: Mapping[str, Any], key: str) -> float:
+    value = holder.get(key)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise ArtifactError(f"{MANIFEST_NAME}: {key} must be a number, found {value!r}; export again")
+    return float(value)
+
+
+def _text(holder: Mapping[str, Any], key: str) -> str | None:
+    value = holder.get(key)
+    if value is not None and not isinstance(value, str):
+        raise ArtifactError(f"{MANIFEST_NAME}: {key} must be text, found {value!r}; export again")
+    return value

@@ -1,0 +1,167 @@
+"""Checks of the graphs on this machine: which provider every node really got, and how long a tick really takes."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import onnxruntime as ort
+
+from edge.artifacts.manifest import Artifacts, GraphContract
+from edge.artifacts.target_facts import PlanFacts
+from edge.core.geometry import SE2
+from edge.deploy.doctor.check import Check, Level, skipped
+from edge.inference.graph import CPU_PROVIDER, Array, zeros
+from edge.inference.policy import Policy
+from edge.motion.guidance import STRAIGHT_AHEAD
+from edge.state.semantic import SemanticState
+
+SHAPE_OPERATORS: Final = frozenset(
+    {
+        "Cast", "Concat", "ConstantOfShape", "Div", "Expand", "Gather", "Identity", "Mul", "Range", "ReduceSum",
+        "Reshape", "Shape", "Size", "Slice", "Squeeze", "Sub", "Unsqueeze",
+    }
+)  # fmt: skip
+"""Operators that ONNX Runtime itself puts on the processor when they only reckon with shapes."""
+SHAPE_BYTES: Final = 1024
+"""Largest output of such a node: shapes are a few numbers."""
+COPIES: Final = ("MemcpyFromHost", "MemcpyToHost")
+SLOWER: Final = 1.25
+"""Measured median tick as a multiple of the plan's upper bound from which the plan does not hold here."""
+LEAST_TICKS: Final = 5
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Nodes of one operator that ran on one provider."""
+
+    provider: str
+    operator: str
+    nodes: int
+    largest_output_bytes: int
+    duration_us: int
+
+
+def placements(events: Iterable[Any]) -> list[Placement]:
+    """Where every node ran, from the events of an ONNX Runtime profile; raises ValueError for another kind of file."""
+    found: dict[tuple[str, str], list[tuple[str, int, int]]] = {}
+    for event in events:
+        if not isinstance(event, dict) or event.get("cat") != "Node":
+            continue
+        args, name = event.get("args"), str(event.get("name", ""))
+        if not isinstance(args, dict) or not name.endswith("_kernel_time"):
+            continue
+        if "provider" not in args:
+            raise ValueError(f"node {name} names no provider")
+        key = (str(args["provider"]), str(args.get("op_name")))
+        found.setdefault(key, []).append((name, int(args.get("output_size") or 0), int(event.get("dur") or 0)))
+    if not found:
+        raise ValueError("the profile names no node")
+    return [
+        Placement(
+            provider, operator, len({n for n, _, _ in runs}), max(size for _, size, _ in runs), sum(d for *_, d in runs)
+        )
+        for (provider, operator), runs in sorted(found.items())
+    ]
+
+
+def judge_placement(graph: str, wanted: str, placed: Sequence[Placement]) -> Check:
+    """No node may have fallen back to the processor, but for those that only reckon with shapes."""
+    name = f"provider of {graph}"
+    by_provider: dict[str, int] = {}
+    for place in placed:
+        by_provider[place.provider] = by_provider.get(place.provider, 0) + place.nodes
+    found = ", ".join(f"{nodes} nodes on {provider}" for provider, nodes in sorted(by_provider.items()))
+    wrong = [place for place in placed if place.provider != wanted and not _harmless(place)]
+    if not wrong:
+        return Check(name, Level.OK, found, f"all on {wanted}")
+    worst = max(wrong, key=lambda place: place.duration_us)
+    found += f"; {worst.nodes} {worst.operator} on {worst.provider} take {worst.duration_us / 1e3:.2f} ms"
+    advice = f"export again with a form that {wanted} takes, or build its engine (edge-install engines)"
+    return Check(name, Level.FAIL, found, f"all on {wanted}", advice)
+
+
+def _harmless(place: Placement) -> bool:
+    small = place.operator in SHAPE_OPERATORS and place.largest_output_bytes <= SHAPE_BYTES
+    return place.provider == CPU_PROVIDER and (small or place.operator in COPIES)
+
+
+def profile_graph(artifacts: Artifacts, name: str) -> Check:
+    """Open a graph as the runner does, run it once under ONNX Runtime's profiler and judge where its nodes ran."""
+    contract = artifacts.graphs[name]
+    wanted = contract.session.provider
+    with tempfile.TemporaryDirectory(prefix="edge-doctor-") as folder:
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = contract.session.threads or 1
+        options.log_severity_level = 3
+        weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
+        options.enable_profiling = True
+        options.profile_file_prefix = str(Path(folder) / "profile")
+        try:
+            session = ort.InferenceSession(
+                artifacts.contents[contract.file], options, providers=[(wanted, dict(contract.session.options))]
+            )
+            session.run(None, example_feeds(artifacts, contract))
+            events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
+            return judge_placement(name, wanted, placements(events))
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime raises whatever its providers do; that is the finding
+            said = (str(error).splitlines() or [type(error).__name__])[0]
+            advice = "verify the artifacts (edge-export verify), then the provider's packages"
+            return Check(f"provider of {name}", Level.FAIL, f"does not run: {said}", wanted, advice)
+
+
+def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Array]:
+    """Zeros for every input of a graph, of the shapes of a short prompt's first call."""
+    axes = {"S": 1, "F": 1, "T": artifacts.runtime.frame_tokens, "C": artifacts.runtime.max_context}
+    feeds = {tensor.name: zeros(tensor, **axes) for tensor in contract.inputs}
+    if "total_sequence_length" in feeds:
+        feeds["total_sequence_length"] = np.array(1, dtype=np.int32)
+    return feeds
+
+
+def measure_ticks(artifacts: Artifacts, count: int, budget_s: float, prompt_tokens: int) -> list[float]:
+    """Durations in ms of ticks on a black frame (encode and act); fewer than `count` when the time budget is used up.
+
+    Raises ArtifactError or GraphError.
+    """
+    policy, runtime = Policy(artifacts), artifacts.runtime
+    here = SE2(0.0, 0.0, 0.0)
+    frame = np.zeros((1, runtime.image_px, runtime.image_px, 3), dtype=np.uint8)
+    kv = np.zeros((1, prompt_tokens, runtime.kv_dim), dtype=np.float32)
+    semantic = SemanticState(0, 0, here, 0, kv, policy.semantic_context(kv), "", STRAIGHT_AHEAD)
+    times: list[float] = []
+    deadline_ns = time.monotonic_ns() + round(budget_s * 1e9)
+    for number in range(count + 2):
+        started_ns = time.monotonic_ns()
+        policy.act(policy.encode(frame), (0.0, 0.0, 0.0), 0.0, here, semantic)
+        if number >= 2:  # the first calls allocate
+            times.append((time.monotonic_ns() - started_ns) / 1e6)
+        if len(times) >= LEAST_TICKS and time.monotonic_ns() > deadline_ns:
+            break
+    return times
+
+
+def judge_ticks(times_ms: Sequence[float], plan: PlanFacts | None, period_ms: int) -> Check:
+    """Measured ticks against the period and the plan."""
+    name = "tick"
+    if not times_ms:
+        return skipped(name, "no tick was run")
+    p50, p99, most = (float(np.percentile(times_ms, q)) for q in (50, 99, 100))
+    found = f"p50 {p50:.1f}, p99 {p99:.1f}, max {most:.1f} ms of {len(times_ms)} ticks, alone, measured"
+    expected = f"period {period_ms} ms"
+    if plan is not None:
+        expected += f", plan {plan.tick_alone_ms:.1f} ms alone, {plan.tick_ms:.1f} beside reasoning, {plan.tagged}"
+    if p99 > period_ms:
+        advice = "this machine cannot keep the rate: check power mode and clocks, or export with a faster precision"
+        return Check(name, Level.FAIL, found, expected, advice)
+    if plan is not None and p50 > SLOWER * plan.tick_alone_ms * (1 + plan.tick_error):
+        advice = "slower than planned: check power mode, clocks and busy programs; edge-calib latency measures anew"
+        return Check(name, Level.WARN, found, expected, advice)
+    return Check(name, Level.OK, found, expected)

@@ -1,0 +1,181 @@
+"""Checks of what this user may do and read: urgency, memory, devices, the socket's folder, power and temperature."""
+
+from __future__ import annotations
+
+import resource
+import stat
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from edge.artifacts.device_nodes import device_nodes
+from edge.deploy.doctor.check import Check, Level, skipped
+from edge.deploy.doctor.user import Whom
+from edge.deploy.service_users import RUNNER_USER
+from edge.deploy.units import NEED_DEVICES
+from edge.inference.scheduling import Role, enter
+from edge.power.governor.limits import LimitsConfig
+from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
+from edge.power.meters.rapl import ZONES
+from edge.power.meters.thermal import ThermalReader
+from firmware_bridge.core.config import OPERATOR_SUFFIX
+
+FROM_UNIT = "the service gets it from its unit (edge-install units)"
+SHARED_FOLDER_MODE = 0o711
+"""Of the installed service's folder: the modes of the sockets in it decide."""
+_SETTLE_S = 0.2
+"""Between opening a meter and reading it: one that counts energy needs some."""
+
+
+def try_priority(priority: int) -> list[str]:
+    """Ask for real time in a thread that then ends; lines that say what was refused."""
+    lines: list[str] = []
+    thread = threading.Thread(target=lambda: lines.extend(enter(Role("control", (), priority))))
+    thread.start()
+    thread.join()
+    return lines
+
+
+def real_time(priority: int, whom: Whom, attempt: Callable[[int], list[str]] = try_priority) -> Check:
+    """Whether the control thread would get the real-time priority that the target gives it."""
+    name = "real-time priority"
+    if priority == 0:
+        return skipped(name, "the target asks for none")
+    if whom.other:
+        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
+    if attempt(priority):
+        return Check(name, Level.WARN, f"refused to {whom.name}", f"SCHED_FIFO {priority}", FROM_UNIT)
+    return Check(name, Level.OK, f"SCHED_FIFO {priority} granted to {whom.name}", f"SCHED_FIFO {priority}")
+
+
+def locked_memory(limit_bytes: int, whom: Whom) -> Check:
+    """Whether the runner may keep its pages in memory."""
+    name = "locked memory"
+    if whom.other and whom.uid != 0:
+        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
+    if limit_bytes == resource.RLIM_INFINITY or whom.uid == 0:
+        return Check(name, Level.OK, f"no limit for {whom.name}", "no limit")
+    return Check(name, Level.WARN, f"at most {limit_bytes // 1024} KiB for {whom.name}", "no limit", FROM_UNIT)
+
+
+def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
+    """Whether the providers' device nodes are there and the user may open them."""
+    name = "device nodes"
+    if not set(providers) & set(NEED_DEVICES):
+        return Check(name, Level.OK, "none needed", "those of " + ", ".join(providers))
+    nodes = device_nodes(providers, root)
+    if not nodes:
+        return Check(name, Level.FAIL, "none", "those of " + ", ".join(providers), "install the device's driver")
+    files = {node: root / node.path.relative_to("/") for node in nodes}
+    closed = [node for node in nodes if not whom.may(files[node], write=_is_for_writing(files[node]))]
+    if closed:
+        groups = sorted({node.group for node in closed if node.group}) or ["video", "render"]
+        found = f"{closed[0].path} and {len(closed) - 1} more are closed to {whom.name}"
+        advice = f"sudo usermod -aG {','.join(groups)} {whom.name}, then log in again"
+        if whom.other and all(node.group and whom.through_its_group(files[node]) for node in closed):
+            return Check(name, Level.WARN, found, "all open", f"{FROM_UNIT}; without it: {advice}")
+        return Check(name, Level.FAIL, found, "all open", advice)
+    return Check(name, Level.OK, f"{len(nodes)} found, all open to {whom.name}", "all open")
+
+
+def _is_for_writing(node: Path) -> bool:
+    """Whether the driver lets anybody but root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
+
+
+def socket_folder(socket: Path, whom: Whom) -> Check:
+    """That only the robot's users can reach the bridge's sockets: one user alone, or the service's groups."""
+    name = "socket folder"
+    folder = socket.parent
+    try:
+        found = folder.stat()
+    except OSError as error:
+        return skipped(name, f"{folder}: {error.strerror}; edge-bridge makes it")
+    mode = stat.S_IMODE(found.st_mode)
+    said = f"{folder}, mode {mode:04o}, user {found.st_uid}"
+    if mode == SHARED_FOLDER_MODE:
+        return _service_sockets(socket, whom, found.st_uid)
+    if mode & 0o077:
+        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: anybody could command the robot"
+        return Check(name, Level.FAIL, said, expected, advice)
+    if found.st_uid != whom.uid and whom.uid != 0:
+        expected = f"user {whom.uid} ({whom.name})"
+        return Check(name, Level.FAIL, said, expected, "run bridge and runner as one user, or name it with --user")
+    return Check(name, Level.OK, f"{said} ({whom.name})", "mode 0700")
+
+
+def _service_sockets(socket: Path, whom: Whom, bridge_uid: int) -> Check:
+    """Modes and groups of the installed service's two sockets, as the runner meets them."""
+    name = "bridge sockets"
+    operator = Path(f"{socket}{OPERATOR_SUFFIX}")
+    try:
+        commands, stops = socket.stat(), operator.stat()
+    except OSError as error:
+        return skipped(name, f"{error.filename}: {error.strerror}; start the bridge, which makes it")
+    said = f"{socket} of group {commands.st_gid}, {operator.name} of group {stops.st_gid}"
+    for path, status in ((socket, commands), (operator, stops)):
+        if stat.S_IMODE(status.st_mode) & 0o007:
+            found = f"{path}, mode {stat.S_IMODE(status.st_mode):04o}"
+            return Check(name, Level.FAIL, found, "mode 0660 or less", "restart the bridge, which sets the modes")
+    if whom.uid == 0:
+        return Check(name, Level.OK, f"{said}; closed to other users", "mode 0660")
+    if whom.uid == bridge_uid or stops.st_gid in whom.groups:
+        advice = (
+            "run the runner as a user of its own, outside the operators' group: it could take back an emergency stop"
+        )
+        return Check(name, Level.FAIL, f"{whom.name} reaches {operator}", "a runner that cannot operate", advice)
+    if commands.st_gid not in whom.groups:
+        advice = f"name the runner's user with --user (edge-install units: {RUNNER_USER})"
+        return Check(name, Level.FAIL, f"{whom.name} does not reach {socket}", "the runner's user", advice)
+    return Check(name, Level.OK, f"{said}; {whom.name} reaches the first only", "the command socket only")
+
+
+def power_meter(
+    kind: str,
+    open_it: Callable[[], PowerMeter],
+    sysfs_root: Path,
+    whom: Whom,
+    *,
+    clock: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Check:
+    """Whether the meter that the target names can be read, and what it says."""
+    name = "power meter"
+    if kind in ("none", "modelled"):
+        return skipped(name, f"the target's meter is {kind!r}")
+    try:
+        meter = open_it()
+        sleep(_SETTLE_S)
+        sample: PowerSample = meter.read(clock())
+    except MeterError as error:
+        advice = "the governor has nothing to hold the budget by; see the message"
+        return Check(name, Level.WARN, str(error), kind, advice)
+    found = f"{sample.total_w:.1f} W, {meter.source}, {sample.tagged}"
+    # Of all that a meter reads, only these are commonly closed to everybody but root.
+    counters = sorted(sysfs_root.glob(f"{ZONES}/energy_uj")) if whom.other and meter.source.startswith("rapl") else []
+    if closed := [path for path in counters if not whom.may(path)]:
+        advice = f"for this boot: sudo chmod a+r {closed[0]}, and the others like it (a side channel, CVE-2020-8694)"
+        return Check(name, Level.WARN, f"{closed[0]} is closed to {whom.name}", kind, advice)
+    return Check(name, Level.OK, found + (f" ({meter.caveat})" if meter.caveat else ""), kind)
+
+
+def temperatures(sysfs_root: Path, now_ns: int) -> Check:
+    """Temperatures, and how far they are from where clocks are held back and where the board switches off."""
+    name = "temperatures"
+    state, limits = ThermalReader(sysfs_root).read(now_ns), LimitsConfig()
+    if state.hottest_c is None:
+        return skipped(name, "this machine shows no thermal zone")
+    found = f"hottest {state.hottest_c:.0f} °C of {len(state.zones_c)} zones"
+    advice = "let it cool down, look at fan and heat sink"
+    trip_c, passive_c = state.trip_margin_c, state.throttle_margin_c
+    if trip_c is not None and trip_c <= limits.trip_margin_c:
+        found += f", {trip_c:.1f} °C below where the board switches off"
+        return Check(name, Level.FAIL, found, f"more than {limits.trip_margin_c:g} °C", advice)
+    if state.throttled:
+        found += f", held back by {', '.join(state.throttling)}"
+        return Check(name, Level.WARN, found, "no throttling", advice)
+    if passive_c is not None and passive_c < limits.throttle_clear_c:
+        found += f", {abs(passive_c):.1f} °C {'below' if passive_c >= 0 else 'above'} where clocks are held back"
+        return Check(name, Level.WARN, found, f"{limits.throttle_clear_c:g} °C or more below", advice)
+    return Check(name, Level.OK, found, "no throttling")

@@ -1,0 +1,132 @@
+"""Checks of the way to the robot: the bridge that commands it, its state, one picture of its camera."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+import cv2
+
+from edge.deploy.doctor.check import Check, Level, skipped
+from edge.run.camera import decode_frame
+from firmware_bridge.client import BridgeClient, BridgeUnavailable
+from firmware_bridge.core.config import OPERATOR_SUFFIX, RobotConfig
+from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.unitree.client import CameraError, Go2Reader, RobotState
+from firmware_bridge.unitree.dds import DdsError
+
+STATE_TIMEOUT_S: Final = 3.0
+_POLL_S: Final = 0.02
+_DISCOVERY_S: Final = 0.5  # for every participant of the network to be announced
+
+
+_ADVICE: Final = {
+    "estop": "an emergency stop is latched: find out why it was pressed, then `edge-bridge arm` while a runner waits",
+    "second_publisher": "two robots, a forger or a motor-command program are on this network: leave one robot on it",
+}
+"""What to do where arming is refused, by cause."""
+
+
+class Reader(Protocol):
+    """What reads the robot; `Go2Reader` in production."""
+
+    def state(self) -> RobotState | None:
+        """Newest state."""
+
+    def request_frame(self, timeout_s: float) -> bytes:
+        """One JPEG; raises CameraError."""
+
+    def surplus_publishers(self) -> str | None:
+        """Which topic of the robot has more publishers than it should have."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+def ask_bridge(robot: RobotConfig) -> BridgeStatus | None:
+    """Status of the bridge over the operator's socket, which leaves the runner its own; raises BridgeUnavailable."""
+    client = BridgeClient(f"{robot.bridge.socket}{OPERATOR_SUFFIX}")
+    try:
+        return client.poll()
+    finally:
+        client.close()
+
+
+def bridge(robot: RobotConfig, ask: Callable[[RobotConfig], BridgeStatus | None] = ask_bridge) -> Check:
+    """Whether the bridge answers, and whether it would arm."""
+    name = "bridge"
+    try:
+        status = ask(robot)
+    except BridgeUnavailable as error:
+        return Check(name, Level.FAIL, str(error), "a bridge that answers", "start edge-bridge or its service")
+    if status is None:
+        return Check(name, Level.FAIL, "it says nothing", "a bridge that answers", "restart edge-bridge")
+    found = f"{status.state}: {status.reason}" if status.reason else status.state
+    if status.blocked_by == "operator":  # comes last: nothing else is in the way
+        return Check(name, Level.OK, f"{found}; waits for `edge-bridge arm`", "ready to arm")
+    if status.blocked_by != "none":
+        advice = _ADVICE.get(
+            status.blocked_by, f"arming is refused because of {status.blocked_by}; edge-bridge status says more"
+        )
+        return Check(name, Level.FAIL, f"{found}; blocked by {status.blocked_by}", "ready to arm", advice)
+    return Check(name, Level.OK, found, "ready to arm")
+
+
+def robot_link(
+    robot: RobotConfig,
+    image_px: int,
+    *,
+    open_reader: Callable[[RobotConfig], Reader] = Go2Reader,
+    timeout_s: float = STATE_TIMEOUT_S,
+) -> list[Check]:
+    """Whether the robot reports its state, and one picture of its camera."""
+    where = f"DDS domain {robot.dds.domain} on {robot.dds.interface}"
+    try:
+        reader = open_reader(robot)
+    except DdsError as error:
+        advice = "bring the interface up or correct the robot file"
+        return [Check("robot", Level.FAIL, str(error), where, advice), skipped("camera", "the robot does not answer")]
+    try:
+        state = _wait_for_state(reader, timeout_s)
+        if state is None:
+            said = f"no state within {timeout_s:g} s"
+            advice = "is the robot on, and its cable in? ping it; compare the robot file's [dds] section"
+            return [Check("robot", Level.FAIL, said, where, advice), skipped("camera", "the robot does not answer")]
+        found = f"{robot.name} reports: mode {state.mode}, error code {state.error_code}"
+        surplus = _wait_for_surplus(reader, min(timeout_s, _DISCOVERY_S))
+        level, found = (Level.FAIL, f"{found}; {surplus}") if surplus else (Level.OK, f"{found}; one publisher a topic")
+        advice = _ADVICE["second_publisher"] if surplus else ""
+        return [Check("robot", level, found, where, advice), _camera(reader, robot, image_px)]
+    finally:
+        reader.close()
+
+
+def _wait_for_state(reader: Reader, timeout_s: float) -> RobotState | None:
+    deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+    while (state := reader.state()) is None and time.monotonic_ns() < deadline_ns:
+        time.sleep(_POLL_S)
+    return state
+
+
+def _wait_for_surplus(reader: Reader, timeout_s: float) -> str | None:
+    deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+    while (surplus := reader.surplus_publishers()) is None and time.monotonic_ns() < deadline_ns:
+        time.sleep(_POLL_S)
+    return surplus
+
+
+def _camera(reader: Reader, robot: RobotConfig, image_px: int) -> Check:
+    name = "camera"
+    expected = f"a JPEG picture within {robot.camera.timeout_ms} ms"
+    started_ns = time.monotonic_ns()
+    try:
+        jpeg = reader.request_frame(robot.camera.timeout_ms / 1e3)
+        took_ms = (time.monotonic_ns() - started_ns) / 1e6
+        pixels = decode_frame(jpeg, image_px)
+    except (CameraError, cv2.error) as error:
+        return Check(name, Level.FAIL, str(error), expected, "restart the robot's camera service; look at its lens")
+    found = f"{len(jpeg)} bytes in {took_ms:.0f} ms"
+    if int(pixels.max()) == int(pixels.min()):
+        return Check(name, Level.FAIL, f"{found}, all of one colour", "a picture", "take the cover off the lens")
+    return Check(name, Level.OK, found, expected)

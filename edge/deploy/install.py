@@ -1,0 +1,108 @@
+"""`edge-install`: what has to be done on the device itself before the runner may start."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.artifacts.trust import KeyFileError
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    check_result_target,
+    command_line,
+    write_result,
+)
+from edge.deploy import install_units
+from edge.deploy.unit_text import UnitError
+from edge.inference import engines
+from edge.reasoning.prompt import InstructionError
+from firmware_bridge.core.config import ConfigError
+
+EXAMPLES = """examples:
+  edge-install engines --artifacts out/orin
+  edge-install engines --artifacts out/orin --engines /var/lib/tic-vla/engines --json -
+  edge-install units --artifacts out/orin --robot go2.toml --instruction "walk to the vending machine" --out units
+  sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
+       --instruction-file /etc/tic-vla/instruction.txt --network 192.168.123.161/32 --system
+
+units wants a robot file with operator_arm = true in [safety], or --arm-at-start.
+
+exit codes: 0 done, 1 systemd finds fault with the units, 2 bad arguments or input, 3 refused (artifacts, device),
+            130 interrupted
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line of `edge-install`."""
+    p = argparse.ArgumentParser(
+        "edge-install", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = p.add_subparsers(dest="command", required=True)
+    build = commands.add_parser(
+        "engines", help="build the engines of TensorRT and OpenVINO now, so that none is built at run time"
+    )
+    build.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="artifact directory")
+    build.add_argument(
+        "--engines", type=Path, metavar="DIR", help="where to keep them (default: DIR.engines beside it)"
+    )
+    build.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    service = commands.add_parser(
+        "units", help="write systemd units, users and firewall of bridge and runner, and check them"
+    )
+    install_units.add_arguments(service)
+    return p
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"edge-install: {line}\n")
+    sys.stderr.flush()
+
+
+@command_line("edge-install")
+def main(
+    argv: Sequence[str] | None = None, machine: engines.Machine | None = None, host: install_units.Host | None = None
+) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        check_result_target(args.json)
+        if args.command == "units":
+            return install_units.run(args, _say, host)
+        return _build_engines(args, machine)
+    except (ArtifactError, engines.EngineError) as error:
+        _say(str(error))
+        return EXIT_REFUSED
+    except (OSError, ConfigError, InstructionError, KeyFileError, UnitError) as error:
+        _say(str(error))
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        _say("interrupted; what was finished is kept, run it again to go on")
+        return EXIT_INTERRUPTED
+
+
+def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) -> int:
+    started_ns = time.monotonic_ns()
+    directory = args.artifacts.absolute()
+    where = args.engines.absolute() if args.engines is not None else engines.default_directory(directory)
+    if where == directory or directory in where.parents:
+        _say(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
+        return EXIT_BAD_INPUT
+    artifacts = load_artifacts(directory)
+    graphs = engines.build(artifacts, where, _say, machine)
+    if not graphs:
+        _say(f"{artifacts.target}: no graph needs an engine")
+    wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
+    write_result(args.json, {"engines": str(where), "graphs": graphs, "wall_s": wall_s})
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

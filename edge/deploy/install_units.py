@@ -1,0 +1,373 @@
+"""`edge-install units`: gathers what the units depend on, writes them, asks systemd about them; starts nothing."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import socket
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
+from pathlib import Path
+from stat import S_IROTH, S_IXOTH
+from typing import Any, Final
+
+import psutil
+
+from edge.artifacts.device_nodes import device_nodes
+from edge.artifacts.files import ArtifactError, read_manifest, read_manifest_bytes
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.artifacts.target_facts import TargetFacts, target_facts
+from edge.artifacts.trust import STATE_DIRECTORY, Trust
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
+from edge.deploy import units
+from edge.deploy.service_users import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER, SYSUSERS_FILE, ServiceUsers, sysusers
+from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
+from edge.deploy.unit_text import UnitError
+from edge.inference import engines
+from edge.run.instructions import check_first_instruction
+from firmware_bridge.core.config import DdsConfig, load_robot_config
+
+SYSTEM_UNITS: Final = Path("etc/systemd/system")
+SYSTEM_USERS: Final = Path("etc/sysusers.d")
+SYSTEM_RULES: Final = units.FIREWALL_FOLDER.relative_to("/")
+_MAX_INSTRUCTION_BYTES: Final = 16_384
+
+Addresses = Mapping[str, Sequence[tuple[str, str]]]
+"""Network interfaces: IPv4 addresses with their netmasks."""
+
+
+def interface_addresses() -> Addresses:
+    """This machine's interfaces."""
+    return {
+        name: [(entry.address, entry.netmask) for entry in entries if entry.family == socket.AF_INET and entry.netmask]
+        for name, entries in psutil.net_if_addrs().items()
+    }
+
+
+def nft_program() -> Path | None:
+    """Program that loads firewall rules; None: not installed."""
+    found = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
+    return None if found is None else Path(found)
+
+
+@dataclass(frozen=True)
+class Host:
+    """The machine as this module meets it; tests give others."""
+
+    root: Path = Path("/")
+    addresses: Callable[[], Addresses] = interface_addresses
+    nft: Callable[[], Path | None] = nft_program
+    check: Callable[[Sequence[Path]], UnitVerdict] = check_units
+    systemd: Callable[[], int | None] = systemd_version
+    programs: Path = field(default_factory=lambda: Path(sys.executable).parent)
+    python: Path = field(default_factory=lambda: Path(sys.executable))
+    prefixes: tuple[Path, ...] = field(
+        default_factory=lambda: (Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[2])
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Command line of `edge-install units`."""
+    parser.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
+    parser.add_argument("--robot", type=Path, required=True, metavar="FILE.toml", help="the robot and its limits")
+    text = parser.add_mutually_exclusive_group(required=True)
+    text.add_argument("--instruction", metavar="TEXT", help="what the robot is to do, in plain words")
+    text.add_argument("--instruction-file", type=Path, metavar="FILE", help="the same, read from a file now")
+    place = parser.add_mutually_exclusive_group(required=True)
+    place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be looked at or copied")
+    place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
+    parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
+    parser.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
+    parser.add_argument("--trust", type=Path, metavar="KEY.pub", help="run only artifacts that this key has signed")
+    for option, default, purpose in (
+        ("--bridge-user", BRIDGE_USER, "user of the bridge"),
+        ("--runner-user", RUNNER_USER, "user of the runner"),
+        ("--operator-group", OPERATOR_GROUP, "group of the people that may stop and arm"),
+    ):
+        parser.add_argument(option, default=default, metavar="NAME", help=f"{purpose} (default: {default})")
+    parser.add_argument(
+        "--network",
+        action="append",
+        default=[],
+        metavar="CIDR",
+        help="the robot's network, IPv4, at most a /16, may be repeated (default: that of the robot file's interface, "
+        "and its peers)",
+    )
+    parser.add_argument(
+        "--arm-at-start",
+        action="store_true",
+        help="a robot file without operator_arm is meant: the runner drives as soon as it starts",
+    )
+    parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+
+
+def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None = None) -> int:
+    """Write the units and check them; the exit code.
+
+    Raises UnitError, ConfigError, InstructionError, KeyFileError or OSError for bad input, ArtifactError for artifacts
+    to be refused.
+    """
+    host = host or Host()
+    inputs = gather(args, host)
+    if set(inputs.providers) & set(units.NEED_DEVICES) and not inputs.devices:
+        lacking = "no device of " + " or ".join(inputs.providers) + " is on this machine"
+        if args.system:
+            raise ArtifactError(f"{lacking}: the runner could not start; install on the device that it is made for")
+        say(f"{lacking}: run this on the device itself before you use the runner's unit")
+    # An emergency stop's input may appear at start-up only; a calibration that is not there is refused here.
+    needed = [inputs.robot, inputs.artifacts, *(path for path in inputs.robot_files if not path.is_relative_to("/sys"))]
+    needed += [] if inputs.trust is None else [inputs.trust]
+    if inputs.engines is not None and inputs.engines.is_dir():
+        needed.append(inputs.engines)
+    elif inputs.engines is not None:
+        say(f"{inputs.engines}: not there yet; build it before the runner starts: edge-install engines")
+    if inputs.operator_arm and args.arm_at_start:
+        say(f"{inputs.robot}: says operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
+    closed = unreadable(needed)
+    for path in closed:
+        say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
+    _say_firewall(inputs, say)
+    contents = _contents(args, inputs, host)
+    written = _write(contents, force=args.force)
+    for path in contents:
+        say(f"{path}: {'written' if path in written else 'is up to date'}")
+    verdict = host.check([path for path in contents if path.suffix == ".service"])
+    _report(verdict, say)
+    commands = _commands(contents, inputs, system=args.system)
+    say("nothing was enabled or started. To do so; the last command lets the robot stand up and drive:")
+    for command in commands:
+        say(f"  {command}")
+    stop = _bridge_command("stop", inputs)
+    say("emergency stop, at any time; only `edge-bridge arm` takes it back:")
+    say(f"  {stop}")
+    result: dict[str, Any] = {
+        "files": [str(path) for path in contents],
+        "written": [str(path) for path in written],
+        "verify": list(verdict.complaints),
+        "verify_other_units": list(verdict.others),
+        "exposure": verdict.exposure,
+        "max_exposure": MAX_EXPOSURE,
+        "not_checked": list(verdict.not_checked),
+        "unreadable": [str(path) for path in closed],
+        "commands": commands,
+        "stop": stop,
+    }
+    write_result(args.json, result)
+    return EXIT_DONE if verdict.good else EXIT_CHECK_FAILED
+
+
+def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
+    """Everything that the units say, from the arguments, the artifacts, the robot file and the machine."""
+    robot = load_robot_config(args.robot, socket=units.SOCKET)
+    if not robot.safety.operator_arm and not args.arm_at_start:
+        raise UnitError(
+            f"robot file {args.robot}: safety.operator_arm: expected true, found false: the service would drive as "
+            f"soon as it starts; set it to true, or give --arm-at-start if you want that"
+        )
+    artifacts = load_artifacts(args.artifacts.resolve())
+    if args.trust is not None:
+        Trust(args.trust, STATE_DIRECTORY / "release.json").check(
+            artifacts.directory, read_manifest_bytes(artifacts.directory)
+        )
+    facts = target_facts(read_manifest(artifacts.directory))
+    if facts is None:
+        raise ArtifactError(f"{artifacts.directory}: its manifest has no target; export again")
+    if args.target is not None and args.target != artifacts.target:
+        raise ArtifactError(
+            f"{artifacts.directory}: made for {artifacts.target}, expected {args.target}; export for {args.target}"
+        )
+    for program in ("edge-bridge", "edge-run"):
+        if not (host.programs / program).exists():
+            raise UnitError(f"{host.programs / program}: missing; install the package there: pip install tic-vla-edge")
+    providers = tuple(sorted({graph.session.provider for graph in artifacts.graphs.values()}))
+    nodes = device_nodes(providers, host.root)
+    folder = None
+    if engines.needed(artifacts):
+        folder = (args.engines or engines.default_directory(artifacts.directory)).resolve()
+    return units.ServiceInputs(
+        programs=host.programs,
+        python=host.python,
+        prefixes=host.prefixes,
+        robot=args.robot.resolve(),
+        robot_files=tuple(path for path in (robot.odometry.calibration, robot.safety.estop_file) if path is not None),
+        artifacts=artifacts.directory,
+        engines=folder,
+        trust=None if args.trust is None else args.trust.resolve(),
+        instruction=check_first_instruction(_instruction(args)),
+        users=ServiceUsers(args.bridge_user, args.runner_user, args.operator_group),
+        interface=robot.dds.interface,
+        domain=robot.dds.domain,
+        networks=robot_networks(robot.dds, args.network, host.addresses),
+        own=tuple(IPv4Network(address) for address, _ in host.addresses().get(robot.dds.interface, ())),
+        nft=host.nft(),
+        providers=providers,
+        devices=tuple(node.path for node in nodes),
+        groups=tuple(sorted({node.group for node in nodes if node.group is not None})),
+        memory_bytes=None if facts.own_memory else facts.available_bytes,
+        control_priority=artifacts.runtime.control_priority,
+        operator_arm=robot.safety.operator_arm,
+        bridge_cores=_bridge_cores(artifacts, facts),
+        systemd=host.systemd(),
+    )
+
+
+def unreadable(paths: Sequence[Path]) -> list[Path]:
+    """What of these files and folders, and of the way to them, only its owner or group may read."""
+    closed: list[Path] = []
+    for path in paths:
+        # What lies in a folder that the services do not see is shown to them without the way to it.
+        way = (
+            [] if units.is_hidden(path) else [folder for folder in path.parents if not folder.stat().st_mode & S_IXOTH]
+        )
+        inside = sorted(path.iterdir()) if path.is_dir() else []
+        needs = {path: S_IROTH | S_IXOTH if path.is_dir() else S_IROTH, **dict.fromkeys(inside, S_IROTH)}
+        closed += [*way, *(entry for entry, bits in needs.items() if entry.stat().st_mode & bits != bits)]
+    return list(dict.fromkeys(closed))
+
+
+def _instruction(args: argparse.Namespace) -> str:
+    if args.instruction_file is None:
+        return str(args.instruction)
+    data = args.instruction_file.read_bytes()[: _MAX_INSTRUCTION_BYTES + 1]
+    try:
+        return str(data.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise UnitError(f"--instruction-file {args.instruction_file}: not UTF-8 text") from None
+
+
+def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
+    """Cores that the target gives to neither thread of the runner; none if it gives no cores at all."""
+    taken = {*artifacts.runtime.control_cores, *artifacts.runtime.reasoning_cores}
+    return tuple(sorted(set(range(facts.cores)) - taken)) if taken else ()
+
+
+def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
+    """Where the robot may be: the networks given, else that of the robot file's interface and its peers.
+
+    Raises UnitError when the file alone does not tell, or when a network is too wide to filter anything.
+    """
+    networks: set[IPv4Network] = set()
+    for text in given:
+        try:
+            network = IPv4Network(text)
+        except (AddressValueError, NetmaskValueError, ValueError) as error:
+            raise UnitError(f"--network {text}: {error}; expected for example 192.168.123.0/24") from None
+        units.check_network(network, f"--network {text}")
+        networks.add(network)
+    if networks:
+        return tuple(sorted(networks))
+    own = addresses().get(dds.interface, ())
+    if not own:
+        raise UnitError(
+            f"the robot file's interface {dds.interface!r} has no IPv4 address here, so the robot's network is not "
+            f"known: bring it up or give --network, e.g. 192.168.123.0/24"
+        )
+    networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
+    for network in networks:
+        units.check_network(network, f"the robot file's interface {dds.interface}")
+    for peer in dds.peers:
+        try:
+            address = IPv4Address(peer)
+        except AddressValueError:
+            raise UnitError(
+                f"dds.peers: {peer!r} is no IPv4 address; give the robot's network with --network"
+            ) from None
+        if not any(address in network for network in networks):
+            networks.add(IPv4Network(address))
+    return tuple(sorted(networks))
+
+
+def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host) -> dict[Path, str]:
+    """Text of every file by its path."""
+    folder = host.root / SYSTEM_UNITS if args.system else args.out.absolute()
+    contents = {
+        folder / units.BRIDGE_UNIT: units.bridge_unit(inputs),
+        folder / units.RUNNER_UNIT: units.runner_unit(inputs),
+    }
+    users = host.root / SYSTEM_USERS if args.system else folder
+    contents[users / SYSUSERS_FILE] = sysusers(inputs.users)
+    if not inputs.over_loopback:
+        rules = host.root / SYSTEM_RULES if args.system else folder
+        contents[rules / units.FIREWALL_FILE] = units.firewall_rules(inputs)
+        if inputs.nft is not None:
+            contents[folder / units.FIREWALL_UNIT] = units.firewall_unit(inputs)
+    return contents
+
+
+def _say_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) -> None:
+    if inputs.over_loopback:
+        return
+    if inputs.nft is None:
+        say("nft is not on this machine, so nothing loads the firewall: sudo apt install nftables, then run this again")
+    wide = [network for network in inputs.networks if network.prefixlen < 32]
+    if wide:
+        say(
+            f"the firewall lets {', '.join(map(str, wide))} through: give the robot's own address with --network, e.g. "
+            f"192.168.123.161/32, to let only the robot through"
+        )
+
+
+def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
+    """Write what differs, each file in one rename; refuses before the first if one is in the way."""
+    wanted: dict[Path, str] = {}
+    for path, text in contents.items():
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise UnitError(f"{path}: is no plain file; remove it first")
+        if path.exists() and path.read_text(encoding="utf-8", errors="replace") == text:
+            continue
+        if path.exists() and not force:
+            raise UnitError(f"{path}: exists and differs; replace it with --force")
+        wanted[path] = text
+    for path, text in wanted.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text)
+        # systemd complains about units that anybody may write, and needs to read them as nobody in particular.
+        path.chmod(0o644)
+    return list(wanted)
+
+
+def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
+    for line in verdict.complaints:
+        say(f"verify: {line}")
+    for line in verdict.others:
+        say(f"verify, about other units of this machine: {line}")
+    for name, score in verdict.exposure.items():
+        judged = "at most" if score <= MAX_EXPOSURE else "above"
+        say(f"{name}: exposure {score}, {judged} {MAX_EXPOSURE}")
+    for line in verdict.not_checked:
+        say(f"skipped: {line}")
+
+
+def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, system: bool) -> list[str]:
+    """Commands that make the services run, for the operator to give."""
+    prepare = (
+        [] if system else [f"sudo install -D -m 0644 {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
+    )
+    prepare += ["sudo systemd-sysusers", f'sudo usermod -aG {inputs.users.operators} "$USER"']
+    firewall = [path.name for path in contents if path.name == units.FIREWALL_UNIT]
+    # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before somebody has
+    # looked at it.
+    drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
+    if inputs.operator_arm:
+        drive = [f"sudo systemctl enable --now {units.RUNNER_UNIT}", _bridge_command("arm", inputs)]
+    return [
+        *prepare,
+        "sudo systemctl daemon-reload",
+        *(f"sudo systemctl {command} {unit}" for unit in firewall for command in ("enable", "restart")),
+        f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
+        *drive,
+    ]
+
+
+def _bridge_command(word: str, inputs: units.ServiceInputs) -> str:
+    bridge, robot = shlex.quote(str(inputs.programs / "edge-bridge")), shlex.quote(str(inputs.robot))
+    return f"sudo {bridge} {word} --robot {robot} --socket {units.SOCKET}"
+
+
+def _home_of(path: Path) -> str:
+    folders = {".conf": SYSTEM_USERS, ".nft": SYSTEM_RULES}
+    return f"/{folders.get(path.suffix, SYSTEM_UNITS) / path.name}"

@@ -1,0 +1,407 @@
+"""systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
+
+Two services of two users. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
+without end and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot.
+systemd restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that
+keeps the promise in milliseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Network, collapse_addresses
+from pathlib import Path
+from typing import Final
+
+from edge.artifacts.trust import STATE_DIRECTORY
+from edge.core.device import CUDA, OPENVINO, TENSORRT
+from edge.deploy import firewall
+from edge.deploy.service_users import ServiceUsers
+from edge.deploy.unit_text import Setting, UnitError, argument, bound, render, word
+from firmware_bridge.core.config import BRIDGE_PRIORITY
+
+BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
+RUNNER_UNIT: Final = "tic-vla-edge-runner.service"
+FIREWALL_UNIT: Final = "tic-vla-edge-firewall.service"
+FIREWALL_FILE: Final = "tic-vla-edge.nft"
+FIREWALL_FOLDER: Final = Path("/etc/tic-vla-edge")
+SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
+LATCH: Final = Path("/var/lib/tic-vla-edge-bridge/emergency-stop")
+"""An emergency stop survives a restart of the bridge and of the machine."""
+FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
+"""systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
+RESTART_STEPS_SINCE: Final = 254
+"""First version of systemd with RestartSteps= (its NEWS file)."""
+BRIDGE_MEMORY: Final = "256M"
+RUNNER_MEMORY_SHARE: Final = "75%"
+"""Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
+WIDEST_PREFIX: Final = 16
+"""Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
+HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+"""Folders that a hardened service does not see: what it needs from there is shown to it, nothing else."""
+
+_COMPILES: Final = (CUDA, TENSORRT, OPENVINO)
+NEED_DEVICES: Final = (CUDA, TENSORRT)
+"""Providers that compute on something other than the processor."""
+
+
+@dataclass(frozen=True)
+class ServiceInputs:
+    """All that the units depend on; paths absolute."""
+
+    programs: Path
+    """Folder of `edge-bridge` and `edge-run`."""
+    python: Path
+    """The interpreter that they run in."""
+    prefixes: tuple[Path, ...]
+    """Folders that Python itself and its packages are read from."""
+    robot: Path
+    robot_files: tuple[Path, ...]
+    """Files that the robot file names."""
+    artifacts: Path
+    engines: Path | None
+    trust: Path | None
+    """Public key that has to have signed the artifacts."""
+    instruction: str
+    users: ServiceUsers
+    interface: str
+    """The robot file's; "lo": the robot is simulated on this machine, no network has to be up and none is filtered."""
+    domain: int
+    """DDS domain."""
+    networks: tuple[IPv4Network, ...]
+    """Where the robot is."""
+    own: tuple[IPv4Network, ...]
+    """This machine's addresses on that interface: by them the bridge notices requests of other programs here."""
+    nft: Path | None
+    """Program that loads the firewall; None: this machine has none."""
+    providers: tuple[str, ...]
+    """ONNX Runtime's execution providers that the graphs use."""
+    devices: tuple[Path, ...]
+    """Device nodes that those need, as found on the machine."""
+    groups: tuple[str, ...]
+    """Groups that may open them."""
+    memory_bytes: int | None
+    """Memory that the runner may take; None: the target knows its graphics card's only, and a share of the machine's
+    is taken."""
+    control_priority: int
+    operator_arm: bool
+    """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
+    bridge_cores: tuple[int, ...]
+    """Cores that the target leaves to neither of the runner's threads; empty: any."""
+    systemd: int | None
+    """Version of the machine's systemd; None: unknown, and only keys that version 249 knows are written."""
+
+    def __post_init__(self) -> None:
+        for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
+            if not getattr(self, name).is_absolute():
+                raise UnitError(f"{name} {getattr(self, name)}: expected an absolute path")
+        for program in (self.programs, self.python):
+            if not set(str(program)) & set("'\"\\"):
+                continue
+            raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
+        if not self.networks:
+            raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
+        for network in collapse_addresses(self.networks):
+            check_network(network, "networks")
+        if (self.memory_bytes is not None and self.memory_bytes <= 0) or not 0 <= self.control_priority <= 99:
+            raise UnitError(
+                f"memory {self.memory_bytes} bytes, priority {self.control_priority}: expected > 0, 0 to 99"
+            )
+        if self.control_priority >= BRIDGE_PRIORITY:
+            raise UnitError(
+                f"the target's control_priority {self.control_priority} must be below the bridge's {BRIDGE_PRIORITY}: "
+                f"export again with --set runtime.control_priority=50"
+            )
+
+    @property
+    def over_loopback(self) -> bool:
+        """The robot is simulated on this machine."""
+        return self.interface == "lo"
+
+
+def check_network(network: IPv4Network, source: str) -> None:
+    """Raise UnitError for a network so wide that the filter would mean nothing; loopback never leaves the machine."""
+    if network.prefixlen < WIDEST_PREFIX and not network.is_loopback:
+        raise UnitError(
+            f"{source}: {network} has {network.num_addresses} addresses, expected a prefix of /{WIDEST_PREFIX} or "
+            f"longer: give the robot's own network with --network, e.g. 192.168.123.0/24"
+        )
+
+
+def bridge_unit(inputs: ServiceInputs) -> str:
+    """Text of the bridge's unit."""
+    users = inputs.users
+    command = [word(str(inputs.programs / "edge-bridge"))]
+    options = ("--robot", str(inputs.robot), "--socket", str(SOCKET), "--latch", str(LATCH))
+    groups = ("--runner-group", users.runner, "--operator-group", users.operators)
+    command += [argument(text) for text in (*options, *groups)]
+    service: list[Setting | str] = [
+        ("Type", "notify"),
+        ("NotifyAccess", "main"),
+        ("ExecStart", " ".join(command)),
+        ("User", users.bridge),
+        "It gives its sockets to these groups; the runner is not in the second, so it can take back no emergency stop.",
+        ("SupplementaryGroups", f"{users.runner} {users.operators}"),
+        *_ending(watchdog_s=1, start_s=20, stop_s=2),
+        "Always, also after a clean exit: without it the robot has nobody that can stop it.",
+        ("Restart", "always"),
+        *_back_off(inputs.systemd),
+        "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
+        ("CPUSchedulingPolicy", "fifo"),
+        ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
+        *_cores(inputs.bridge_cores),
+        ("LimitRTPRIO", str(BRIDGE_PRIORITY)),
+        "A loop that spins: killed after this much computing without a pause (start-up takes less).",
+        ("LimitRTTIME", "5s"),
+        "This limit counts addresses, of which Python and DDS reserve far more than they use; MemoryMax counts pages.",
+        ("LimitMEMLOCK", "infinity"),
+        ("OOMScoreAdjust", "-900"),
+        ("MemoryMax", BRIDGE_MEMORY),
+        ("MemorySwapMax", "0"),
+        ("TasksMax", "64"),
+        ("RuntimeDirectory", SOCKET.parent.name),
+        "Other users pass through to the sockets, whose modes decide, and write nothing here: clients rely on that.",
+        ("RuntimeDirectoryMode", "0711"),
+        ("RuntimeDirectoryPreserve", "restart"),
+        "Keeps an emergency stop over restarts and reboots until a person ends it.",
+        ("StateDirectory", LATCH.parent.name),
+        ("StateDirectoryMode", "0700"),
+        *_hardening(inputs, (inputs.robot, *inputs.robot_files)),
+        ("PrivateDevices", "yes"),
+        ("ProcSubset", "pid"),
+        ("MemoryDenyWriteExecute", "yes"),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged @resources"),
+        "For the groups of its sockets; no PrivateUsers, in which those groups do not exist.",
+        ("SystemCallFilter", "chown fchownat"),
+    ]
+    unit: list[Setting | str] = [
+        ("Description", "tic-vla-edge bridge: the only process that commands the robot"),
+        "Ordered after no network: the bridge itself waits for its interface, and takes an emergency stop meanwhile.",
+        "No limit of starts: a robot must not be left without a bridge.",
+        ("StartLimitIntervalSec", "0"),
+        *_behind_firewall(inputs),
+    ]
+    return _render("bridge", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def runner_unit(inputs: ServiceInputs) -> str:
+    """Text of the runner's unit."""
+    engines = () if inputs.engines is None else ("--engines", str(inputs.engines))
+    paths = ("--artifacts", str(inputs.artifacts), *engines, "--robot", str(inputs.robot), "--socket", str(SOCKET))
+    command = [word(str(inputs.programs / "edge-run")), *(argument(text) for text in paths)]
+    # One word with its text, so that a text that begins with a dash is no option.
+    command.append(argument(f"--instruction={inputs.instruction}"))
+    command += [argument("--record"), FLIGHT_LOG]
+    if inputs.trust is not None:
+        # The newest release that was run is remembered where the service may write.
+        command += [argument(text) for text in ("--trust", str(inputs.trust), "--state", str(STATE_DIRECTORY))]
+    cleaning = ("-I", "-m", "edge.flightlog.cleanup", str(STATE_DIRECTORY))
+    optional = tuple(path for path in (inputs.engines, inputs.trust) if path is not None)
+    needed = (inputs.robot, *inputs.robot_files, inputs.artifacts, *optional)
+    arms = "--arm-at-start was given: this stands the robot up and drives by itself whenever it starts."
+    if inputs.operator_arm:
+        arms = "Stands the robot up and drives after `edge-bridge arm` only, once for each; until then it waits."
+    service: list[Setting | str] = [
+        ("Type", "notify"),
+        ("NotifyAccess", "main"),
+        "A recording bounds itself, all of them together do not: the oldest are deleted; starting does not hang on it.",
+        ("ExecStartPre", "-" + " ".join([word(str(inputs.python)), *(argument(text) for text in cleaning)])),
+        arms,
+        ("ExecStart", " ".join(command)),
+        ("User", inputs.users.runner),
+        "ONNX Runtime 1.29 and later keeps a device id and reports to its maker, unless told not to before it starts.",
+        ("Environment", "ORT_DISABLE_TELEMETRY=1"),
+        *_ending(watchdog_s=3, start_s=180, stop_s=10),
+        *_starting_again(inputs),
+        "The control thread asks for real time by itself; the rest of the process stays ordinary.",
+        ("LimitRTPRIO", str(inputs.control_priority)),
+        ("LimitMEMLOCK", "infinity"),
+        "Dies first, and never makes the bridge wait for memory.",
+        ("OOMScoreAdjust", "500"),
+        ("OOMPolicy", "kill"),
+        ("MemoryMax", RUNNER_MEMORY_SHARE if inputs.memory_bytes is None else str(inputs.memory_bytes)),
+        ("MemorySwapMax", "0"),
+        ("TasksMax", "512"),
+        ("StateDirectory", STATE_DIRECTORY.name),
+        ("StateDirectoryMode", "0700"),
+        *_hardening(inputs, needed),
+        *_accelerator(inputs),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged"),
+    ]
+    unit = [
+        ("Description", "tic-vla-edge runner: drives the robot by its instruction"),
+        "Wants and not Requires: a bridge that restarts must not start the robot again by restarting the runner, whose",
+        "connection ends with the old bridge. After: at shutdown the runner stops first.",
+        ("Wants", BRIDGE_UNIT),
+        ("After", BRIDGE_UNIT),
+        *_network(inputs),
+        *_behind_firewall(inputs),
+        # A start that fails slowly must be counted too, so the window holds several of the longest starts.
+        *_restarts(900),
+    ]
+    return _render("runner", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
+    if not inputs.operator_arm:
+        return [
+            "A runner that arms by itself would drive on after a crash, before anybody has looked at the robot.",
+            ("Restart", "no"),
+        ]
+    return [
+        "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
+        "nobody but the operator starts the robot again after it.",
+        ("Restart", "on-abnormal"),
+        ("RestartSec", "2s"),
+    ]
+
+
+def firewall_unit(inputs: ServiceInputs) -> str:
+    """Text of the unit that loads the firewall's file at boot. Raises UnitError without a program that loads it."""
+    if inputs.nft is None:
+        raise UnitError("no program loads the firewall: install nftables")
+    nft, file = word(str(inputs.nft)), argument(str(FIREWALL_FOLDER / FIREWALL_FILE))
+    service: list[Setting | str] = [
+        ("Type", "oneshot"),
+        ("RemainAfterExit", "yes"),
+        ("ExecStart", f"{nft} -f {file}"),
+        ("ExecReload", f"{nft} -f {file}"),
+        ("ExecStop", f"{nft} delete table inet {firewall.TABLE}"),
+        ("IPAddressDeny", "any"),
+        ("RestrictAddressFamilies", "AF_NETLINK AF_UNIX"),
+        ("CapabilityBoundingSet", "CAP_NET_ADMIN"),
+        ("PrivateDevices", "yes"),
+        ("ProcSubset", "pid"),
+        ("ProtectHome", "yes"),
+        ("MemoryDenyWriteExecute", "yes"),
+        ("RestrictRealtime", "yes"),
+        *_confinement(),
+        ("SystemCallFilter", "@system-service"),
+        ("SystemCallFilter", "~@privileged @resources"),
+    ]
+    unit: list[Setting | str] = [
+        ("Description", "tic-vla-edge firewall of the robot's cable"),
+        ("Before", f"{BRIDGE_UNIT} {RUNNER_UNIT}"),
+    ]
+    return _render("firewall", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
+
+
+def firewall_rules(inputs: ServiceInputs) -> str:
+    """Text of the nftables file; raises UnitError for an interface without a name."""
+    users = (inputs.users.bridge, inputs.users.runner)
+    return firewall.ruleset(firewall.CableRules(inputs.interface, inputs.networks, inputs.domain, users))
+
+
+def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
+    comment = [f"Made by edge-install units: the {which} of one robot. Write it anew instead of editing it; see also"]
+    return render([*comment, "systemctl edit, which keeps changes of yours apart."], sections)
+
+
+def _network(inputs: ServiceInputs) -> list[Setting | str]:
+    if inputs.over_loopback:
+        return []
+    return [("Wants", "network-online.target"), ("After", "network-online.target")]
+
+
+def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
+    """Wants and not Requires: without its firewall the robot must still have a bridge."""
+    if inputs.over_loopback or inputs.nft is None:
+        return []
+    return [("Wants", FIREWALL_UNIT), ("After", FIREWALL_UNIT)]
+
+
+def _back_off(systemd: int | None) -> list[Setting | str]:
+    """Delays between restarts of the bridge: short after a crash, longer while something persistent is wrong."""
+    if systemd is None or systemd < RESTART_STEPS_SINCE:
+        return [("RestartSec", "1s")]
+    return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
+
+
+def _restarts(window_s: int) -> list[Setting | str]:
+    return [("StartLimitIntervalSec", str(window_s)), ("StartLimitBurst", "5")]
+
+
+def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str]:
+    return [
+        ("TimeoutStartSec", str(start_s)),
+        ("WatchdogSec", str(watchdog_s)),
+        "SIGABRT does not reach a stopped process (systemd issue 1970); nothing is gained by a core dump either.",
+        ("WatchdogSignal", "SIGKILL"),
+        ("TimeoutAbortSec", "1"),
+        ("LimitCORE", "0"),
+        ("KillMode", "mixed"),
+        ("TimeoutStopSec", str(stop_s)),
+    ]
+
+
+def _cores(cores: Sequence[int]) -> list[Setting | str]:
+    return [("CPUAffinity", " ".join(str(core) for core in cores))] if cores else []
+
+
+def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
+    """What both services give up; `needed`: what they read besides Python."""
+    allowed = dict.fromkeys((*inputs.networks, *inputs.own, firewall.MULTICAST))
+    networks = " ".join(str(network) for network in allowed)
+    hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if is_hidden(path)})
+    return [
+        "The robot's network and nothing else: its body is an unauthenticated peer.",
+        ("IPAddressDeny", "any"),
+        ("IPAddressAllow", networks),
+        ("RestrictAddressFamilies", "AF_UNIX AF_INET AF_NETLINK"),
+        ("CapabilityBoundingSet", ""),
+        ("ProtectHome", "tmpfs" if hidden else "yes"),
+        *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
+        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which anybody else could have put there.",
+        *_confinement(),
+    ]
+
+
+def _confinement() -> list[Setting | str]:
+    """What no service of ours needs."""
+    return [
+        ("NoNewPrivileges", "yes"),
+        ("AmbientCapabilities", ""),
+        ("ProtectSystem", "strict"),
+        ("PrivateTmp", "yes"),
+        ("PrivateMounts", "yes"),
+        ("ProtectProc", "invisible"),
+        ("ProtectClock", "yes"),
+        ("ProtectHostname", "yes"),
+        ("ProtectKernelTunables", "yes"),
+        ("ProtectKernelModules", "yes"),
+        ("ProtectKernelLogs", "yes"),
+        ("ProtectControlGroups", "yes"),
+        ("DevicePolicy", "closed"),
+        ("RestrictNamespaces", "yes"),
+        ("RestrictSUIDSGID", "yes"),
+        ("LockPersonality", "yes"),
+        ("RemoveIPC", "yes"),
+        ("KeyringMode", "private"),
+        ("UMask", "0077"),
+        "A call outside the list fails like one without permission, which the program survives.",
+        ("SystemCallErrorNumber", "EPERM"),
+        ("SystemCallArchitectures", "native"),
+    ]
+
+
+def is_hidden(path: Path) -> bool:
+    """Whether a hardened service does not see it unless it is shown to it."""
+    return any(path.is_relative_to(folder) for folder in HIDDEN)
+
+
+def _accelerator(inputs: ServiceInputs) -> list[Setting | str]:
+    """What the graphs' providers need: nothing on a processor, the device's nodes otherwise."""
+    if not set(inputs.providers) & set(_COMPILES):
+        # No PrivateUsers, in which the bridge's user has no number: the runner could not tell it from an impostor.
+        return [("PrivateDevices", "yes"), ("MemoryDenyWriteExecute", "yes")]
+    nodes: list[Setting | str] = [("DeviceAllow", f"{word(str(node))} rw") for node in inputs.devices]
+    if not nodes and set(inputs.providers) & set(NEED_DEVICES):
+        nodes = ["DeviceAllow= is missing: no device of these providers was found where this was written."]
+    return [
+        "These providers compile code at run time and use devices: no PrivateDevices, no MemoryDenyWriteExecute.",
+        *nodes,
+        *((("SupplementaryGroups", " ".join(inputs.groups)),) if inputs.groups else ()),
+    ]

@@ -1,0 +1,122 @@
+"""Clean-up of old flight logs: `python -m edge.flightlog.cleanup FOLDER`, as the runner's service does before every
+start.
+
+A recording bounds itself, but every start makes another. Whole runs are deleted, the oldest first, until the rest fits;
+the newest runs stay whatever they take, so that what happened last can always be looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import stat
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED
+
+KEEP_BYTES: Final = 8 * 1024**3
+"""Two recordings at their own bound (edge.flightlog.recorder); a choice of ours."""
+KEEP_SHARE: Final = 0.25
+"""Of the file system, where that is less."""
+KEEP_RUNS: Final = 2
+_PART: Final = re.compile(r"(flight-[A-Za-z0-9_-]+)(?:\.\d{3,})?\.mcap", re.ASCII)
+
+EXAMPLES = """examples:
+  python -m edge.flightlog.cleanup /var/lib/tic-vla-edge
+  python -m edge.flightlog.cleanup /var/lib/tic-vla-edge --keep-bytes 2000000000
+
+Only files named flight-ID.mcap and flight-ID.NNN.mcap are looked at.
+exit codes: 0 done, 2 bad arguments or a folder that cannot be read or written, 130 interrupted
+"""
+
+
+@dataclass
+class _Run:
+    """Files of one recording."""
+
+    newest_ns: int = 0
+    size: int = 0
+    files: tuple[Path, ...] = ()
+
+
+def runs(folder: Path) -> list[_Run]:
+    """Recordings in a folder, the one written last first; raises OSError."""
+    found: dict[str, _Run] = {}
+    for path in sorted(folder.iterdir()):
+        match, status = _PART.fullmatch(path.name), path.lstat()
+        if match is None or not stat.S_ISREG(status.st_mode):
+            continue
+        run = found.setdefault(match[1], _Run())
+        run.newest_ns = max(run.newest_ns, status.st_mtime_ns)
+        run.size += status.st_size
+        run.files += (path,)
+    return sorted(found.values(), key=lambda run: -run.newest_ns)
+
+
+def clean(folder: Path, keep_bytes: int, keep_runs: int = KEEP_RUNS) -> tuple[list[Path], int]:
+    """Delete what is beyond the total; the files deleted and the bytes left. Raises OSError."""
+    deleted: list[Path] = []
+    left = 0
+    for number, run in enumerate(runs(folder)):
+        # Once one does not fit, none of the older ones is kept in its place.
+        if number < keep_runs or (not deleted and left + run.size <= keep_bytes):
+            left += run.size
+            continue
+        for path in run.files:
+            path.unlink(missing_ok=True)
+            deleted.append(path)
+    return deleted, left
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "edge.flightlog.cleanup",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("folder", type=Path, metavar="FOLDER", help="where the flight logs are")
+    p.add_argument(
+        "--keep-bytes",
+        type=int,
+        default=KEEP_BYTES,
+        metavar="N",
+        help=f"what may stay (default: {KEEP_BYTES}, at most a quarter of the file system)",
+    )
+    return p
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"edge.flightlog.cleanup: {line}\n")
+    sys.stderr.flush()
+
+
+def main(
+    argv: Sequence[str] | None = None, total_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).total
+) -> int:
+    """Entry point; returns the exit code. `total_bytes`: size of the file system that holds a path."""
+    args = parser().parse_args(argv)
+    if args.keep_bytes < 0:
+        _say(f"--keep-bytes {args.keep_bytes}: expected 0 or more")
+        return EXIT_BAD_INPUT
+    try:
+        deleted, left = clean(args.folder, min(args.keep_bytes, round(KEEP_SHARE * total_bytes(args.folder))))
+    except OSError as error:
+        _say(f"{error.filename or args.folder}: {error.strerror or error}; expected a folder whose logs may be deleted")
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        _say("interrupted")
+        return EXIT_INTERRUPTED
+    if deleted:
+        _say(f"{len(deleted)} files of old runs deleted, the first {deleted[0].name}; {left / 2**20:.0f} MiB stay")
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,318 @@
+"""Flight recorder: what the runner saw, decided and commanded, as MCAP files written by a thread of its own.
+
+The control thread must never wait for a disk. `Recorder.put` therefore only appends to a bounded queue, without a lock
+(a writer thread that the scheduler has put aside would keep it); everything that can be slow or can fail — JSON,
+compression, write, fsync — happens in the writer thread. What the queue cannot hold is dropped and counted by topic.
+
+On disk a recording is bounded too. It is written in parts (`flight.mcap`, `flight.002.mcap`, …), each a whole MCAP that
+begins with the `/run` record; beyond `total_bytes` the oldest part but the first is deleted, so that how the run began
+and how it ended are kept. While the file system has less than `free_bytes` left nothing is written (`error` says so)
+and what comes is dropped and counted; a write error ends the recording.
+
+A chunk is closed and handed to the device at least once a second, so a process killed in the middle loses at most the
+last second (read such a file with `edge.flightlog.reader.read_messages`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edge.flightlog.part import LogPart, PartFile, Payload, encode
+from edge.flightlog.reader import part_path, parts
+
+ARMING_FREE_SHARE = 0.07
+"""Fault matrix row 51: a robot that records is not armed with less of its file system free (openpilot's figure)."""
+_FLUSH_PERIOD_NS = 900_000_000  # below one second even when a pass of the loop is late
+_POLL_S = 0.05  # the writer looks by itself, so that a caller never pays for waking it
+_PART_AGE_NS = 300 * 1_000_000_000
+"""The index of a part is kept in memory until it is finished, 1 KiB a second: what five minutes take is used again."""
+_NICENESS = 10
+_RESUME = 1.25
+"""A paused recording goes on once there is this many times the floor: not on and off with every flush."""
+_RUN_TOPIC = "/run"
+
+_Item = tuple[str, int, Payload]
+
+
+@dataclass(frozen=True)
+class RecorderLimits:
+    """What a recording may take of memory and disk."""
+
+    records: int = 4096
+    """Queue length: more than a minute of everything that a run records."""
+    picture_bytes: int = 64 * 1024 * 1024
+    """Pictures in the queue."""
+    part_bytes: int = 256 * 1024 * 1024
+    total_bytes: int = 4 * 1024 * 1024 * 1024
+    free_bytes: int = 512 * 1024 * 1024
+    """What is left free for everything else on that file system."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1 and name != "free_bytes":
+                raise ValueError(f"recorder limit {name} must be positive, found {value}")
+        if self.free_bytes < 0:
+            raise ValueError(f"recorder limit free_bytes must be 0 or more, found {self.free_bytes}")
+        if self.total_bytes < 3 * self.part_bytes:
+            raise ValueError(
+                f"recorder limit total_bytes {self.total_bytes}: expected at least three parts of {self.part_bytes}, "
+                "the first, the one being written and the one before it"
+            )
+
+
+class Recorder:
+    """Write records to MCAP files without ever making the caller wait.
+
+    A path that cannot be opened is reported in `error`, not raised: the caller decides whether a run without a
+    recording may start. Each topic is put by one thread at a time (otherwise counts of drops may be one short), and
+    pictures by one thread.
+    """
+
+    def __init__(self, path: str | Path, limits: RecorderLimits | None = None) -> None:
+        self.path = Path(path)
+        self._limits = limits or RecorderLimits()
+        self._queue: deque[_Item] = deque()
+        self._refused: dict[str, int] = {}  # by `put`
+        self._picture_bytes_in = 0  # by `put`
+        self._picture_bytes_out = 0
+        self._ended = False
+        # Between the writer and whoever asks how it goes; `put` never takes it.
+        self._lock = threading.Lock()
+        self._lost: Counter[str] = Counter()
+        self._unsaved: Counter[str] = Counter()  # taken from the queue since the last flush
+        self._error: str | None = None
+        self._paused: str | None = None
+        self._closing = threading.Event()
+        self._run_item: _Item | None = None
+        self._finished: list[tuple[Path, int]] = []
+        self._discarded = 0
+        self._number = 1
+        self._part: LogPart | None = None
+        file: PartFile | None = None
+        try:
+            if len(parts(self.path)) > 1:
+                raise FileExistsError(errno.EEXIST, f"{parts(self.path)[-1].name} of another recording lies beside it")
+            file = PartFile(self.path, new=False)
+        except OSError as error:
+            self._ended = True
+            self._error = f"cannot open {self.path} for recording: {error.strerror or error}"
+        # A daemon: a disk that hangs for good must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, args=(file,), name="recorder", daemon=True)
+        if file is not None:
+            self._thread.start()
+
+    @property
+    def error(self) -> str | None:
+        """Why nothing is written (any more, or just now), in one line, or None while it works."""
+        with self._lock:
+            return self._error or self._paused
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Records per topic that were given to `put` and are not known to be on disk.
+
+        While `error` is None that is what was refused or could not be encoded. An error adds what was queued and
+        what was written since the last flush, of which the file may still hold a part: never fewer than are missing.
+        """
+        with self._lock:
+            counts = Counter(self._refused.copy()) + self._lost
+            # A record that `put` was adding while the recording ended will not be written.
+            left = self._queue.copy() if self._ended and not self._thread.is_alive() else ()
+        counts.update(topic for topic, _, _ in left)
+        return dict(counts)
+
+    def statistics(self) -> dict[str, Any]:
+        """For a run's result: what was dropped and why, and what lies on disk."""
+        part = self._part
+        with self._lock:
+            written = sum(size for _, size in self._finished) + (0 if part is None else part.file.length)
+            found = {"error": self._error or self._paused, "bytes": written, "discarded_parts": self._discarded}
+        return {"dropped": self.dropped, **found, "parts": [str(path) for path in parts(self.path)]}
+
+    def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
+        """Queue one record; never blocks, never raises, encodes nothing.
+
+        `payload` is a mapping that JSON can hold (numpy values allowed) and that nobody changes afterwards, or
+        the bytes of a JPEG, which become a `foxglove.CompressedImage`.
+        """
+        size = len(payload) if isinstance(payload, bytes) else 0
+        limits = self._limits
+        full = len(self._queue) >= limits.records or (
+            size > 0 and self._picture_bytes_in + size - self._picture_bytes_out > limits.picture_bytes
+        )
+        if full or self._ended:
+            self._refused[topic] = self._refused.get(topic, 0) + 1
+            return
+        if size:
+            self._picture_bytes_in += size
+        self._queue.append((topic, stamp_ns, payload))
+
+    def close(self, timeout_s: float = 5.0) -> bool:
+        """Write what is queued, finish the file and return whether all of it is on disk in time."""
+        self._ended = True
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+            if self._thread.is_alive():
+                self._fail(f"{self.path} was not finished within {timeout_s:g} s; its last second may be missing")
+        return self.error is None
+
+    def _take(self) -> _Item | None:
+        with self._lock:
+            try:
+                item = self._queue.popleft()
+            except IndexError:
+                return None
+            if isinstance(item[2], bytes):
+                self._picture_bytes_out += len(item[2])
+            self._unsaved[item[0]] += 1
+            return item
+
+    def _fail(self, message: str) -> None:
+        self._ended = True
+        while self._take() is not None:
+            pass
+        with self._lock:
+            self._error = self._error or message
+            self._lost.update(self._unsaved)
+            self._unsaved.clear()
+
+    def _drop_taken(self, topic: str) -> None:
+        with self._lock:
+            if self._unsaved[topic] > 0:  # otherwise _fail has counted it
+                self._unsaved[topic] -= 1
+                self._lost[topic] += 1
+
+    def _all_saved(self) -> None:
+        with self._lock:
+            self._unsaved.clear()
+
+    def _run(self, file: PartFile) -> None:
+        with contextlib.suppress(OSError):
+            # Linux niceness is per thread: whoever drives the robot gets the core first.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        try:
+            self._write_all(self._begin(file))
+        except Exception as error:  # noqa: BLE001 - a thread that ends must always say why in `error`
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            self._fail(f"recording to {self.path} stopped: {reason or type(error).__name__}")
+        finally:
+            if self._part is not None:
+                self._part.file.close()
+
+    def _begin(self, file: PartFile) -> LogPart:
+        try:
+            self._part = LogPart(file, self._number)
+        except OSError:
+            file.close()
+            raise
+        self._part.flush()
+        return self._part
+
+    def _write_all(self, part: LogPart) -> None:
+        self._look_at_space()
+        begun_ns = flushed_ns = time.monotonic_ns()
+        while True:
+            # Asked before the queue is emptied: whatever was put before close() is then written.
+            closing = self._closing.is_set()
+            while (item := self._take()) is not None:
+                self._write(part, item)
+                if part.file.length >= self._limits.part_bytes:
+                    part, begun_ns = self._next_part(part), time.monotonic_ns()
+                if time.monotonic_ns() - flushed_ns >= _FLUSH_PERIOD_NS:
+                    break
+            now_ns = time.monotonic_ns()
+            if now_ns - flushed_ns >= _FLUSH_PERIOD_NS:
+                part.flush()
+                if part.file.removed:
+                    raise OSError("the file was removed while recording")
+                self._all_saved()
+                self._look_at_space()
+                flushed_ns = now_ns
+                if now_ns - begun_ns >= _PART_AGE_NS:
+                    part, begun_ns = self._next_part(part), now_ns
+            if closing and not self._queue:
+                part.finish()
+                self._all_saved()
+                return
+            if not self._queue:
+                self._closing.wait(_POLL_S)
+
+    def _write(self, part: LogPart, item: _Item) -> None:
+        topic, stamp_ns, payload = item
+        try:
+            if topic == _RUN_TOPIC:
+                encode(payload, stamp_ns)  # it is kept to begin every part with, so it must be sound
+                self._run_item = item
+            if self._paused is not None:
+                self._drop_taken(topic)
+                return
+            if self._run_item is not None and self._run_item is not item and not part.has(_RUN_TOPIC):
+                part.add(*self._run_item)
+            part.add(*item)
+        except (TypeError, ValueError, RecursionError):
+            # One record JSON cannot hold must not end the recording of all others.
+            self._drop_taken(topic)
+
+    def _next_part(self, part: LogPart) -> LogPart:
+        part.finish()
+        part.file.close()
+        self._all_saved()
+        with self._lock:
+            self._finished.append((part_path(self.path, self._number), part.file.length))
+            self._part = None
+        while self._limits.part_bytes + sum(size for _, size in self._finished) > self._limits.total_bytes:
+            oldest, _ = self._finished[1]
+            oldest.unlink(missing_ok=True)
+            with self._lock:
+                self._finished.pop(1)
+                self._discarded += 1
+        self._number += 1
+        return self._begin(PartFile(part_path(self.path, self._number), new=True))
+
+    def _look_at_space(self) -> None:
+        """Pause below the floor; go on once there is clearly more."""
+        floor = self._limits.free_bytes
+        free = _free(self.path)
+        if free is None or free[0] >= floor * (_RESUME if self._paused else 1):
+            paused = None
+        else:
+            paused = (
+                f"recording to {self.path} is paused: {free[0] / 2**20:.0f} MiB are free, "
+                f"{floor / 2**20:.0f} MiB are left to others; delete old logs"
+            )
+        with self._lock:
+            self._paused = paused
+
+
+def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | None:
+    """Why a robot that is to record to `path` must not be armed (fault matrix row 51); None: it may."""
+    free = _free(path)
+    if free is None:
+        return None
+    floor = max((limits or RecorderLimits()).free_bytes, round(ARMING_FREE_SHARE * free[1]))
+    if free[0] >= floor:
+        return None
+    return (
+        f"{free[0] / 2**20:.0f} MiB of its file system are free, recording needs {floor / 2**20:.0f} MiB "
+        f"({ARMING_FREE_SHARE:.0%} of it, and what is left to others); delete old logs or record elsewhere"
+    )
+
+
+def _free(path: Path) -> tuple[int, int] | None:
+    """Bytes free to us, and in all, of the file system that holds `path`; None where nobody knows."""
+    try:
+        found = os.statvfs(path.parent)
+    except OSError:
+        return None
+    if found.f_blocks == 0:
+        return None
+    return found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize

@@ -1,0 +1,1 @@
+"""`edge-replay`: runs the policy again on a flight log and compares the outputs with the recorded ones."""

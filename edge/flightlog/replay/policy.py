@@ -1,0 +1,246 @@
+"""Run the policy again on what a flight log says it was given, and measure how far its outputs lie apart."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.flightlog.replay.records import Event, RecordedFrame, RecordedGeneration, RecordedRun, RecordedTick, Rows
+from edge.inference.graph import GraphError
+from edge.inference.language import ContextOverflowError, LanguageModel
+from edge.inference.policy import Policy
+from edge.motion.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
+from edge.motion.standstill_recovery import TURNING
+from edge.motion.stuck_recovery import BACKING_OFF
+from edge.reasoning.path_memory import Way, way_of
+from edge.run.camera import decode_frame
+from edge.state.pose_history import PoseHistory, StampedPose
+from edge.state.reasoning_text import parse_waypoints
+from edge.state.ring import EncodedFrame
+from edge.state.semantic import SemanticState
+from firmware_bridge.unitree.client import CameraError
+
+FRAMES_KEPT_NS = 120_000_000_000
+"""How long a picture is kept for a generation that names it: its 9 s of past, its own time, and a release delay."""
+_ANY_AGE_MS = 1.0
+"""Ages are not judged again: the log says which ticks were held."""
+
+Floats = npt.NDArray[np.float32]
+_Result = TypeVar("_Result")
+
+
+_GENERATIONS_KEPT = 3
+"""A tick that was reading the old semantic state while the new one was published comes after it in the log."""
+
+
+class _SkippedError(Exception):
+    """Something that a record refers to is not in the log; the reason in a few words."""
+
+
+@dataclass
+class _Thought:
+    """A generation of the log with its pictures, run when a tick first needs it."""
+
+    record: RecordedGeneration
+    pictures: dict[int, bytes]
+    state: SemanticState | None = None
+
+
+@dataclass
+class Comparison:
+    """What was run again, and how far it lies from the log."""
+
+    driven: int = 0
+    """Ticks that had a plan, each of which could be run again if the log held all that it was made from."""
+    ticks: int = 0
+    ticks_equal: int = 0
+    """Plans that are the same bit for bit."""
+    generations: int = 0
+    texts_equal: int = 0
+    different_texts: list[int] = field(default_factory=list)
+    """Numbers of the generations whose text differs."""
+    poses_interpolated: int = 0
+    """Generations whose frames' poses had to be taken from the ticks around them."""
+    ways_from_frames: int = 0
+    """Generations of a log that does not say which way the prompt told: it is told through their frames alone."""
+    skipped: Counter[str] = field(default_factory=Counter)
+    trajectory_cm: list[float] = field(default_factory=list)
+    heading_deg: list[float] = field(default_factory=list)
+    command: list[float] = field(default_factory=list)
+    """Largest difference of a command's components, in m/s and rad/s."""
+    worst_tick: int | None = None
+    """The one whose plan lies farthest apart; None while all are equal."""
+
+
+class Replayer:
+    """Takes a log's events in order; `comparison` is what came of those within [from_ns, to_ns]."""
+
+    def __init__(
+        self,
+        artifacts: Artifacts,
+        policy: Policy,
+        language: LanguageModel,
+        run: RecordedRun,
+        *,
+        from_ns: int,
+        to_ns: int,
+    ) -> None:
+        self._image_px = artifacts.runtime.image_px
+        self._step_s = artifacts.runtime.step_s
+        self._policy = policy
+        self._language = language
+        self._run = run
+        self._from_ns, self._to_ns = from_ns, to_ns
+        self._frames: OrderedDict[int, bytes] = OrderedDict()
+        self._encoded: tuple[int, Floats] | None = None
+        self._poses = PoseHistory()
+        self._thoughts: OrderedDict[int, _Thought] = OrderedDict()
+        self._controller: Controller | None = None
+        if run.limits is not None:
+            config = ControllerConfig(run.limits, self._step_s, _ANY_AGE_MS, _ANY_AGE_MS)
+            self._controller = Controller(config)
+        self._command_known = False
+        self._worst_cm = 0.0
+        self.comparison = Comparison()
+
+    def step(self, event: Event) -> None:
+        """Run one event again; what the log lacks for it is counted as skipped."""
+        if isinstance(event, RecordedFrame):
+            self._frames[event.stamp_ns] = event.jpeg
+            while next(iter(self._frames)) < event.stamp_ns - FRAMES_KEPT_NS:
+                self._frames.popitem(last=False)
+        elif isinstance(event, RecordedGeneration):
+            pictures = {stamp_ns: self._frames[stamp_ns] for stamp_ns in event.frames_ns if stamp_ns in self._frames}
+            thought = self._thoughts[event.number] = _Thought(event, pictures)
+            while len(self._thoughts) > _GENERATIONS_KEPT:
+                self._thoughts.popitem(last=False)
+            if self._from_ns <= event.ready_ns <= self._to_ns:
+                self._counting_skips(lambda: self._think(thought))
+        else:
+            if event.pose is not None:
+                self._poses.put(StampedPose(event.now_ns, event.pose, *event.state))
+            if self._from_ns <= event.now_ns <= self._to_ns:
+                self.comparison.driven += event.rows is not None
+                self._compare_command(event, self._counting_skips(lambda: self._act(event)))
+
+    def _counting_skips(self, work: Callable[[], _Result]) -> _Result | None:
+        try:
+            return work()
+        except _SkippedError as reason:
+            self.comparison.skipped[str(reason)] += 1
+        except (GraphError, ContextOverflowError) as error:
+            self.comparison.skipped[f"these artifacts fail on it ({error})"] += 1
+        except CameraError:
+            self.comparison.skipped["its picture cannot be decoded"] += 1
+        return None
+
+    def _think(self, thought: _Thought) -> SemanticState:
+        """The semantic state of a generation, run once; its text is compared then."""
+        if thought.state is not None:
+            return thought.state
+        record, found = thought.record, self.comparison
+        missing = [stamp_ns for stamp_ns in record.frames_ns if stamp_ns not in thought.pictures]
+        if missing:
+            raise _SkippedError("a picture of its generation is not in the log")
+        frames = [
+            EncodedFrame(stamp_ns, pose, self._policy.encode(decode_frame(thought.pictures[stamp_ns], self._image_px)))
+            for stamp_ns, pose in zip(record.frames_ns, self._frame_poses(record), strict=True)
+        ]
+        generation = self._language.generate(
+            self._language.prompt.build(
+                frames, record.instruction or self._run.instruction, self._way(record, frames), record.known.before
+            ),
+            max_new_tokens=record.max_new_tokens,
+            cancelled=lambda: False,
+            guide=self._language.guide(record.known),
+        )
+        found.generations += 1
+        found.poses_interpolated += record.poses is None
+        found.ways_from_frames += record.way is None
+        if generation.text == record.text:
+            found.texts_equal += 1
+        else:
+            found.different_texts.append(record.number)
+        thought.state = SemanticState(
+            generation=record.number,
+            anchor_ns=frames[-1].stamp_ns,
+            T_odom_anchor=record.anchor_pose,
+            ready_ns=record.ready_ns,
+            last_layer_kv=generation.last_layer_kv,
+            context=self._policy.semantic_context(generation.last_layer_kv),
+            text=generation.text,
+            waypoints=parse_waypoints(generation.text),
+        )
+        return thought.state
+
+    def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
+        """As it was told; of a log that does not say, through the frames alone."""
+        if record.way is not None:
+            return record.way
+        return way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
+
+    def _frame_poses(self, record: RecordedGeneration) -> Sequence[SE2]:
+        if record.poses is not None:
+            return record.poses
+        poses = [self._poses.at(stamp_ns) for stamp_ns in record.frames_ns[:-1]]
+        return [*(pose or record.anchor_pose for pose in poses), record.anchor_pose]
+
+    def _act(self, tick: RecordedTick) -> Floats | None:
+        """The whole plan of a tick; None when it had none."""
+        if tick.rows is None or tick.generation is None or tick.frame_ns is None:
+            return None
+        if tick.frame_ns not in self._frames:
+            raise _SkippedError("its picture is not in the log")
+        if tick.generation not in self._thoughts:
+            raise _SkippedError("its generation is not in the log")
+        semantic = self._think(self._thoughts[tick.generation])
+        if self._encoded is None or self._encoded[0] != tick.frame_ns:
+            picture = decode_frame(self._frames[tick.frame_ns], self._image_px)
+            self._encoded = tick.frame_ns, self._policy.encode(picture)
+        trajectory = self._policy.act(self._encoded[1], tick.state, tick.delay_s, tick.offset, semantic)
+        every = max(1, round(TARGET_TIME_S / self._step_s))
+        rows = trajectory[every - 1 :: every].astype(np.float64)
+        if rows.shape != tick.rows.shape:
+            raise _SkippedError("its plan has another length")
+        self._compare_rows(tick, rows)
+        return trajectory
+
+    def _compare_rows(self, tick: RecordedTick, rows: Rows) -> None:
+        assert tick.rows is not None
+        found = self.comparison
+        found.ticks += 1
+        # null in the log stands for whatever is not finite; on one side only, it is infinitely far from the other.
+        here, there = (np.where(np.isfinite(plan), plan, np.nan) for plan in (rows, tick.rows))
+        found.ticks_equal += np.array_equal(here, there, equal_nan=True)
+        apart = np.where(np.isnan(here) & np.isnan(there), 0.0, np.nan_to_num(here - there, nan=np.inf))
+        distance_cm = float(np.hypot(apart[:, 0], apart[:, 1]).max()) * 100
+        turn = np.abs(apart[:, 2])
+        finite = np.isfinite(turn)
+        turn[finite] = np.abs((turn[finite] + np.pi) % (2 * np.pi) - np.pi)
+        if distance_cm > self._worst_cm:
+            self._worst_cm, found.worst_tick = distance_cm, tick.number
+        found.trajectory_cm.append(distance_cm)
+        found.heading_deg.append(float(np.degrees(turn.max())))
+
+    def _compare_command(self, tick: RecordedTick, trajectory: Floats | None) -> None:
+        """Run the controller again; its speed is known from the first tick on at which it had to stand."""
+        if self._controller is None:
+            return
+        hold = None if tick.reason == "ok" else tick.reason
+        if hold is None and trajectory is None:
+            self._command_known = False
+            return
+        inputs = ControllerInputs(trajectory, 0.0, 0.0, speed_scale=tick.speed_scale, hold=hold)
+        command = self._controller.step(inputs, tick.acted_ns)
+        self._command_known = self._command_known or hold is not None
+        # A way back, or a turn to what was said, is of what odometry saw meanwhile, not of the plan.
+        if self._command_known and tick.reason not in (BACKING_OFF, TURNING):
+            apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
+            self.comparison.command.append(float(np.abs(apart).max()))

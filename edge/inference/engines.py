@@ -1,0 +1,362 @@
+"""Engines of TensorRT and OpenVINO: built ahead of time on the device, checked before control starts.
+
+A provider that compiles would otherwise do so at the first run, for minutes and without a word. Here every graph that
+needs an engine gets one in a folder of its own; `engines.json` says what it depends on and the hash of each file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from edge.artifacts.files import HASH_BLOCK_BYTES, ArtifactError, FileIdentity, read_manifest
+from edge.artifacts.manifest import Artifacts, TensorContract
+from edge.core.cli import write_whole
+from edge.core.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
+from edge.inference.graph import DTYPES, Array, Graph, GraphError
+
+ENGINES_NAME = "engines.json"
+SCHEMA = 1
+MAX_BYTES = 4_000_000
+BUSY_LINE_S = 15.0
+TIMING_SUFFIX = ".timing"
+PROFILES = ("min", "opt", "max")
+CONTEXT_AXIS = "T"
+"""Free axis along which a semantic state grows, up to the model's context."""
+_CACHE_OPTIONS = {
+    TENSORRT: ("trt_engine_cache_path", "trt_timing_cache_path"),
+    OPENVINO: ("cache_dir",),
+}
+
+Progress = Callable[[str], None]
+
+
+class EngineError(ValueError):
+    """An engine that is missing, is another device's, or cannot be built; its text is the one line to show."""
+
+
+class Runnable(Protocol):
+    """An opened graph."""
+
+    def run(self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None) -> list[Array]:
+        """Outputs for named inputs."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """The device and ONNX Runtime as this module meets them; tests give others."""
+
+    facts: Callable[[str], DeviceFacts] = read_device
+    providers: Callable[[], list[str]] = available_providers
+    open_graph: Callable[[Artifacts, str], Runnable] = Graph
+    now_ns: Callable[[], int] = time.monotonic_ns
+
+
+@dataclass(frozen=True)
+class VerifiedEngines:
+    """Engine files as they were before their hashes were compared; empty where no graph needs an engine."""
+
+    identities: Mapping[Path, Mapping[str, FileIdentity]]
+    """Files of each engine's folder."""
+
+    def check_unchanged(self) -> None:
+        """Raise EngineError if a file is not the verified one any more: call it when the graphs have been opened."""
+        for folder, before in self.identities.items():
+            after = _identities(folder)
+            for file in sorted({*before, *after}):
+                if before.get(file) != after.get(file):
+                    raise EngineError(f"{folder / file}: changed while the engines were opened; start again")
+
+
+def default_directory(artifacts: Path) -> Path:
+    """Where the engines of an artifact directory are unless told otherwise: beside it, as it is sealed."""
+    return artifacts.with_name(artifacts.name + ".engines")
+
+
+def needed(artifacts: Artifacts) -> list[str]:
+    """Graphs that need an engine."""
+    return [name for name, graph in artifacts.graphs.items() if graph.session.engine]
+
+
+def with_engines(artifacts: Artifacts, directory: Path) -> Artifacts:
+    """The artifacts with every session that needs an engine pointed at its folder; raises EngineError."""
+    graphs = dict(artifacts.graphs)
+    for name in needed(artifacts):
+        graphs[name] = _redirected(artifacts, name, directory / name)
+    return dataclasses.replace(artifacts, graphs=graphs)
+
+
+def _redirected(artifacts: Artifacts, name: str, folder: Path) -> Any:
+    graph = artifacts.graphs[name]
+    keys = _CACHE_OPTIONS.get(graph.session.provider)
+    if keys is None:
+        raise EngineError(
+            f"{name}: {graph.session.provider} is not a provider whose engines can be kept; expected "
+            f"{' or '.join(_CACHE_OPTIONS)}"
+        )
+    options = {**graph.session.options, **dict.fromkeys(keys, str(folder))}
+    return dataclasses.replace(graph, session=dataclasses.replace(graph.session, options=options))
+
+
+def engine_inputs(artifacts: Artifacts, name: str, machine: Machine) -> dict[str, Any]:
+    """All that an engine depends on; its hash is the engine's key."""
+    graph = artifacts.graphs[name]
+    listed = read_manifest(artifacts.directory)["files"]
+    return {
+        "files": {file: str(listed[file]["sha256"]) for file in (graph.file, *graph.data_files)},
+        "provider": graph.session.provider,
+        "options": dict(sorted(graph.session.options.items())),
+        **machine.facts(graph.session.provider).to_dict(),
+    }
+
+
+def key_of(inputs: Mapping[str, Any]) -> str:
+    """Hash of an engine's inputs."""
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None) -> VerifiedEngines:
+    """Verify every engine needed; returns what tells whether a file changes afterwards.
+
+    Raises EngineError, naming the command that helps, unless every engine is there and this device's own.
+    """
+    machine = machine or Machine()
+    names = needed(artifacts)
+    if not names:
+        return VerifiedEngines({})
+    identities = {directory / name: _identities(directory / name) for name in names}
+    _check_profiles(artifacts, names)
+    entries = _read(directory)
+    for name in names:
+        wrong = _wrong(artifacts, name, directory, entries.get(name), machine)
+        if wrong is not None:
+            raise EngineError(
+                f"{name}: {wrong}; build it first: edge-install engines --artifacts {artifacts.directory} "
+                f"--engines {directory}"
+            )
+    return VerifiedEngines(identities)
+
+
+def _wrong(artifacts: Artifacts, name: str, directory: Path, entry: Any, machine: Machine) -> str | None:
+    """What is wrong with an engine, in words; None if it is as it should be."""
+    if not isinstance(entry, dict):
+        return f"has no engine in {directory}"
+    inputs = engine_inputs(artifacts, name, machine)
+    if entry.get("key") != key_of(inputs):
+        before = entry.get("inputs")
+        known = before if isinstance(before, dict) else {}
+        changed = [f"{k} {known.get(k)} → {inputs[k]}" for k in inputs if known.get(k) != inputs[k] and k != "files"]
+        return f"its engine was built for something else ({', '.join(changed) or 'another model'})"
+    files = entry.get("files")
+    if not isinstance(files, dict) or not files:
+        return f"{ENGINES_NAME} lists no files of its engine"
+    try:
+        found = _hashes(directory / name)
+    except OSError as error:
+        return f"its engine cannot be read ({error.strerror})"
+    for file in sorted({*files, *found}):
+        if files.get(file) != found.get(file):
+            return f"{directory / name / file} is not the file that was built"
+    return None
+
+
+def _read(directory: Path) -> dict[str, Any]:
+    """Entries of engines.json; none if there is no such file or it is damaged."""
+    path = directory / ENGINES_NAME
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            return {}
+        content: Any = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA or not isinstance(content.get("graphs"), dict):
+        return {}
+    graphs: dict[str, Any] = content["graphs"]
+    return graphs
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    """Hash of every file of an engine's folder but timing caches, which later builds may add to; raises OSError."""
+    hashes: dict[str, str] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix != TIMING_SUFFIX):
+        digest = hashlib.sha256()
+        with path.open("rb") as file:
+            while block := file.read(HASH_BLOCK_BYTES):
+                digest.update(block)
+        hashes[path.relative_to(folder).as_posix()] = digest.hexdigest()
+    return hashes
+
+
+def _identities(folder: Path) -> dict[str, FileIdentity]:
+    """What changes when a compiled file is written again, even with the same bytes; none without the folder."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix not in (TIMING_SUFFIX, ".profile"))
+    return {path.relative_to(folder).as_posix(): FileIdentity.from_stat(path.stat()) for path in files}
+
+
+def build(artifacts: Artifacts, directory: Path, say: Progress, machine: Machine | None = None) -> dict[str, Any]:
+    """Build every engine that is missing or another device's; returns per graph whether it was built and how long.
+
+    Each engine is built aside and renamed, and `engines.json` is written after each: an interrupted build goes on where
+    it stopped. Raises EngineError, ArtifactError or OSError.
+    """
+    machine = machine or Machine()
+    names = needed(artifacts)
+    lacking = {artifacts.graphs[name].session.provider for name in names} - set(machine.providers())
+    if lacking:
+        raise EngineError(
+            f"this ONNX Runtime has no {', '.join(sorted(lacking))}, only {', '.join(machine.providers())}: "
+            f"run this on the device itself, with the package that brings it"
+        )
+    _check_profiles(artifacts, names)
+    directory.mkdir(parents=True, exist_ok=True)
+    entries = {name: entry for name, entry in _read(directory).items() if name in names}
+    results: dict[str, Any] = {}
+    for number, name in enumerate(names, 1):
+        provider = artifacts.graphs[name].session.provider
+        if _wrong(artifacts, name, directory, entries.get(name), machine) is None:
+            say(f"[{number}/{len(names)}] {name}: its engine is up to date")
+            results[name] = {"built": False, "build_s": entries[name].get("build_s"), "key": entries[name]["key"]}
+            continue
+        say(f"[{number}/{len(names)}] {name}: {provider} builds its engine, which can take ten minutes")
+        started_ns = machine.now_ns()
+        with _busy(say, f"[{number}/{len(names)}] {name}: still building"):
+            files = _build_one(artifacts, name, directory, machine)
+        build_s = round((machine.now_ns() - started_ns) / 1e9, 3)
+        inputs = engine_inputs(artifacts, name, machine)
+        entries[name] = {"key": key_of(inputs), "inputs": inputs, "files": files, "build_s": build_s}
+        _write(directory, entries)
+        say(f"[{number}/{len(names)}] {name}: built in {build_s:.0f} s, {len(files)} files")
+        results[name] = {"built": True, "build_s": build_s, "key": entries[name]["key"]}
+    if names:
+        _write(directory, entries)
+    return results
+
+
+def _write(directory: Path, entries: Mapping[str, Any]) -> None:
+    content = {"schema": SCHEMA, "graphs": dict(entries)}
+    write_whole(directory / ENGINES_NAME, json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+
+def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machine) -> dict[str, str]:
+    """Build one engine, then open it again from where the runner will: nothing may be compiled that time."""
+    partial, final = directory / f"{name}.partial", directory / name
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    try:
+        _open_and_run(artifacts, name, partial, machine)
+        built = _hashes(partial)
+        if not built:
+            raise EngineError(
+                f"{name}: {artifacts.graphs[name].session.provider} built no engine: it takes no part of this graph; "
+                f"export it for another provider"
+            )
+        shutil.rmtree(final, ignore_errors=True)
+        partial.rename(final)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    identities = _identities(final)
+    _open_and_run(artifacts, name, final, machine)
+    after = _hashes(final)
+    # Compiling again may give the very same bytes: the file's identity tells.
+    rewritten = {file for file, found in _identities(final).items() if identities.get(file) != found}
+    changed = sorted(rewritten | {file for file in {*built, *after} if built.get(file) != after.get(file)})
+    if changed:
+        raise EngineError(
+            f"{name}: {changed[0]} was built anew when the engine was opened again: it would be at run time too, so "
+            f"{artifacts.graphs[name].session.provider} cannot be used for this graph here"
+        )
+    return after
+
+
+def _open_and_run(artifacts: Artifacts, name: str, folder: Path, machine: Machine) -> None:
+    """Open a graph on an engine folder and run it once at every profile's shapes."""
+    graph = _redirected(artifacts, name, folder)
+    moved = dataclasses.replace(artifacts, graphs={**artifacts.graphs, name: graph})
+    session = machine.open_graph(moved, name)
+    for shapes in profile_shapes(graph.inputs, graph.session.options, name):
+        feeds = {t.name: np.zeros(shapes[t.name], dtype=DTYPES[t.dtype]) for t in graph.inputs}
+        try:
+            session.run(feeds)
+        except GraphError as error:
+            raise EngineError(f"{name}: its engine does not run ({error})") from error
+
+
+def profile_shapes(
+    inputs: Sequence[TensorContract], options: Mapping[str, str], name: str
+) -> list[dict[str, tuple[int, ...]]]:
+    """Shapes of all inputs at each profile in a session's options; one set without free axes. Raises EngineError."""
+    free = {t.name: len(t.shape) for t in inputs if any(isinstance(axis, str) for axis in t.shape)}
+    fixed = {t.name: tuple(axis for axis in t.shape if isinstance(axis, int)) for t in inputs if t.name not in free}
+    if not free:
+        return [fixed]
+    sets: list[dict[str, tuple[int, ...]]] = []
+    for kind in PROFILES:
+        text = options.get(f"trt_profile_{kind}_shapes", "")
+        pairs = [entry.rpartition(":") for entry in text.split(",") if entry]
+        try:
+            shapes = {tensor: tuple(int(axis) for axis in shape.split("x")) for tensor, _, shape in pairs}
+        except ValueError:
+            raise EngineError(f"{name}: profile {text!r} is not of the form input:1x2,… ; export again") from None
+        missing = [tensor for tensor, axes in free.items() if len(shapes.get(tensor, ())) != axes]
+        if missing:
+            raise EngineError(f"{name}: no {kind} profile for input {missing[0]}, whose shape is free; export again")
+        sets.append({**fixed, **{tensor: shapes[tensor] for tensor in free}})
+    return sets
+
+
+def _check_profiles(artifacts: Artifacts, names: Sequence[str]) -> None:
+    """Raise EngineError if a generation could give an engine more than it is built for."""
+    context = artifacts.runtime.max_context
+    for name in names:
+        graph = artifacts.graphs[name]
+        largest = profile_shapes(graph.inputs, graph.session.options, name)[-1]
+        for tensor in graph.inputs:
+            for axis, length in zip(tensor.shape, largest[tensor.name], strict=True):
+                if axis == CONTEXT_AXIS and length < context:
+                    raise EngineError(
+                        f"{name}: its profile takes {tensor.name} of at most {length} tokens, the model reads "
+                        f"{context}; export again with graphs.{name}.profile.{axis}=1,{context},{context}"
+                    )
+
+
+@contextmanager
+def _busy(say: Progress, line: str) -> Iterator[None]:
+    """Say that something is still going on while it is: a compiler says nothing for minutes."""
+    done = threading.Event()
+    started_ns = time.monotonic_ns()
+
+    def repeat() -> None:
+        while not done.wait(BUSY_LINE_S):
+            say(f"{line}, {(time.monotonic_ns() - started_ns) / 1e9:.0f} s")
+
+    thread = threading.Thread(target=repeat, name="busy-line", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+__all__ = [
+    "ENGINES_NAME",
+    "ArtifactError",
+    "EngineError",
+    "Machine",
+    "build",
+    "check",
+    "default_directory",
+    "needed",
+    "with_engines",
+]

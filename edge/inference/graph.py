@@ -1,0 +1,181 @@
+"""One ONNX graph in ONNX Runtime, opened from verified bytes and held to its contract."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime as ort
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts, TensorContract
+
+Array = npt.NDArray[np.generic]
+
+CPU_PROVIDER = "CPUExecutionProvider"
+DTYPES: dict[str, type[np.generic]] = {
+    "float": np.float32,
+    "float16": np.float16,
+    "int32": np.int32,
+    "int64": np.int64,
+    "uint8": np.uint8,
+}
+_ORT_TYPES = {f"tensor({name})": name for name in DTYPES}
+_DEVICES = {"CUDAExecutionProvider": "cuda", "TensorrtExecutionProvider": "cuda"}
+
+
+class GraphError(RuntimeError):
+    """ONNX Runtime failed while running a graph."""
+
+
+class CancelledError(Exception):
+    """A generation was told to stop."""
+
+
+class Interrupt:
+    """Ends calls from another thread, also in the middle of one; it belongs to one generation and stays set.
+
+    ONNX Runtime looks at it between two nodes of a graph, so a compiled engine, which is one node, is finished first.
+    """
+
+    def __init__(self) -> None:
+        self.options = ort.RunOptions()
+        self.is_set = False
+
+    def set(self) -> None:
+        """End the call under way and every later one."""
+        self.is_set = True
+        self.options.terminate = True
+
+
+class Binding:
+    """Buffers that a graph reads and writes; the arrays behind them are the caller's to keep alive.
+
+    On an accelerator an input is copied to it when it is bound, which can fail there as a run can: with a GraphError.
+    """
+
+    def __init__(self, graph: str, buffers: ort.IOBinding) -> None:
+        self._graph = graph
+        self.buffers = buffers
+
+    def bind_ortvalue_input(self, name: str, value: ort.OrtValue) -> None:
+        """Read an input from a buffer."""
+        try:
+            self.buffers.bind_ortvalue_input(name, value)
+        except Exception as error:
+            raise GraphError(f"{self._graph}: input {name}: {str(error).splitlines()[0]}") from error
+
+    def bind_ortvalue_output(self, name: str, value: ort.OrtValue) -> None:
+        """Write an output to a buffer."""
+        try:
+            self.buffers.bind_ortvalue_output(name, value)
+        except Exception as error:
+            raise GraphError(f"{self._graph}: output {name}: {str(error).splitlines()[0]}") from error
+
+
+class Graph:
+    """A session on the execution provider and with the threads that the manifest names, unless told otherwise.
+
+    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run. Weights in data files
+    are mapped, not read; the files' identity is checked again once the session holds them.
+    """
+
+    def __init__(
+        self,
+        artifacts: Artifacts,
+        name: str,
+        *,
+        threads: int | None = None,
+        provider: str | None = None,
+        cores: Collection[int] = (),
+    ) -> None:
+        """`cores`: where the session's own worker threads may run; empty: where the opening thread may."""
+        contract = artifacts.graphs[name]
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads or contract.session.threads or 1
+        if cores and options.intra_op_num_threads > 1:
+            # The calling thread is the first of them; ONNX Runtime counts processors from 1.
+            worker = ",".join(str(core + 1) for core in sorted(cores))
+            affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
+            options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
+        options.inter_op_num_threads = 1
+        # A spinning worker would take the core that the other thread needs.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        # Opened from bytes, a graph would read external weights from the working directory: it may read them from its
+        # own directory if the manifest lists them, and from a folder that is not there if it lists none.
+        weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
+        self.provider = provider or contract.session.provider
+        if self.provider not in ort.get_available_providers():
+            raise ArtifactError(
+                f"{contract.file}: made for {self.provider}, this ONNX Runtime has {ort.get_available_providers()}; "
+                f"install the package that brings it or export for another target"
+            )
+        providers = [(self.provider, dict(contract.session.options) if provider is None else {})]
+        try:
+            self._session = ort.InferenceSession(
+                artifacts.contents[contract.file], sess_options=options, providers=providers
+            )
+        except Exception as error:
+            raise ArtifactError(
+                f"{contract.file}: ONNX Runtime cannot open it ({str(error).splitlines()[0]})"
+            ) from error
+        artifacts.check_unchanged(contract.data_files)
+        opened = self._session.get_providers()[0]
+        if opened != self.provider:
+            # A provider whose libraries do not load is replaced by the CPU's with no more than a line in the log.
+            raise ArtifactError(
+                f"{contract.file}: ONNX Runtime opened it on {opened} instead of {self.provider}, whose libraries are "
+                f"missing or do not load; install those that its package names"
+            )
+        self.name = name
+        self.contract = contract
+        for declared, found in (
+            (contract.inputs, self._session.get_inputs()),
+            (contract.outputs, self._session.get_outputs()),
+        ):
+            promised = [(t.name, t.dtype, t.shape) for t in declared]
+            actual = [(t.name, _ORT_TYPES.get(t.type, t.type), tuple(t.shape)) for t in found]
+            if promised != actual:
+                raise ArtifactError(f"{contract.file}: its inputs or outputs are not those of the manifest")
+        self.input_names = [t.name for t in contract.inputs]
+        self.output_names = [t.name for t in contract.outputs]
+
+    @property
+    def device(self) -> str:
+        """Where the graph's large buffers belong, in ONNX Runtime's words: `cpu` or `cuda`."""
+        return _DEVICES.get(self.provider, "cpu")
+
+    def run(
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None, interrupt: Interrupt | None = None
+    ) -> list[Array]:
+        """Outputs (all, or those named) for named inputs; raises GraphError, or CancelledError when interrupted."""
+        try:
+            result: list[Array] = self._session.run(outputs, feeds, interrupt.options if interrupt else None)
+        except Exception as error:
+            raise self._failure(error, interrupt) from error
+        return result
+
+    def binding(self) -> Binding:
+        """A new set of bound buffers for `run_bound`."""
+        return Binding(self.name, self._session.io_binding())
+
+    def run_bound(self, binding: Binding, interrupt: Interrupt | None = None) -> None:
+        """Run on bound buffers, in place where an input and an output share one; raises as `run` does."""
+        try:
+            self._session.run_with_iobinding(binding.buffers, interrupt.options if interrupt else None)
+        except Exception as error:
+            raise self._failure(error, interrupt) from error
+
+    def _failure(self, error: Exception, interrupt: Interrupt | None) -> Exception:
+        if interrupt is not None and interrupt.is_set:
+            return CancelledError(self.name)
+        return GraphError(f"{self.name}: {str(error).splitlines()[0]}")
+
+
+def zeros(contract: TensorContract, **axes: int) -> Array:
+    """A buffer of zeros in a tensor's shape, its free axes as given."""
+    shape = [axis if isinstance(axis, int) else axes[axis] for axis in contract.shape]
+    return np.zeros(shape, dtype=DTYPES[contract.dtype])

@@ -1,0 +1,179 @@
+"""A device's latency profile: how long its generations take, as a file that calibration writes and others draw from.
+
+A profile file (JSON or TOML) has `schema = 1`, `name`, `source` (what it was measured on) and `generation_s`, a list of
+times; optionally `anchor_after_s`, of the same length: how long after its start each captured its newest frame; and
+`tagged`: measured or modelled. The flight log and the result of an `edge-run` are read as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge.flightlog.reader import RecordingError, read_messages
+from edge.inference.release import MAX_DELAY_S
+from edge.power.meters.meter import MEASURED, MODELLED
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SCHEMA = 1
+MAX_SAMPLES = 100_000
+MAX_BYTES = 16_000_000
+QUANTILE_STEPS = 200
+"""Into so many times a distribution is cut of which only percentiles are known."""
+_POINTS = ("p50", "p99", "max")
+_KEYS = ("schema", "name", "source", "generation_s", "anchor_after_s", "tagged")
+
+
+class LatencyError(ValueError):
+    """A latency that cannot be used; one line: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class LatencyProfile:
+    """Times to draw from with equal chances; a single one is a constant."""
+
+    name: str
+    source: str
+    """What it was measured on; "setting" for a constant."""
+    generation_s: tuple[float, ...]
+    anchor_after_s: tuple[float, ...] = ()
+    """Empty: every newest frame is the one of its generation's start."""
+    tagged: str = MODELLED
+    """Whether these are times that a device took, or numbers that somebody set or scaled."""
+
+    def __post_init__(self) -> None:
+        times, anchors = self.generation_s, self.anchor_after_s
+        if not 1 <= len(times) <= MAX_SAMPLES:
+            raise LatencyError(f"latency: expected 1 to {MAX_SAMPLES} generation times, found {len(times)}")
+        if not all(math.isfinite(time_s) and 0 <= time_s <= MAX_DELAY_S for time_s in times):
+            raise LatencyError(f"latency: expected generation times of 0 to {MAX_DELAY_S:g} s, found one outside")
+        if anchors and len(anchors) != len(times):
+            raise LatencyError(f"latency: expected as many anchor_after_s as generation_s, found {len(anchors)}")
+        if not all(0 <= anchor_s <= time_s for anchor_s, time_s in zip(anchors, times, strict=False)):
+            raise LatencyError("latency: expected every anchor_after_s from 0 to its generation's time")
+        if self.tagged not in (MEASURED, MODELLED):
+            raise LatencyError(f"latency: expected tagged to be {MEASURED} or {MODELLED}, found {self.tagged!r}")
+
+    @staticmethod
+    def constant(seconds: float) -> LatencyProfile:
+        """Every generation takes this long."""
+        return LatencyProfile(f"{seconds:g} s", "setting", (float(seconds),))
+
+    @property
+    def mean_s(self) -> float:
+        """Mean generation time."""
+        return sum(self.generation_s) / len(self.generation_s)
+
+    def scaled_to_mean(self, mean_s: float) -> LatencyProfile:
+        """Times of the same shape with another mean, as a modelled profile that says so; raises LatencyError."""
+        if not (math.isfinite(mean_s) and mean_s > 0 and self.mean_s > 0):
+            raise LatencyError(f"latency: expected means above 0 s, found {self.mean_s:g} s scaled to {mean_s:g} s")
+        factor = mean_s / self.mean_s
+        scaled = tuple(min(time_s * factor, MAX_DELAY_S) for time_s in self.generation_s)
+        anchors = tuple(min(a * factor, t) for a, t in zip(self.anchor_after_s, scaled, strict=False))
+        source = f"{self.source}; scaled by {factor:.4g} to a mean of {mean_s:g} s"
+        return LatencyProfile(f"{self.name}, {mean_s:g} s", source, scaled, anchors, MODELLED)
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+    @staticmethod
+    def of_json(content: object) -> LatencyProfile:
+        """A profile file's content; raises LatencyError."""
+        if not isinstance(content, Mapping) or content.get("schema") != SCHEMA:
+            raise LatencyError(f"expected a table with schema = {SCHEMA}")
+        if unknown := sorted(set(content) - set(_KEYS)):
+            raise LatencyError(f"unknown key {unknown[0]!r}; expected {', '.join(_KEYS)}")
+        texts = [content.get(key) for key in ("name", "source")]
+        if not all(isinstance(text, str) and text for text in texts):
+            raise LatencyError("expected name and source, both texts that are not empty")
+        return LatencyProfile(
+            str(texts[0]),
+            str(texts[1]),
+            _times(content.get("generation_s"), "generation_s"),
+            _times(content.get("anchor_after_s", []), "anchor_after_s"),
+            str(content.get("tagged", MODELLED)),
+        )
+
+
+def load_profile(path: Path) -> LatencyProfile:
+    """A profile (.json, .toml), an edge-run result (.json) or a flight log (.mcap); raises LatencyError."""
+    try:
+        if path.suffix == ".mcap":
+            return _of_flight_log(path)
+        if path.stat().st_size > MAX_BYTES:
+            raise LatencyError(f"more than {MAX_BYTES} bytes, which is no latency profile")
+        text = path.read_text(encoding="utf-8")
+        content: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        if isinstance(content, Mapping) and isinstance(content.get("reasoning"), Mapping):
+            return _of_run(path, content["reasoning"])
+        return LatencyProfile.of_json(content)
+    except OSError as error:
+        raise LatencyError(f"latency profile {path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:  # of the parsers, and LatencyError
+        raise LatencyError(f"latency profile {path}: {error}") from error
+
+
+def times_of(record: Mapping[str, Any]) -> tuple[float, float]:
+    """(time of a generation, how long after its start its newest frame was captured) in s, of a `/semantic` record."""
+    ready_ns, anchor_ns = int(record["ready_ns"]), int(record["anchor_ns"])
+    # A frame is not younger in virtual time than it was: one captured before the start counts as the start.
+    total_s = max(ready_ns - int(record["started_ns"]), ready_ns - anchor_ns) / 1e9
+    return total_s, total_s - (ready_ns - anchor_ns) / 1e9
+
+
+def _of_flight_log(path: Path) -> LatencyProfile:
+    times: list[float] = []
+    anchors: list[float] = []
+    try:
+        for topic, _, record in read_messages(path):
+            if topic == "/semantic":
+                total_s, anchor_s = times_of(record)
+                times.append(total_s)
+                anchors.append(anchor_s)
+    except RecordingError as error:
+        raise LatencyError(str(error)) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise LatencyError(f"a /semantic record lacks or misshapes a field: {error!r}") from error
+    if not times:
+        raise LatencyError("expected generations in the flight log, found none")
+    return LatencyProfile(path.name, "flight log of edge-run", tuple(times), tuple(anchors), MEASURED)
+
+
+def _of_run(path: Path, reasoning: Mapping[str, Any]) -> LatencyProfile:
+    """From percentiles: nobody knows what is below the median, so that half takes the median; above they are joined."""
+
+    def points_s(key: str) -> list[float]:
+        values = reasoning.get(key)
+        points: list[Any] = [values.get(point) for point in _POINTS] if isinstance(values, Mapping) else []
+        if len(points) != 3 or not all(_is_number(point) for point in points):
+            raise LatencyError(f"expected reasoning.{key} with p50, p99 and max, as an edge-run with generations has")
+        return [float(point) / 1e3 for point in points]
+
+    generation, late_anchor = points_s("generation_ms"), points_s("late_anchor_ms")
+    shares = (np.arange(QUANTILE_STEPS) + 0.5) / QUANTILE_STEPS
+    times = [float(value) for value in np.interp(shares, (0.5, 0.99, 1.0), generation)]
+    anchors = tuple(min(late_anchor[0], time_s) for time_s in times)
+    return LatencyProfile(path.name, "percentiles of an edge-run", tuple(times), anchors, MEASURED)
+
+
+def _times(value: object, key: str) -> tuple[float, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or not all(_is_number(item) for item in value):
+        raise LatencyError(f"expected {key} to be a list of seconds")
+    return tuple(float(item) for item in value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

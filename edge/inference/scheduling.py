@@ -1,0 +1,295 @@
+"""Which thread runs on which cores and how urgently, what stays in memory, and when reasoning gives way to a tick."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import resource
+import threading
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import TypeVar
+
+from edge.artifacts.manifest import Artifacts
+from edge.core.device import shares_device
+
+Result = TypeVar("Result")
+
+CONTROL_GRAPHS = ("vision_encoder", "action_expert")
+CONTROL_NICENESS = -10
+"""What the control thread asks for where real-time priority is refused."""
+REASONING_NICENESS = 10
+SPARE_CORES = 1
+"""Cores left to camera, odometry and recorder before reasoning's threads are fenced in; with fewer, the operating
+system shares the cores out better than a fence would."""
+ROUND_NS = 1_000_000
+"""How often a waiting reasoning thread looks again."""
+GAP_NS = 2_000_000
+"""Between a tick's two calls, and after them, the tick is not over yet."""
+
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # linux/mman.h
+
+
+@dataclass(frozen=True)
+class Role:
+    """How a thread is to run; the defaults change nothing."""
+
+    name: str
+    cores: tuple[int, ...] = ()
+    """Cores that it may use; empty: all that the process may."""
+    priority: int | None = None
+    """Of SCHED_FIFO, 1 to 99; None: ordinary scheduling."""
+    niceness: int = 0
+    """For ordinary scheduling, also where real-time priority is refused."""
+
+    def __post_init__(self) -> None:
+        if self.priority is not None and not 1 <= self.priority <= 99:
+            raise ValueError(f"priority must be 1 to 99, found {self.priority}")
+        if not -20 <= self.niceness <= 19:
+            raise ValueError(f"niceness must be -20 to 19, found {self.niceness}")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Both threads' roles, and whether they compete for what computes."""
+
+    control: Role
+    reasoning: Role
+    shared: bool
+    """Reasoning can take a core or the accelerator from a tick, so it has to give way by itself."""
+    notes: tuple[str, ...] = ()
+    """Lines for the operator."""
+
+
+def schedule_for(artifacts: Artifacts, allowed: Collection[int] | None = None) -> Schedule:
+    """The schedule of a target's artifacts on the cores that this process may use."""
+    runtime = artifacts.runtime
+    reasoning_graphs = (*artifacts.language_graphs, "semantic_context")
+    sessions = {name: graph.session for name, graph in artifacts.graphs.items()}
+    return make_schedule(
+        control_cores=runtime.control_cores,
+        reasoning_cores=runtime.reasoning_cores,
+        control_priority=runtime.control_priority or None,
+        allowed=os.sched_getaffinity(0) if allowed is None else allowed,
+        control_threads=max(sessions[name].threads or 1 for name in CONTROL_GRAPHS),
+        reasoning_threads=max(sessions[name].threads or 1 for name in reasoning_graphs),
+        one_device=shares_device(
+            [sessions[name].provider for name in CONTROL_GRAPHS], [sessions[name].provider for name in reasoning_graphs]
+        ),
+    )
+
+
+def make_schedule(
+    *,
+    control_cores: tuple[int, ...],
+    reasoning_cores: tuple[int, ...],
+    control_priority: int | None,
+    allowed: Collection[int],
+    control_threads: int,
+    reasoning_threads: int,
+    one_device: bool,
+) -> Schedule:
+    """Roles from what the target asks for and the cores there are; pure.
+
+    Without cores in the target, reasoning leaves the control thread its cores if there are some to spare.
+    """
+    available = set(allowed)
+    notes = [
+        f"the target gives {name} cores {_list(cores)}, this process may use {_list(available)}: it runs on any of them"
+        for name, cores in (("control", control_cores), ("reasoning", reasoning_cores))
+        if not available.issuperset(cores)
+    ]
+    control = set(control_cores) if available.issuperset(control_cores) else set()
+    reasoning = set(reasoning_cores) if available.issuperset(reasoning_cores) else set()
+    if not reasoning and control:
+        reasoning = available - control
+    if not reasoning and len(available) >= control_threads + reasoning_threads + SPARE_CORES:
+        reasoning = set(sorted(available)[:-control_threads])
+    free = (control or available) - (reasoning or available)
+    return Schedule(
+        control=Role("control", tuple(sorted(control)), control_priority, CONTROL_NICENESS),
+        reasoning=Role("reasoning", tuple(sorted(reasoning)), None, REASONING_NICENESS),
+        shared=one_device or len(free) < control_threads,
+        notes=tuple(notes),
+    )
+
+
+def _list(cores: Collection[int]) -> str:
+    return ", ".join(str(core) for core in sorted(cores))
+
+
+def _set_fifo(priority: int) -> None:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+def _set_niceness(niceness: int) -> None:
+    # Linux niceness is per thread.
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+
+
+def _set_cores(cores: Collection[int]) -> None:
+    os.sched_setaffinity(0, cores)
+
+
+@dataclass(frozen=True)
+class ThreadCalls:
+    """What sets the calling thread's scheduling; each raises OSError when it is refused."""
+
+    set_cores: Callable[[Collection[int]], None] = _set_cores
+    set_fifo: Callable[[int], None] = _set_fifo
+    set_niceness: Callable[[int], None] = _set_niceness
+
+
+def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
+    """Give the calling thread its role; whatever is refused is one line for the operator, never an error."""
+    calls = calls or ThreadCalls()
+    lines: list[str] = []
+    if role.cores:
+        try:
+            calls.set_cores(role.cores)
+        except OSError as error:
+            lines.append(f"{role.name} thread: cores {_list(role.cores)} refused ({error.strerror}): it runs on any")
+    if role.priority is not None:
+        try:
+            calls.set_fifo(role.priority)
+            return lines
+        except OSError as error:
+            lines.append(
+                f"{role.name} thread: no real-time priority {role.priority} ({error.strerror}): other programs can "
+                f"delay it; allow it with LimitRTPRIO={role.priority} in its service"
+            )
+    if role.niceness:
+        # A negative value is refused to most users, who have been told about the priority already.
+        with contextlib.suppress(OSError):
+            calls.set_niceness(role.niceness)
+    return lines
+
+
+def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
+    """Run `body` in a thread of that role and wait for it: threads that it starts inherit cores and urgency.
+
+    ONNX Runtime's workers are such threads: opened from an ordinary thread, those of the language model would be as
+    urgent as the control thread. Raises what `body` raises.
+    """
+    if role is None:
+        return body()
+    results: list[Result] = []
+    errors: list[BaseException] = []
+
+    def target() -> None:
+        enter(role)
+        try:
+            results.append(body())
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            errors.append(error)
+
+    thread = threading.Thread(target=target, name=f"open-{role.name}")
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+    return results[0]
+
+
+def _mlockall(flags: int) -> int:
+    """0, or the error number."""
+    library = ctypes.CDLL(None, use_errno=True)
+    return 0 if library.mlockall(flags) == 0 else ctypes.get_errno()
+
+
+def lock_memory(
+    limit_bytes: int | None = None, mlockall: Callable[[int], int] = _mlockall, euid: int | None = None
+) -> str | None:
+    """Keep pages in memory once they have been used, so that no tick waits for a disk; a line if it is not permitted.
+
+    Call it after warm-up. Under a finite limit nothing is locked: later allocations beyond it would fail.
+    """
+    if limit_bytes is None:
+        limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    privileged = (os.geteuid() if euid is None else euid) == 0
+    if limit_bytes != resource.RLIM_INFINITY and not privileged:
+        return f"memory is not locked: the limit is {limit_bytes} bytes; set LimitMEMLOCK=infinity in its service"
+    number = mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    if number:
+        return f"memory is not locked ({os.strerror(number)}): a tick may wait for a page from disk"
+    return None
+
+
+def freeze_garbage() -> None:
+    """Collect once, then keep the collector away from everything that lives as long as the process."""
+    gc.collect()
+    gc.freeze()
+
+
+class TickActivity:
+    """What the control thread is computing: it writes instants and waits for nobody, anybody may read them."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._started_ns: int | None = None
+        self._ended_ns = 0
+        self._busy = False
+
+    def begin(self, now_ns: int) -> None:
+        """A call of a tick starts (control thread)."""
+        started_ns = self._started_ns
+        # The second call of a tick does not start another one.
+        if started_ns is None or now_ns - started_ns > self._period_ns // 2:
+            self._started_ns = now_ns
+        self._busy = True
+
+    def end(self, now_ns: int) -> None:
+        """That call is over (control thread)."""
+        self._ended_ns = now_ns
+        self._busy = False
+
+    def hold_ns(self, now_ns: int, needs_ns: int) -> int:
+        """How long a call that takes `needs_ns` has to wait before it is looked at again; 0: it may start.
+
+        It waits for the tick under way, and for the next one if it would not be over by then. A call that is longer
+        than the whole gap starts early in one. Ticks that have stopped are not waited for.
+        """
+        started_ns, ended_ns = self._started_ns, self._ended_ns
+        if started_ns is None or now_ns - started_ns > 2 * self._period_ns:
+            return 0
+        if self._busy:
+            return ROUND_NS
+        if now_ns - ended_ns < GAP_NS:
+            return GAP_NS - max(0, now_ns - ended_ns)
+        next_ns = started_ns + self._period_ns
+        if now_ns >= next_ns:
+            return ROUND_NS
+        gap_ns = next_ns - ended_ns - GAP_NS
+        if needs_ns <= next_ns - now_ns or (needs_ns > gap_ns and next_ns - now_ns > gap_ns // 2):
+            return 0
+        return next_ns - now_ns
+
+
+class GiveWay:
+    """Reasoning's side of the rule: called before every call of a graph."""
+
+    def __init__(
+        self,
+        activity: TickActivity,
+        *,
+        clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._activity = activity
+        self._clock = clock
+        self._sleep = sleep
+        self.waited_ns = 0
+        """Time given away so far."""
+
+    def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
+        """Return when a call of `needs_ns` may start, or has been cancelled."""
+        started_ns = self._clock()
+        while not cancelled():
+            hold_ns = self._activity.hold_ns(self._clock(), needs_ns)
+            if hold_ns == 0:
+                break
+            self._sleep(hold_ns / 1e9)
+        self.waited_ns += self._clock() - started_ns

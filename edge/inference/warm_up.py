@@ -1,0 +1,60 @@
+"""Warm-up: every graph runs before the robot may move, and a tick that is far too slow is found here."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Final
+
+import numpy as np
+
+from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.motion.guidance import STRAIGHT_AHEAD
+from edge.state.ring import EncodedFrame
+from edge.state.semantic import SemanticState
+
+COLD_TICKS: Final = 5
+"""Pay for first-time allocation."""
+WARM_TICKS: Final = 20
+
+
+def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count: int) -> float:
+    """Run every graph, so that no tick pays for first-time allocation; the median of warm ticks, ms (graphs only)."""
+    here = SE2(0.0, 0.0, 0.0)
+    frame = np.zeros((1, image_px, image_px, 3), dtype=np.uint8)
+    frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(frame_count)]
+    generation = language.generate(language.prompt.build(frames, "stop"), max_new_tokens=4, cancelled=lambda: False)
+    context = policy.semantic_context(generation.last_layer_kv)
+    semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, "", STRAIGHT_AHEAD)
+    took_ms: list[float] = []
+    for _ in range(COLD_TICKS + WARM_TICKS):
+        started_ns = time.monotonic_ns()
+        policy.act(policy.encode(frame), (0.0, 0.0, 0.0), 0.0, here, semantic)
+        took_ms.append((time.monotonic_ns() - started_ns) / 1e6)
+    return statistics.median(took_ms[COLD_TICKS:])
+
+
+def check_tick(artifacts: Artifacts, tick_ms: float) -> None:
+    """Refuse graphs that do not run at the speed that they were planned for; raises ArtifactError.
+
+    Fault matrix row 25: what an accelerator does not take, the processor runs in silence. A target whose plan is not
+    enforced (`runtime.enforce_plan`) promises no speed.
+    """
+    period_ms = artifacts.runtime.tick_period_ms
+    if tick_ms > period_ms and plan_is_enforced(artifacts):
+        raise ArtifactError(
+            f"{artifacts.directory}: a tick of its graphs takes {tick_ms:.0f} ms here, expected less than its period "
+            f"of {period_ms} ms: part of a graph may run on the processor; edge-doctor says which"
+        )
+
+
+def plan_is_enforced(artifacts: Artifacts) -> bool:
+    """What the target in the manifest says; raises ArtifactError."""
+    try:
+        return bool(read_manifest(artifacts.directory)["provenance"]["target"]["runtime"]["enforce_plan"])
+    except (KeyError, TypeError) as error:
+        raise ArtifactError(f"{MANIFEST_NAME}: the target lacks runtime.enforce_plan; export again") from error

@@ -1,0 +1,360 @@
+"""Drift estimator: body odometry, gyro, standing still and the camera's motion fused into one pose in the plane.
+
+Between two visual motions the pose is dead-reckoned from the robot's position increments and the gyro; when a visual
+motion arrives, which is some 0.1 s after the fact, the interval it covers is corrected and what came after is played
+again. A visual motion that contradicts gyro and odometry by more than their errors allow does not enter. The gyro's
+bias is learned whenever the robot stands; scales and bias also from the camera. No clock, thread or I/O in here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edge.core.geometry import SE2, wrap_angle
+from edge.odometry import pose_chain
+from edge.odometry.calibration import OdometryCalibration
+from edge.odometry.dead_reckoning import Cursor, Interval, OdometryModel, advance, bent, integrate, split
+from edge.odometry.drift_rate import Comparison, DriftMonitor, DriftRate
+from edge.odometry.gate import GateConfig, Increment, OdometryGate, OdometryInputs, age_findings
+from edge.odometry.pose_chain import HEADING, VISUAL, Array, Node
+from edge.odometry.standing import StillCheck
+from edge.odometry.visual_odometry import VisualMotion
+from edge.safety.faults.findings import Finding
+from edge.state.pose_history import StampedPose
+
+__all__ = ["DriftConfig", "DriftEstimator", "OdometryInputs", "OdometryOutputs"]
+
+_SHORT = 1.3
+"""Error rate of a few decimetres over that of a metre, in which part of it has already averaged out."""
+
+
+@dataclass(frozen=True)
+class DriftConfig:
+    """How far each source is trusted, and how much of the past is kept."""
+
+    gyro_noise_radps_rthz: float = math.radians(0.08)
+    """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
+    gyro_bias_walk_radps_rts: float = math.radians(0.008)
+    """A trotting body rolls and pitches, which its own vertical axis takes for a turn: 0.02 to 0.07 °/s, simulated."""
+    scale_walk_rtm: float = 0.005
+    """Change of the odometry's scales per square root of a metre."""
+    visual_scale_sigma: float = 0.007
+    """Error that all visual motions share: of the camera's height and mounting angle."""
+    stamp_sigma_s: float = 0.01
+    """Error of a picture's stamp. A trot sways and yaws fast enough for 10 ms to matter more than the pixels."""
+    visual_gate: float = 25.0
+    """Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""
+    prior_m: float = 5.0
+    """The calibration's drift counts as much as this much driving."""
+    history_ns: int = 30_000_000_000
+    node_ns: int = 15_000_000
+    pending_ns: int = 2_000_000_000
+    """How long the pose waits for the camera's word on an interval."""
+    still_ns: int = 300_000_000
+    still_mps: float = 0.05
+    still_radps: float = math.radians(4.0)
+    still_m: float = 0.01
+    command_mps: float = 0.02
+    foot_share: float = 0.2
+    """A foot carries when it feels at least this share of the mean over the feet."""
+    floor_m: float = 0.001
+    floor_rad: float = math.radians(0.05)
+    """What no bookkeeping makes more certain: stamps, interpolation, the sway of the body."""
+
+    def __post_init__(self) -> None:
+        values = [getattr(self, name) for name in self.__dataclass_fields__]
+        if not all(math.isfinite(value) and value > 0 for value in values):
+            raise ValueError(f"drift estimator: expected positive settings, found {self}")
+
+
+@dataclass(frozen=True)
+class OdometryOutputs:
+    """What one report led to; `pose` is None when it was rejected or brought nothing new."""
+
+    pose: StampedPose | None
+    findings: tuple[Finding, ...]
+    drift: DriftRate
+    standing: bool
+
+
+class DriftEstimator:
+    """Fuses what one robot reports. `step` belongs to one thread; the other methods may be called from any."""
+
+    def __init__(
+        self,
+        calibration: OdometryCalibration | None = None,
+        config: DriftConfig | None = None,
+        gate: GateConfig | None = None,
+    ) -> None:
+        self._config = config or DriftConfig()
+        self._calibration = calibration or OdometryCalibration()
+        self._gate = OdometryGate(gate)
+        self._visual: deque[VisualMotion] = deque(maxlen=16)
+        self._pending: deque[Increment] = deque()
+        self._commit: Cursor | None = None
+        self._live: Cursor | None = None
+        # Published as a whole: (nodes, newest); nobody ever changes a list that has been published.
+        self._published: tuple[list[Node], Node] | None = None
+        known = self._calibration
+        self._model = OdometryModel(
+            has_gyro=True,
+            heading=known.gyro_bias_radps,
+            scale=known.scale_x - 1.0,
+            sideways=known.sideways_m_per_m,
+            scale_y=known.scale_y,
+            scale_yaw=known.scale_yaw,
+            gyro_noise_radps_rthz=self._config.gyro_noise_radps_rthz,
+            rate_m_per_m=known.drift_m_per_m,
+            rate_rad_per_m=known.drift_rad_per_m,
+        )
+        self._visual_scale = 0.0
+        self._covariance = np.zeros((4, 4))
+        self._drift, self._residual = DriftMonitor(), DriftMonitor()
+        c = self._config
+        self._still = StillCheck(
+            after_ns=c.still_ns, max_mps=c.still_mps, max_radps=c.still_radps, max_m=c.still_m,
+            max_command_mps=c.command_mps, foot_share=c.foot_share,
+        )  # fmt: skip
+        self.visual_used = 0
+        self.visual_rejected = 0
+
+    @property
+    def rejected(self) -> int:
+        """Reports that were not believed."""
+        return self._gate.rejected
+
+    @property
+    def gyro_bias_radps(self) -> float:
+        """What the gyro shows at rest, as learned so far; 0 without a gyro."""
+        return self._model.heading if self._model.has_gyro else 0.0
+
+    def add_visual(self, motion: VisualMotion) -> None:
+        """Hand over the camera's motion; it is used by the next `step`. Any thread, never waits."""
+        self._visual.append(motion)
+
+    def motion_offset(self, anchor_ns: int) -> tuple[SE2, Array] | None:
+        """Motion since an instant of the last 30 s, (Δx m, Δy m, Δθ rad), and the covariance [3, 3] of its error.
+
+        None for an instant before the history begins. Any thread, never waits.
+        """
+        published = self._published
+        if published is None:
+            return None
+        nodes, newest = published
+        anchor = newest if anchor_ns >= newest.stamp_ns else pose_chain.at([*nodes, newest], anchor_ns)
+        if anchor is None:
+            return None
+        offset, covariance = pose_chain.relative(anchor, newest)
+        return offset, covariance + np.diag((self._config.floor_m**2,) * 2 + (self._config.floor_rad**2,))
+
+    def step(self, report: OdometryInputs, now_ns: int) -> OdometryOutputs:
+        """Take one report as it arrives; the pose, what is wrong, and how much the robot's odometry drifts."""
+        verdict = self._gate.step(report)
+        findings = verdict.findings
+        if now_ns > report.received_ns:
+            findings = (*findings, *age_findings(now_ns - report.received_ns))
+        finite = not any(finding.name == "odometry-not-finite" for finding in findings)
+        if self._live is None and finite:
+            return OdometryOutputs(self._start(report), findings, self._drift.rate(), standing=False)
+        increment = verdict.increment
+        if increment is None or self._live is None:
+            return OdometryOutputs(None, findings, self._drift.rate(), standing=False)
+        standing = self._still.step(report, increment, self.gyro_bias_radps)
+        if standing:
+            increment = replace(increment, still=True)
+            self._learn_bias()
+        self._pending.append(increment)
+        self._live = advance(self._live, increment, self._model)
+        self._see()
+        self._publish()
+        self._settle(increment.end_ns - self._config.pending_ns)
+        return OdometryOutputs(self._stamped(report, standing), findings, self._drift.rate(), standing)
+
+    def _start(self, report: OdometryInputs) -> StampedPose:
+        known, has_gyro = self._calibration, report.gyro_wz_radps is not None
+        heading_sigma = known.gyro_bias_sigma_radps if has_gyro else known.drift_rad_per_m
+        self._model = replace(self._model, has_gyro=has_gyro, heading=known.gyro_bias_radps if has_gyro else 0.0)
+        sigmas = (heading_sigma, known.scale_x_sigma, known.sideways_sigma, self._config.visual_scale_sigma)
+        self._covariance = np.diag(np.square(sigmas))
+        node = pose_chain.origin(report.received_ns, report.T_odom_base, self._covariance)
+        self._commit = self._live = Cursor(node, 0.0)
+        self._published = ([node], node)
+        return self._stamped(report, standing=False)
+
+    def _stamped(self, report: OdometryInputs, standing: bool) -> StampedPose:
+        assert self._live is not None
+        node, model = self._live.node, self._model
+        if standing:
+            velocity = (0.0, 0.0, 0.0)
+        else:
+            vx = report.vx_mps / (1.0 + model.scale)
+            vy = report.vy_mps / model.scale_y - model.sideways * vx
+            rate = report.gyro_wz_radps
+            velocity = (vx, vy, report.wz_radps if rate is None else rate - self.gyro_bias_radps)
+        return StampedPose(node.stamp_ns, node.pose, *velocity, report.roll_rad, report.pitch_rad)
+
+    def _learn_bias(self) -> None:
+        """At rest the gyro shows its bias."""
+        measured = self._still.take_rate()
+        if measured is None or not self._model.has_gyro:
+            return
+        rate_radps, seconds = measured
+        row = self._covariance[HEADING]
+        gain = row / (row[HEADING] + self._config.gyro_noise_radps_rthz**2 / seconds)
+        self._learn(gain * (rate_radps - self._model.heading), self._covariance - np.outer(gain, row))
+
+    def _learn(self, change: Array, covariance: Array) -> None:
+        """Correct the parameters."""
+        heading, scale, sideways, visual_scale = (float(v) for v in change)
+        model = self._model
+        self._model = replace(
+            model, heading=model.heading + heading, scale=model.scale + scale, sideways=model.sideways + sideways
+        )
+        self._visual_scale += visual_scale
+        self._covariance = 0.5 * (covariance + covariance.T)
+
+    def _publish(self) -> None:
+        assert self._published is not None and self._live is not None
+        nodes, node = self._published[0], self._live.node
+        if node.stamp_ns - nodes[-1].stamp_ns >= self._config.node_ns:
+            oldest_ns = node.stamp_ns - self._config.history_ns
+            # Two are dropped for one that comes: one more than the time asked for always stays.
+            first = 2 if len(nodes) > 2 and nodes[2].stamp_ns < oldest_ns else 0
+            nodes = [*nodes[first:], node]
+        self._published = (nodes, node)
+
+    def _settle(self, before_ns: int) -> None:
+        """Give up waiting for the camera on what is too long ago."""
+        assert self._commit is not None
+        while self._pending and self._pending[0].end_ns < before_ns:
+            self._commit = advance(self._commit, self._pending.popleft(), self._model)
+
+    def _see(self) -> None:
+        """Use the visual motions that have arrived, if the odometry has reached their end."""
+        assert self._live is not None
+        while self._visual and self._visual[0].end_ns <= self._live.node.stamp_ns:
+            try:
+                used = self._fuse(self._visual.popleft())
+            except np.linalg.LinAlgError:
+                used = False
+            if used:
+                self.visual_used += 1
+            else:
+                self.visual_rejected += 1
+
+    def _fuse(self, seen: VisualMotion) -> bool:
+        """Correct the interval that the camera has seen and play again what came after; False if it is not believed."""
+        assert self._commit is not None and self._published is not None
+        if seen.start_ns < self._commit.node.stamp_ns:
+            return False
+        before, inside, after = split(self._pending, self._commit.node.stamp_ns, seen.start_ns, seen.end_ns)
+        if not inside:
+            return False
+        interval = integrate(inside, self._model)
+        if interval.still:
+            return False
+        pictures = np.reshape(seen.covariance, (3, 3))
+        visual = pictures + self._mistimed(inside)
+        by = np.zeros((3, pose_chain.PARAMETERS))
+        by[0, VISUAL], by[1, VISUAL] = seen.T_start_end.x_m, seen.T_start_end.y_m
+        observed = np.array(seen.T_start_end.as_tuple())
+        observed[:2] /= 1.0 + self._visual_scale
+        innovation = observed - interval.motion
+        innovation[2] = wrap_angle(float(innovation[2]))
+        model = by - interval.gains
+        total = model @ self._covariance @ model.T + visual + interval.white
+        if not float(innovation @ np.linalg.solve(total, innovation)) <= self._config.visual_gate:  # also for NaN
+            return False
+        gain = self._covariance @ model.T @ np.linalg.inv(total)
+        change = gain @ innovation
+        # Given the parameters, odometry and camera are independent: weigh them by their white noise alone. What is left
+        # of the parameters' error then acts through the gains of both, in these shares.
+        share = interval.white @ np.linalg.inv(interval.white + visual)
+        motion = interval.motion - interval.gains @ change + share @ (innovation - model @ change)
+        white = interval.white - share @ interval.white
+        gains = -(interval.gains + share @ model)
+        # Without the stamps' error: what one interval gains by it the next one loses, and here they are added up.
+        self._compare(interval, observed, float(motion[2]), pictures, white)
+        walked = self._covariance - gain @ model @ self._covariance
+        self._learn(change, walked + self._walk(interval, seen))
+        self._replay(before, inside, after, seen, motion, 0.5 * (white + white.T), gains)
+        return True
+
+    def _mistimed(self, inside: list[Increment]) -> Array:
+        """Covariance of what a robot in motion does between the stamps of two pictures and when they were taken."""
+        seconds = sum(increment.dt_s for increment in inside)
+        if seconds <= 0:
+            return np.zeros((3, 3))
+        shares = [
+            (
+                increment.dx_m**2 / increment.dt_s,
+                increment.dy_m**2 / increment.dt_s,
+                increment.turn_rad**2 / increment.dt_s,
+            )
+            for increment in inside
+            if increment.dt_s > 0
+        ]
+        mean_squares = np.sum(shares, axis=0) / seconds
+        return np.diag(2 * self._config.stamp_sigma_s**2 * mean_squares)
+
+    def _walk(self, interval: Interval, seen: VisualMotion) -> Array:
+        config = self._config
+        seconds = (seen.end_ns - seen.start_ns) / 1e9
+        scale = config.scale_walk_rtm**2 * interval.distance_m
+        heading = config.gyro_bias_walk_radps_rts**2 * seconds if self._model.has_gyro else scale
+        return np.diag((heading, scale, scale, 0.0))
+
+    def _compare(self, interval: Interval, observed: Array, turn_rad: float, visual: Array, white: Array) -> None:
+        """Odometry against the camera's translation and the fused turn: as reported, and as corrected."""
+        # Without a gyro the fused turn contains the odometry's.
+        reference = turn_rad if self._model.has_gyro else float(observed[2])
+        variance_rad2 = float(white[2, 2] if self._model.has_gyro else visual[2, 2])
+        variance_m2 = 0.5 * float(visual[0, 0] + visual[1, 1])
+        distance = float(math.hypot(observed[0], observed[1]))
+        yaw = wrap_angle(interval.odometry_rad - reference)
+        for monitor, motion in ((self._drift, interval.uncorrected), (self._residual, interval.motion)):
+            forward, left = float(motion[0] - observed[0]), float(motion[1] - observed[1])
+            monitor.add(Comparison(distance, forward, left, yaw, variance_m2, variance_rad2))
+        rate, known = self._residual.rate(), self._calibration
+        if rate.m_per_m is not None and rate.rad_per_m is not None:
+            weight, prior = min(rate.distance_m, 20.0), self._config.prior_m
+            a, b = math.sqrt(prior / (prior + weight)), math.sqrt(weight / (prior + weight))
+            self._model = replace(
+                self._model,
+                rate_m_per_m=_SHORT * math.hypot(known.drift_m_per_m * a, rate.m_per_m * b),
+                rate_rad_per_m=_SHORT * math.hypot(known.drift_rad_per_m * a, rate.rad_per_m * b),
+            )
+
+    def _replay(
+        self, before: list[Increment], inside: list[Increment], after: list[Increment], seen: VisualMotion,
+        motion: Array, white: Array, gains: Array,
+    ) -> None:  # fmt: skip
+        """Rebuild the chain from the last settled pose on."""
+        assert self._commit is not None and self._published is not None
+        cursor = self._commit
+        kept = [node for node in self._published[0] if node.stamp_ns <= cursor.node.stamp_ns]
+        nodes: list[Node] = []
+        for increment in before:
+            cursor = advance(cursor, increment, self._model)
+            nodes.append(cursor.node)
+        start = cursor.node
+        end = pose_chain.add_interval(start, seen.end_ns, motion, white, gains, self._covariance)
+        for increment in inside:
+            cursor = advance(cursor, increment, self._model)
+            nodes.append(cursor.node)
+        nodes[len(before) :] = bent([*nodes[len(before) :]], start, end)
+        self._commit = cursor = Cursor(end, 0.0)
+        for increment in after:
+            cursor = advance(cursor, increment, self._model)
+            nodes.append(cursor.node)
+        self._live = cursor
+        self._pending = deque(after)
+        spaced = [*kept]
+        for node in nodes:
+            if not spaced or node.stamp_ns - spaced[-1].stamp_ns >= self._config.node_ns or node is end:
+                spaced.append(node)
+        self._published = (spaced, cursor.node)

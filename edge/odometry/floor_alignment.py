@@ -1,0 +1,243 @@
+"""Planar motion between two pictures of the floor by least squares: first by corners, then by the pictures themselves.
+
+Six unknowns: x, y, θ of the base, and what attitude and height err by between the two pictures. The latter three carry
+the attitude's own uncertainty as a prior; the trot moves the camera by centimetres and degrees, which would otherwise
+pass for motion. Tukey's weights keep out what is not floor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.odometry.camera_geometry import Array, Attitude, FloorProjector, seen_from
+
+Picture = npt.NDArray[np.float32]
+_STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4))
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """Noise of the measurements, and which part of the floor is compared."""
+
+    pixel_sigma: float = 0.15
+    """Of a tracked corner, at least."""
+    inlier_px: float = 1.5
+    attitude_sigma_rad: float = math.radians(0.15)
+    height_sigma: float = 0.01
+    """Relative error of the height between two frames."""
+    tilt_sigma_rad: float = math.radians(0.1)
+    """What one pair of pictures may say about the camera's angle to the floor."""
+    grey_sigma: float = 1.5
+    """Of a pixel of a smoothed picture, at least."""
+    smooth_px: float = 1.0
+    points: int = 500
+    min_points: int = 150
+    min_gradient: float = 2.5
+    """Grey levels a pixel: flatter floor says nothing."""
+    range_m: float = 2.6
+    half_width_m: float = 1.6
+    min_share: float = 0.5
+    settle_m: float = 0.06
+    settle_rad: float = math.radians(3.0)
+    """How far the pictures may lead from where the corners pointed."""
+    correlation: float = 8.5
+    """By how much the covariance of independent pixels is too small: neighbours share blur, texture and sampling."""
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(getattr(self, n)) and getattr(self, n) > 0 for n in self.__dataclass_fields__):
+            raise ValueError(f"floor alignment: expected positive settings, found {self}")
+
+    @property
+    def prior(self) -> Array:
+        """Information [6] on the six unknowns."""
+        sigmas = np.array((np.inf, np.inf, np.inf, self.height_sigma, *[self.attitude_sigma_rad] * 2))
+        return np.asarray(1 / sigmas**2, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The unknowns, the covariance [3, 3] of x, y and θ, how many measurements agreed and their share of all.
+
+    By the pictures there is a seventh unknown, the tilt of the camera in both: `tilt_rad` is what they say of it on
+    their own, `tilt_sigma_rad` its standard error.
+    """
+
+    unknowns: Array
+    covariance: Array
+    inliers: int
+    share: float
+    tilt_rad: float = 0.0
+    tilt_sigma_rad: float = math.inf
+
+
+def smooth(grey: npt.NDArray[np.uint8], config: AlignmentConfig) -> Picture:
+    """The picture as it is compared: without the finest detail, which no sampling reproduces."""
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), config.smooth_px), dtype=np.float32)
+
+
+def fit_corners(
+    projector: FloorProjector, before: Array, seen: Array, attitude: Attitude, start: Array, config: AlignmentConfig
+) -> Solution | None:
+    """Fit floor points [n, 2] of the earlier frame to pixels [n, 2] of the later one; None when it does not settle."""
+    q = np.concatenate((start, np.zeros(3)))
+    outlier = 2 * config.inlier_px
+    normal = np.eye(6)
+    weight = np.zeros(len(before))
+    jacobian = np.zeros((len(before), 2, 6))
+    for iteration in range(8):
+        # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
+        if iteration in (0, 2):
+            at, jacobian = _pixels_of(projector, before, attitude, q)
+        else:
+            at = _project(projector, before, attitude, q)
+        r = at - seen
+        size = np.abs(r).max(axis=1)
+        close = size < outlier
+        if np.count_nonzero(close) < 6:
+            return None
+        sigma = max(config.pixel_sigma, 1.4826 * float(np.median(np.abs(r[close]))))
+        weight = np.clip(1 - (size / min(outlier, 4.7 * sigma)) ** 2, 0, None) ** 2
+        weighted = jacobian * (weight / sigma**2)[:, None, None]
+        normal = np.einsum("nki,nkj->ij", weighted, jacobian) + np.diag(config.prior)
+        step = _solve(normal, np.einsum("nki,nk->i", weighted, r) + config.prior * q)
+        if step is None:
+            return None
+        q = q + step
+        if iteration >= 2 and np.abs(step[:3]).max() < 1e-4:
+            break
+    inliers = int(np.count_nonzero(weight > 0.05))
+    # The axes of one corner err together, and neighbouring corners share texture: count half of them as independent.
+    covariance = _inverse(normal)
+    return None if covariance is None else Solution(q, 2.0 * covariance[:3, :3], inliers, inliers / len(before))
+
+
+def align_pictures(
+    projector: FloorProjector, key: Picture, key_attitude: Attitude, now: Picture, attitude: Attitude,
+    start: Array, floor: npt.NDArray[np.uint8], config: AlignmentConfig,
+) -> Solution | None:  # fmt: skip
+    """Fit the later smoothed picture to the earlier one where `floor` is set; `start` [6] must be within a few pixels.
+
+    Edges count as much as corners here, each by the direction that it can tell. None when it does not settle.
+    """
+    pixels = _strong_pixels(key, floor, config)
+    points, _ = projector.floor_points(pixels.astype(np.float64), key_attitude)
+    near = (points[:, 0] < config.range_m) & (np.abs(points[:, 1]) < config.half_width_m)
+    pixels, points = pixels[near], points[near]
+    if len(pixels) < config.min_points:
+        return None
+    wanted = key[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    # Half of the next and half of the previous pixel: the derivative of the picture that is sampled linearly below.
+    slope = _slopes(now)
+    q, normal = np.append(start, 0.0), np.eye(7)
+    prior = np.append(config.prior, 1 / config.tilt_sigma_rad**2) * config.correlation
+    chosen = pixels.astype(np.float64)
+    height, width = now.shape
+    weight = np.zeros(0)
+    rows = np.zeros((len(points), 7))
+
+    def reprojected(unknowns: Array) -> Array:
+        tilted = replace(key_attitude, pitch_rad=key_attitude.pitch_rad + float(unknowns[6]))
+        points, _ = projector.floor_points(chosen, tilted)
+        return _project(
+            projector, points, replace(attitude, pitch_rad=attitude.pitch_rad + float(unknowns[6])), unknowns
+        )
+
+    for iteration in range(10):
+        if iteration in (0, 2):
+            at = reprojected(q)
+            jacobian = np.stack([(reprojected(q + step) - at) / step.sum() for step in np.diag(_STEPS)], axis=-1)
+        else:
+            at = reprojected(q)
+        inside = (at[:, 0] > 2) & (at[:, 0] < width - 3) & (at[:, 1] > 2) & (at[:, 1] < height - 3)
+        if np.count_nonzero(inside) < config.min_points:
+            return None
+        spots = at[inside].astype(np.float32)
+        r = _sampled(now, spots) - wanted[inside]
+        r = r - np.median(r)  # exposure may change
+        sigma = max(config.grey_sigma, 1.4826 * float(np.median(np.abs(r))))
+        weight = np.clip(1 - (r / (4.7 * sigma)) ** 2, 0, None) ** 2
+        if iteration in (0, 2):
+            slopes = np.zeros((len(points), 2))
+            slopes[inside] = np.stack([_sampled(picture, spots) for picture in slope], axis=1)
+            rows = (slopes[:, None, :] @ jacobian)[:, 0, :]
+        weighted = rows[inside] * (weight / sigma**2)[:, None]
+        normal = weighted.T @ rows[inside] + np.diag(prior)
+        step = _solve(normal, weighted.T @ r + prior * q)
+        if step is None:
+            return None
+        q = q + step
+        if iteration >= 2 and np.abs(step[:3]).max() < 1e-4:
+            break
+    inliers = int(np.count_nonzero(weight > 0.05))
+    inverse = _inverse(normal)
+    if inverse is None:
+        return None
+    covariance = config.correlation * inverse
+    # Take the prior out again: whoever adds up many such answers must not count it many times.
+    told = 1.0 - float(covariance[6, 6]) / config.tilt_sigma_rad**2
+    tilt_rad, tilt_sigma_rad = 0.0, math.inf
+    if told > 0.02:
+        tilt_rad, tilt_sigma_rad = float(q[6]) / told, config.tilt_sigma_rad * math.sqrt((1 - told) / told)
+    return Solution(q, covariance[:3, :3], inliers, inliers / len(weight), tilt_rad, tilt_sigma_rad)
+
+
+def _pixels_of(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> tuple[Array, Array]:
+    """Where floor points of the earlier frame are seen in the later one, [n, 2], and derivatives [n, 2, 6]."""
+    at = _project(projector, points, attitude, q)
+    steps = [(_project(projector, points, attitude, q + step) - at) / step.sum() for step in np.diag(_STEPS)[:6, :6]]
+    return at, np.stack(steps, axis=-1)
+
+
+def _tilted(attitude: Attitude, tilt_rad: float) -> Attitude:
+    return replace(attitude, pitch_rad=attitude.pitch_rad + tilt_rad)
+
+
+def _project(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> Array:
+    height_m = projector.camera_height_m(attitude)
+    tilted = Attitude(
+        attitude.roll_rad + float(q[5]), attitude.pitch_rad + float(q[4]), attitude.lift_m + height_m * float(q[3])
+    )
+    return projector.pixels(seen_from(points, q[:3]), tilted)
+
+
+def _solve(normal: Array, gradient: Array) -> Array | None:
+    """The step that a least-squares problem asks for; None when it is singular or far beyond any frame's motion."""
+    try:
+        step = np.linalg.solve(normal, -gradient)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(step, np.float64) if np.all(np.isfinite(step)) and np.abs(step[:3]).max() < 1.0 else None
+
+
+def _inverse(normal: Array) -> Array | None:
+    """Covariance of a least-squares problem; None when it leaves a direction open."""
+    try:
+        inverse = np.asarray(np.linalg.inv(normal), np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return inverse if np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) > 0) else None
+
+
+def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8], config: AlignmentConfig) -> npt.NDArray[np.int64]:
+    """Pixels [n, 2] (column, row) of the floor with enough slope, evenly thinned to about `points`."""
+    gx, gy = _slopes(key)
+    rows, columns = np.nonzero((np.hypot(gx, gy) > config.min_gradient) & (floor > 0))
+    every = max(1, len(rows) // config.points)
+    return np.stack((columns[::every], rows[::every]), axis=1)
+
+
+def _slopes(picture: Picture) -> tuple[Picture, Picture]:
+    """Derivatives along the columns and along the rows, grey levels a pixel."""
+    across, down = (cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
+    return np.asarray(across, np.float32), np.asarray(down, np.float32)
+
+
+def _sampled(picture: Picture, at: npt.NDArray[np.float32]) -> Array:
+    """Grey values at pixels [n, 2] between the pixels, [n]."""
+    values = cv2.remap(picture, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)
+    return np.asarray(values[0], dtype=np.float64)

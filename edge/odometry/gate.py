@@ -1,0 +1,280 @@
+"""Which odometry reports may be believed (fault matrix, rows 8 to 12): what is wrong becomes a finding, not motion."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from edge.core.geometry import wrap_angle
+from edge.safety.faults.findings import Finding
+
+MAX_AGE_LIMIT_NS = 150_000_000
+MAX_AGE_ZERO_NS = 250_000_000
+"""Row 11: older than 150 ms limits the speed, older than 250 ms stops."""
+
+MAX_NUMBER = 1e7
+"""A position, angle or speed beyond it is no measurement, and would break arithmetic."""
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """Bounds of the checks; the defaults are the fault matrix's and the Go2's own limits (3.8 m/s, 4 rad/s)."""
+
+    max_speed_mps: float = 4.0
+    max_turn_radps: float = 6.0
+    jump_m: float = 0.25
+    """What a report may deviate beyond what top speed explains: jitter of its arrival."""
+    jump_rad: float = 0.35
+    norm_tolerance: float = 0.05
+    frozen_command_mps: float = 0.2
+    frozen_ns: int = 500_000_000
+    frozen_m: float = 0.01
+    frozen_rad: float = 0.02
+    mismatch_mps: float = 0.5
+    mismatch_radps: float = 0.5
+    mismatch_window_ns: int = 200_000_000
+    clock_drift: float = 100e-6
+    """How fast the robot's clock may run away from ours; what goes beyond it is a delay, however long it lasts."""
+    clock_back_ns: int = 100_000_000
+    clock_step_ns: int = 5_000_000_000
+    """The robot's clock was set when its stamps go back by more than the first, or apart from ours by the second."""
+
+
+@dataclass(frozen=True)
+class OdometryInputs:
+    """One report of the robot, as it came: numbers may be anything. `commanded` is the velocity in force (body frame).
+
+    `quaternion_norm`, `gyro_wz_radps`, `foot_forces`, `commanded` are None where the protocol does not carry them;
+    `robot_stamp_ns` is the robot's clock, 0 without one.
+    """
+
+    received_ns: int
+    T_odom_base: tuple[float, float, float]
+    vx_mps: float
+    vy_mps: float
+    wz_radps: float
+    gyro_wz_radps: float | None = None
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    robot_stamp_ns: int = 0
+    quaternion_norm: float | None = None
+    foot_forces: tuple[float, ...] | None = None
+    commanded: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Increment:
+    """Motion between two accepted reports in the body frame at its middle, by the robot's own account."""
+
+    end_ns: int
+    dt_s: float
+    dx_m: float
+    dy_m: float
+    odometry_rad: float
+    turn_rad: float
+    """By the gyro where there is one, else the same as `odometry_rad`."""
+    still: bool = False
+    """The robot stood: nothing moved, whatever the report's last digits say."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of one report: an increment unless it was the first or was rejected."""
+
+    increment: Increment | None
+    findings: tuple[Finding, ...]
+
+
+def age_findings(age_ns: int) -> tuple[Finding, ...]:
+    """Row 11 for a pose of this age."""
+    if age_ns > MAX_AGE_ZERO_NS:
+        return (Finding("odometry-stale", f"{age_ns / 1e6:.0f} ms old, at most 250 ms"),)
+    if age_ns > MAX_AGE_LIMIT_NS:
+        return (Finding("odometry-late", f"{age_ns / 1e6:.0f} ms old, at most 150 ms"),)
+    return ()
+
+
+class OdometryGate:
+    """Checks reports in their order of arrival and turns the good ones into increments."""
+
+    def __init__(self, config: GateConfig | None = None) -> None:
+        self._config = config or GateConfig()
+        self._last: OdometryInputs | None = None
+        self._suspect: OdometryInputs | None = None
+        self._apart: deque[tuple[float, float, float, float]] = deque()
+        self._apart_sums = [0.0, 0.0, 0.0, 0.0]
+        self._pushed_since_ns: int | None = None
+        self._pushed_from = (0.0, 0.0, 0.0)
+        self._quickest: tuple[int, int, int] | None = None
+        self.rejected = 0
+
+    def step(self, report: OdometryInputs) -> Verdict:
+        """Judge one report."""
+        if not _finite(report, self._config.norm_tolerance):
+            self.rejected += 1
+            return Verdict(None, (Finding("odometry-not-finite", f"pose {report.T_odom_base}"),))
+        findings = age_findings(self._lag_ns(report))
+        last = self._last
+        if last is None:
+            self._last = report
+            return Verdict(None, findings)
+        dt_s = elapsed_s(last, report)
+        if dt_s <= 0 or report.received_ns <= last.received_ns:
+            self.rejected += 1
+            return Verdict(None, findings)
+        jumped = self._jump(last, report, dt_s)
+        if jumped and self._suspect is not None:
+            suspect_dt_s = elapsed_s(self._suspect, report)
+            if suspect_dt_s > 0 and not self._jump(self._suspect, report, suspect_dt_s):
+                # It stays where it jumped to: go on from there. The step itself is no motion; the reported velocity
+                # says what was driven meanwhile.
+                return self._accept(self._suspect, report, suspect_dt_s, findings, bridged=last)
+        if jumped:
+            again = self._suspect is not None
+            self._suspect = report
+            self.rejected += 1
+            if again:
+                return Verdict(None, (*findings, Finding("odometry-jump", "again, before it had settled")))
+            x, y, turn = _moved(last, report)
+            detail = f"{math.hypot(x, y):.2f} m and {math.degrees(turn):.0f}° in {dt_s * 1e3:.0f} ms"
+            return Verdict(None, (*findings, Finding("odometry-jump", detail)))
+        return self._accept(last, report, dt_s, findings)
+
+    def _accept(
+        self,
+        before: OdometryInputs,
+        report: OdometryInputs,
+        dt_s: float,
+        findings: tuple[Finding, ...],
+        bridged: OdometryInputs | None = None,
+    ) -> Verdict:
+        dx_m, dy_m, turn = _moved(before, report)
+        gap_s = 0.0 if bridged is None else max(0.0, elapsed_s(bridged, before))
+        mean_rate = report.gyro_wz_radps
+        if mean_rate is not None and before.gyro_wz_radps is not None:
+            mean_rate = 0.5 * (mean_rate + before.gyro_wz_radps)
+        mismatch, gyro_lies = self._mismatch((dx_m, dy_m, turn), dt_s, report, mean_rate)
+        if gyro_lies:
+            mean_rate = None
+        increment = Increment(
+            end_ns=report.received_ns,
+            dt_s=dt_s + gap_s,
+            dx_m=dx_m + gap_s * report.vx_mps,
+            dy_m=dy_m + gap_s * report.vy_mps,
+            odometry_rad=turn + gap_s * report.wz_radps,
+            turn_rad=turn + gap_s * report.wz_radps if mean_rate is None else mean_rate * (dt_s + gap_s),
+        )
+        self._last, self._suspect = report, None
+        frozen = self._frozen(report)
+        return Verdict(increment, (*findings, *mismatch, *frozen))
+
+    def _jump(self, before: OdometryInputs, report: OdometryInputs, dt_s: float) -> bool:
+        config = self._config
+        x, y, turn = _moved(before, report)
+        far = math.hypot(x, y) > config.jump_m + config.max_speed_mps * dt_s
+        return far or abs(turn) > config.jump_rad + config.max_turn_radps * dt_s
+
+    def _mismatch(
+        self, moved: tuple[float, float, float], dt_s: float, report: OdometryInputs, gyro_radps: float | None
+    ) -> tuple[tuple[Finding, ...], bool]:
+        """Row 12: changes of the pose against the reported velocity and the gyro, all over the same short time.
+
+        Also whether the gyro disagrees: a stuck one shows nothing while the robot turns.
+        """
+        config = self._config
+        dx_m, dy_m, turn_rad = moved
+        window_s = config.mismatch_window_ns / 1e9
+        if dt_s > 0.5 * window_s:
+            # Two readings do not tell the motion over a long gap: the robot may have been stopped in it.
+            self._apart.clear()
+            self._apart_sums = [0.0] * len(self._apart_sums)
+            return (), False
+        # A pose that does not change at all is row 9's.
+        told = gyro_radps is not None and any(moved)
+        turned_apart = turn_rad - gyro_radps * dt_s if told and gyro_radps is not None else 0.0
+        sums = self._apart_sums
+        self._apart.append((dt_s, dx_m - report.vx_mps * dt_s, dy_m - report.vy_mps * dt_s, turned_apart))
+        for index, value in enumerate(self._apart[-1]):
+            sums[index] += value
+        while len(self._apart) > 1 and sums[0] - self._apart[0][0] >= window_s:
+            for index, value in enumerate(self._apart.popleft()):
+                sums[index] -= value
+        # Two reports could be an accident of their arrival; a full window is not.
+        if sums[0] < 0.7 * window_s or len(self._apart) < 4:
+            return (), False
+        apart_mps, apart_radps = math.hypot(sums[1], sums[2]) / sums[0], abs(sums[3]) / sums[0]
+        findings: tuple[Finding, ...] = ()
+        if apart_mps > config.mismatch_mps:
+            detail = f"{apart_mps:.2f} m/s apart, at most {config.mismatch_mps} m/s"
+            findings = (Finding("odometry-speed-mismatch", detail),)
+        if apart_radps > config.mismatch_radps:
+            detail = f"gyro and reported yaw {apart_radps:.2f} rad/s apart, at most {config.mismatch_radps} rad/s"
+            findings = (*findings, Finding("odometry-speed-mismatch", detail))
+        return findings, apart_radps > config.mismatch_radps
+
+    def _frozen(self, report: OdometryInputs) -> tuple[Finding, ...]:
+        """Row 9, once for every try: the zero that follows ends the try, so that staying frozen shows in a second one.
+
+        Whether a robot at zero would move cannot be seen: the next command tries again, and the table counts.
+        """
+        config, command = self._config, report.commanded
+        if command is None or math.hypot(command[0], command[1]) <= config.frozen_command_mps:
+            self._pushed_since_ns = None
+            return ()
+        x, y, theta = report.T_odom_base
+        px, py, ptheta = self._pushed_from
+        moved = math.hypot(x - px, y - py) > config.frozen_m or abs(wrap_angle(theta - ptheta)) > config.frozen_rad
+        if self._pushed_since_ns is None or moved:
+            self._pushed_since_ns, self._pushed_from = report.received_ns, report.T_odom_base
+            return ()
+        held_ns = report.received_ns - self._pushed_since_ns
+        if held_ns < config.frozen_ns:
+            return ()
+        self._pushed_since_ns = report.received_ns
+        return (
+            Finding("odometry-frozen", f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),
+        )
+
+    def _lag_ns(self, report: OdometryInputs) -> int:
+        """How much later than the quickest report so far this one came, by the robot's own clock."""
+        received_ns, stamp_ns, config = report.received_ns, report.robot_stamp_ns, self._config
+        if stamp_ns <= 0:
+            return 0
+        offset_ns = received_ns - stamp_ns
+        if self._quickest is not None:
+            at_ns, least_ns, last_ns = self._quickest
+            lag_ns = offset_ns - least_ns - round(config.clock_drift * (received_ns - at_ns))
+            if 0 < lag_ns <= config.clock_step_ns and stamp_ns > last_ns - config.clock_back_ns:
+                self._quickest = (at_ns, least_ns, max(stamp_ns, last_ns))
+                return lag_ns
+        self._quickest = (received_ns, offset_ns, stamp_ns)
+        return 0
+
+
+def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:
+    """Time between two reports: by the robot's clock where it has one, which no network delays, else by arrival."""
+    received_s = (after.received_ns - before.received_ns) / 1e9
+    if before.robot_stamp_ns > 0 and after.robot_stamp_ns > 0:
+        robot_s = (after.robot_stamp_ns - before.robot_stamp_ns) / 1e9
+        # A clock that was set does not tell how long it took.
+        return robot_s if 0 < robot_s < received_s + 1.0 else received_s
+    return received_s
+
+
+def _finite(report: OdometryInputs, norm_tolerance: float) -> bool:
+    gyro = report.gyro_wz_radps
+    values = (*report.T_odom_base, report.vx_mps, report.vy_mps, report.wz_radps, 0.0 if gyro is None else gyro,
+              report.roll_rad, report.pitch_rad)  # fmt: skip
+    if not all(abs(value) <= MAX_NUMBER for value in values):  # False for NaN
+        return False
+    return report.quaternion_norm is None or abs(report.quaternion_norm - 1.0) <= norm_tolerance
+
+
+def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float, float]:
+    """Forward, left and turn between two reports, in the body frame at the middle of the turn."""
+    x0, y0, t0 = before.T_odom_base
+    x1, y1, t1 = after.T_odom_base
+    turn = wrap_angle(t1 - t0)
+    c, s = math.cos(t0 + turn / 2), math.sin(t0 + turn / 2)
+    return c * (x1 - x0) + s * (y1 - y0), c * (y1 - y0) - s * (x1 - x0), turn

@@ -1,0 +1,306 @@
+"""Planar motion from the front camera: corners of the floor are tracked and seen as points of a plane of known height.
+
+Scale comes from the camera's height, level from the robot's attitude, so the result owes nothing to its odometry. What
+is not floor (walls, people, furniture) moves otherwise and is outvoted; where there is nothing to hold on to, the dark,
+blur or a crowd, there is no answer instead of a bad one. A few milliseconds a frame: run it in the camera thread.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.geometry import SE2
+from edge.core.jpeg import jpeg_refusal, jpeg_size
+from edge.odometry.camera_geometry import Array, Attitude, CameraGeometry, FloorProjector, seen_from
+from edge.odometry.floor_alignment import AlignmentConfig, Picture, Solution, align_pictures, fit_corners, smooth
+
+Grey = npt.NDArray[np.uint8]
+Covariance = tuple[float, float, float, float, float, float, float, float, float]
+"""Row-major 3 × 3 over (x m, y m, θ rad)."""
+
+
+@dataclass(frozen=True)
+class VisualConfig:
+    """How corners are chosen, when an answer is given, and how far the attitude is trusted between two frames."""
+
+    max_corners: int = 80
+    min_corners: int = 12
+    renew_corners: int = 18
+    """With fewer left, an answer is given while it can be."""
+    min_depression_rad: float = math.radians(7.0)
+    """Floor nearer to the horizon than this moves too little to tell anything."""
+    keyframe_distance_m: float = 0.25
+    keyframe_turn_rad: float = math.radians(8.0)
+    keyframe_age_ns: int = 1_000_000_000
+    max_gap_ns: int = 500_000_000
+    """Corners are not followed across a longer pause between frames."""
+    min_inlier_share: float = 0.4
+    min_brightness: float = 12.0
+    """Mean grey value, 0..255."""
+    hypotheses: int = 64
+    tilt_sigma_rad: float = math.radians(0.2)
+    """Error of the camera's angle to the floor: mounting, lens centre and the robot's own attitude together."""
+    tilt_caution: float = 2.0
+    """One answer about it errs by this much more than its pixels say: their errors are alike from frame to frame."""
+    tilt_floor_rad: float = math.radians(0.03)
+    """It is never known better than this, and so goes on being learned."""
+    max_tilt_rad: float = math.radians(1.0)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+
+    def __post_init__(self) -> None:
+        if not 6 <= self.min_corners <= self.max_corners <= 1000:
+            raise ValueError("visual odometry: expected 6 <= min_corners <= max_corners <= 1000, found "
+                             f"{self.min_corners} and {self.max_corners}")  # fmt: skip
+        positive = (
+            self.min_depression_rad, self.keyframe_distance_m, self.keyframe_turn_rad, self.keyframe_age_ns,
+            self.max_gap_ns, self.hypotheses, self.tilt_sigma_rad, self.tilt_caution, self.tilt_floor_rad,
+            self.max_tilt_rad,
+        )  # fmt: skip
+        if not all(math.isfinite(v) and v > 0 for v in positive) or not 0 < self.min_inlier_share <= 1:
+            raise ValueError(f"visual odometry: expected positive settings, found {self}")
+
+
+@dataclass(frozen=True)
+class VisualMotion:
+    """Motion of the base between two frames: pose at the later one in the level base frame of the earlier one."""
+
+    start_ns: int
+    end_ns: int
+    T_start_end: SE2
+    covariance: Covariance
+    corners: int
+    """How many corners agreed."""
+
+
+@dataclass(frozen=True)
+class _Keyframe:
+    stamp_ns: int
+    attitude: Attitude
+    corners: Array
+    picture: Picture
+    floor: Grey
+
+
+def grey_frame(jpeg: bytes, width_px: int = 320) -> Grey | None:
+    """JPEG → grey picture [h, w] of about `width_px`; None when it is not a picture of a sensible size.
+
+    The decoder itself shrinks by 2, 4 or 8, which is cheaper than decoding the whole.
+    """
+    size = jpeg_size(jpeg)
+    if size is None or jpeg_refusal(jpeg) is not None:
+        return None
+    try:
+        grey = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), _reduced(size[0] / width_px))
+    except cv2.error:
+        return None
+    return None if grey is None else np.ascontiguousarray(grey, dtype=np.uint8)
+
+
+def _reduced(ratio: float) -> int:
+    if ratio < 2:
+        return int(cv2.IMREAD_GRAYSCALE)
+    if ratio >= 8:
+        return int(cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    return int(cv2.IMREAD_REDUCED_GRAYSCALE_4 if ratio >= 4 else cv2.IMREAD_REDUCED_GRAYSCALE_2)
+
+
+class VisualOdometry:
+    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to tell."""
+
+    def __init__(self, geometry: CameraGeometry, config: VisualConfig | None = None) -> None:
+        self._geometry = geometry
+        self._config = config or VisualConfig()
+        self._projector: FloorProjector | None = None
+        self._shape = (0, 0)
+        self._previous: Grey | None = None
+        self._previous_ns = 0
+        self._key: _Keyframe | None = None
+        self._tracked: Array = np.zeros((0, 2))
+        self._rng = np.random.default_rng(0)
+        self.tilt_rad = 0.0
+        """How much further down than told the camera looks, as learned so far."""
+        self._tilt_variance = self._config.tilt_sigma_rad**2
+        self.refused = 0
+        """Frames on which the floor could not be followed any more."""
+
+    def step(self, grey: Grey, stamp_ns: int, attitude: Attitude) -> VisualMotion | None:
+        """Take a frame [h, w]; the motion since the last key frame when it is due, else None.
+
+        Frames must come in the order of their stamps; one that does not advance is ignored. Raises ValueError for a
+        picture that is not uint8 [h, w].
+        """
+        if grey.ndim != 2 or grey.dtype != np.uint8 or min(grey.shape) < 32:
+            raise ValueError(f"visual odometry: expected a grey uint8 picture, found {grey.dtype}{list(grey.shape)}")
+        if self._key is not None and stamp_ns <= self._previous_ns:
+            return None
+        if grey.shape != self._shape:
+            self._shape = (grey.shape[0], grey.shape[1])
+            self._projector = FloorProjector(self._geometry, grey.shape[1], grey.shape[0])
+            self._key = None
+        assert self._projector is not None
+        attitude = replace(attitude, pitch_rad=attitude.pitch_rad + self.tilt_rad)
+        motion: VisualMotion | None = None
+        restart = True
+        if self._key is not None and stamp_ns - self._previous_ns <= self._config.max_gap_ns and self._follow(grey):
+            solved = self._solve(self._projector, self._key, attitude)
+            if solved is None:
+                self.refused += 1
+            elif self._due(solved, self._key, stamp_ns):
+                motion = self._answer(self._projector, self._key, grey, stamp_ns, attitude, solved)
+            else:
+                restart = False
+        elif self._key is not None:
+            self.refused += 1
+        if restart:
+            self._set_keyframe(self._projector, grey, stamp_ns, attitude)
+        self._previous, self._previous_ns = grey, stamp_ns
+        return motion
+
+    def _due(self, solved: Solution, key: _Keyframe, stamp_ns: int) -> bool:
+        config = self._config
+        return (
+            math.hypot(solved.unknowns[0], solved.unknowns[1]) >= config.keyframe_distance_m
+            or abs(solved.unknowns[2]) >= config.keyframe_turn_rad
+            or stamp_ns - key.stamp_ns >= config.keyframe_age_ns
+            or solved.inliers < config.renew_corners
+        )
+
+    def _answer(
+        self, projector: FloorProjector, key: _Keyframe, grey: Grey, stamp_ns: int, attitude: Attitude, solved: Solution
+    ) -> VisualMotion:
+        """The motion by the whole picture; by its corners where that does not settle near them."""
+        config = self._config.alignment
+        now = smooth(grey, config)
+        aligned = align_pictures(
+            projector,
+            key.picture,
+            key.attitude,
+            now,
+            attitude,
+            solved.unknowns,
+            key.floor,
+            config,
+        )
+        if aligned is not None and aligned.share >= config.min_share:
+            apart = np.abs(aligned.unknowns[:3] - solved.unknowns[:3])
+            if apart[:2].max() < config.settle_m and apart[2] < config.settle_rad:
+                solved = aligned
+                self._learn_tilt(aligned)
+        x, y, theta = (float(v) for v in solved.unknowns[:3])
+        c = [float(v) for v in solved.covariance.ravel()]
+        covariance: Covariance = (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+        return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
+
+    def _learn_tilt(self, aligned: Solution) -> None:
+        """What near and far floor agree on best is how the camera really looks down: mounting, attitude and lens."""
+        config = self._config
+        gain = self._tilt_variance / (self._tilt_variance + (config.tilt_caution * aligned.tilt_sigma_rad) ** 2)
+        learned = self.tilt_rad + gain * aligned.tilt_rad
+        self.tilt_rad = min(max(learned, -config.max_tilt_rad), config.max_tilt_rad)
+        self._tilt_variance = max((1.0 - gain) * self._tilt_variance, config.tilt_floor_rad**2)
+
+    def _set_keyframe(self, projector: FloorProjector, grey: Grey, stamp_ns: int, attitude: Attitude) -> None:
+        self._key, self._tracked = None, np.zeros((0, 2))
+        if grey[::4, ::4].mean() < self._config.min_brightness:
+            return
+        floor = self._floor_mask(projector, attitude)
+        found = cv2.goodFeaturesToTrack(grey, self._config.max_corners, 0.005, 5, mask=floor, blockSize=5)
+        if found is None or len(found) < self._config.min_corners:
+            return
+        corners = found.reshape(-1, 2).astype(np.float64)
+        self._key, self._tracked = (
+            _Keyframe(stamp_ns, attitude, corners, smooth(grey, self._config.alignment), floor),
+            corners,
+        )
+
+    def _floor_mask(self, projector: FloorProjector, attitude: Attitude) -> Grey:
+        """255 where a pixel would show floor that is near enough; columns are sampled, the edge between is straight."""
+        height, width = self._shape
+        mask = np.zeros((height, width), np.uint8)
+        columns = np.linspace(0, width - 1, 9)
+        rows = np.arange(height, dtype=np.float64)
+        first = np.empty(9)
+        for index, column in enumerate(columns):
+            pixels = np.stack((np.full(height, column), rows), axis=1)
+            _, depression = projector.floor_points(pixels, attitude)
+            below = np.flatnonzero(depression >= self._config.min_depression_rad)
+            first[index] = below[0] if len(below) else height
+        edge = np.interp(np.arange(width), columns, first)
+        mask[rows[:, None] >= edge[None, :]] = 255
+        # A corner at the rim is about to leave the picture, and its neighbourhood is cut off.
+        mask[:, :4] = mask[:, -4:] = 0
+        mask[-4:, :] = 0
+        return mask
+
+    def _follow(self, grey: Grey) -> bool:
+        """Track the corners from the previous frame into this one and back; False when too few come back."""
+        assert self._previous is not None and self._key is not None
+        before = self._tracked.astype(np.float32)[:, None, :]
+        after, ok = _track(self._previous, grey, before)
+        back, ok_back = _track(grey, self._previous, after)
+        apart = np.abs(back - before).reshape(-1, 2).max(axis=1)
+        height, width = self._shape
+        at = after.reshape(-1, 2)
+        inside = (at[:, 0] > 3) & (at[:, 0] < width - 4) & (at[:, 1] > 3) & (at[:, 1] < height - 4)
+        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (apart < 0.7) & inside
+        if np.count_nonzero(good) < self._config.min_corners:
+            return False
+        self._tracked = at[good].astype(np.float64)
+        self._key = replace(self._key, corners=self._key.corners[good])
+        return True
+
+    def _solve(self, projector: FloorProjector, key: _Keyframe, attitude: Attitude) -> Solution | None:
+        """The motion since the key frame by its corners."""
+        config = self._config
+        before, _ = projector.floor_points(key.corners, key.attitude)
+        after, depression = projector.floor_points(self._tracked, attitude)
+        usable = depression > config.min_depression_rad / 2
+        if np.count_nonzero(usable) < config.min_corners:
+            return None
+        start = self._vote(projector, before, after, usable, attitude)
+        if start is None:
+            return None
+        solved = fit_corners(projector, before, self._tracked, attitude, start, config.alignment)
+        if solved is None or solved.inliers < config.min_corners or solved.share < config.min_inlier_share:
+            return None
+        return solved
+
+    def _vote(
+        self, projector: FloorProjector, before: Array, after: Array, usable: npt.NDArray[np.bool_], attitude: Attitude
+    ) -> Array | None:
+        """The planar motion (x, y, θ) that most corners agree with, out of those that two corners each define."""
+        indices = np.flatnonzero(usable)
+        pairs = self._rng.choice(indices, (self._config.hypotheses, 2))
+        p, q = before[pairs], after[pairs]
+        dp, dq = p[:, 1] - p[:, 0], q[:, 1] - q[:, 0]
+        apart = np.hypot(dp[:, 0], dp[:, 1]) > 0.2
+        if not apart.any():
+            return None
+        p, q, dp, dq = p[apart], q[apart], dp[apart], dq[apart]
+        turn = np.arctan2(dq[:, 0] * dp[:, 1] - dq[:, 1] * dp[:, 0], (dq * dp).sum(axis=1))
+        c, s = np.cos(turn), np.sin(turn)
+        middle = q.mean(axis=1)
+        shift = p.mean(axis=1) - np.stack(
+            (c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]), axis=1
+        )
+        motions = np.concatenate((shift, turn[:, None]), axis=1)
+        moved = seen_from(before[None], motions[:, None, :])
+        errors = np.abs(projector.pixels(moved, attitude) - self._tracked[None]).max(axis=2)
+        votes = np.count_nonzero(errors < 2 * self._config.alignment.inlier_px, axis=1)
+        best = int(votes.argmax())
+        if votes[best] < max(self._config.min_corners, self._config.min_inlier_share * len(before)):
+            return None
+        return np.asarray(motions[best], dtype=np.float64)
+
+
+def _track(
+    before: Grey, after: Grey, corners: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    """Corners [n, 1, 2] of one picture in the next, and which of them were found."""
+    at, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(13, 13), maxLevel=3)
+    return np.asarray(at, np.float32), np.asarray(found, np.uint8)

@@ -1,0 +1,1 @@
+"""Keeps the moving average of power under a budget by shedding reasoning; pure."""

@@ -1,0 +1,126 @@
+"""What an artifact directory's manifest says of power: the meter, the budget and the modelled energy of every stage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from edge.artifacts.files import MANIFEST_NAME, SEAL, ArtifactError, read_manifest
+from edge.artifacts.manifest import Artifacts
+from edge.power.meters.meter import MEASURED, MODELLED
+
+STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
+
+
+@dataclass(frozen=True)
+class PowerModel:
+    """Energy above idle of a tick and of the parts of a generation, and how long a generation takes beside control."""
+
+    idle_w: float
+    period_s: float
+    encode_j: float
+    act_j: float
+    prefill_j: float
+    """The whole prompt."""
+    token_j: float
+    """One new token."""
+    context_j: float
+    before_text_s: float
+    """A generation without any new token: prefill and semantic context."""
+    token_s: float
+    prompt_tokens: int
+    tagged: str = MODELLED
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name != "tagged" and not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} must be 0 or more, found {value}")
+        if self.period_s <= 0 or self.before_text_s <= 0:
+            raise ValueError("period_s and before_text_s must be positive")
+        if self.tagged not in (MEASURED, MODELLED):
+            raise ValueError(f"tagged must be {MEASURED} or {MODELLED}, found {self.tagged!r}")
+
+    @property
+    def control_w(self) -> float:
+        """What control adds to idle power."""
+        return (self.encode_j + self.act_j) / self.period_s
+
+    def generation_s(self, tokens: int) -> float:
+        """Duration of a generation of that many new tokens, beside control."""
+        return self.before_text_s + self.token_s * tokens
+
+    def generation_j(self, tokens: int) -> float:
+        """Its energy above idle."""
+        return self.prefill_j + self.context_j + self.token_j * tokens
+
+    def reasoning_w(self, tokens: int) -> float:
+        """What a running generation adds to idle power and control."""
+        return self.generation_j(tokens) / self.generation_s(tokens)
+
+
+@dataclass(frozen=True)
+class PowerPlan:
+    """How the target wants its power measured and limited."""
+
+    meter: str
+    rail: str | None
+    budget_w: float | None
+    max_delay_s: float
+    max_new_tokens: int
+    model: PowerModel | None
+    """None: the target has no figures of power."""
+
+
+def read_power_plan(artifacts: Artifacts) -> PowerPlan:
+    """The power plan of verified artifacts; raises ArtifactError."""
+    manifest = read_manifest(artifacts.directory)
+    if manifest[SEAL] != artifacts.manifest_sha256:
+        raise ArtifactError(f"{artifacts.directory / MANIFEST_NAME}: changed while it was being opened; start again")
+    return power_plan(manifest, artifacts.runtime.max_new_tokens)
+
+
+def power_plan(manifest: Mapping[str, Any], max_new_tokens: int) -> PowerPlan:
+    """The same from a manifest's `plan` and its target's `power`; raises ArtifactError."""
+    try:
+        plan = manifest["plan"]
+        target = manifest["provenance"].get("target", {})
+        power = target.get("power", {})
+        budget_w = power.get("budget_w")
+        return PowerPlan(
+            meter=str(power.get("meter", "none")),
+            rail=power.get("rail"),
+            budget_w=None if budget_w is None else float(budget_w),
+            max_delay_s=float(plan.get("max_delay_s", math.inf)),
+            max_new_tokens=max_new_tokens,
+            model=_model(plan, power),
+        )
+    except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise ArtifactError(f"{MANIFEST_NAME}: plan or target lacks what the power budget needs ({error!r})") from error
+
+
+def _model(plan: Mapping[str, Any], power: Mapping[str, Any]) -> PowerModel | None:
+    stages, idle = plan.get("per_graph", {}), power.get("idle_w")
+    if idle is None or any(stages.get(name, {}).get("energy_j") is None for name in STAGES):
+        return None
+    joules = {name: float(stages[name]["energy_j"]) for name in STAGES}
+    seconds = {name: float(stages[name]["ms"]) / 1e3 for name in STAGES}
+    # Beside control a generation takes longer than by itself, its parts alike.
+    alone_ms, beside_ms = float(plan["generation_alone_ms"]), plan["generation_ms"]
+    slower = 1.0 if beside_ms is None else float(beside_ms) / alone_ms
+    tokens = int(stages["decode"]["calls"])
+    measured = all(stages[name].get("energy_tagged") == MEASURED for name in STAGES)
+    return PowerModel(
+        idle_w=float(idle["value"]),
+        period_s=float(plan["period_ms"]) / 1e3,
+        encode_j=joules["vision_encoder"],
+        act_j=joules["action_expert"],
+        prefill_j=joules["prefill"],
+        token_j=joules["decode"] / tokens if tokens else 0.0,
+        context_j=joules["semantic_context"],
+        before_text_s=(seconds["prefill"] + seconds["semantic_context"]) * slower,
+        token_s=seconds["decode"] * slower / tokens if tokens else 0.0,
+        prompt_tokens=int(plan["prompt_tokens"]),
+        tagged=MEASURED if measured and idle.get("tag") == MEASURED else MODELLED,
+    )

@@ -1,0 +1,141 @@
+"""Temperatures, and whether the machine holds its clocks back because of them.
+
+Zones are found by `type`, because numbers differ between boards and releases. Distances to the board's own trip points
+matter, not degrees: `passive` is where Linux starts to slow down, `critical` is where it cuts the power.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from edge.core.sysfs import SYSFS, read_int, read_text
+
+JUNCTION: Final = ("tj-thermal", "tj-therm", "Tj-therm")
+"""Jetson's hottest point, as its own zone; on some carrier boards it is there and reads as nothing."""
+LOWEST_C, HIGHEST_C = -40.0, 150.0
+"""A disabled Jetson zone reads -256 °C."""
+LOWEST_TRIP_C: Final = 50.0
+"""A passive trip below it is a user's trip that nobody has set."""
+WARNS_ONLY: Final = "hot-surface-alert"
+"""Jetson's cooling device that says "do not touch" from a passive trip at 70 °C on, and slows nothing down."""
+# A fan that turns is no throttling, and some boards cap devfreq at rest.
+_THROTTLES = re.compile(r"(.*-throttle-alert|Processor|(thermal-)?cpufreq-(cpu)?\d+)")
+_GPU = (
+    "devices/platform/17000000.gpu",
+    "devices/platform/bus@0/17000000.gpu",
+    "devices/17000000.ga10b",
+    "devices/platform/17000000.ga10b",
+    "devices/platform/gpu.0",
+)
+_DEVFREQ = ("class/devfreq/17000000.gpu", "class/devfreq/17000000.ga10b")
+
+
+@dataclass(frozen=True)
+class ThermalState:
+    """One reading; None for what the board does not say."""
+
+    stamp_ns: int
+    zones_c: Mapping[str, float] = field(default_factory=dict)
+    hottest_c: float | None = None
+    throttle_margin_c: float | None = None
+    """Degrees below the nearest passive trip point; negative above it."""
+    trip_margin_c: float | None = None
+    """Degrees below the nearest critical trip point."""
+    throttling: tuple[str, ...] = ()
+    """What holds clocks back now."""
+    gpu_load: float | None = None
+    """0 to 1."""
+    gpu_hz: int | None = None
+    gpu_max_hz: int | None = None
+
+    @property
+    def throttled(self) -> bool:
+        """Clocks are held back now."""
+        return bool(self.throttling)
+
+
+@dataclass(frozen=True)
+class _Zone:
+    name: str
+    temp: Path
+    passive_c: float | None
+    critical_c: float | None
+
+
+class ThermalReader:
+    """Reads zones, cooling devices, throttle counters and the GPU's load below a sysfs root."""
+
+    def __init__(self, sysfs_root: Path = SYSFS) -> None:
+        thermal = sysfs_root / "class/thermal"
+        self._zones = [zone for path in sorted(thermal.glob("thermal_zone*")) if (zone := _zone(path)) is not None]
+        self._cooling = [
+            (name, path / "cur_state")
+            for path in sorted(thermal.glob("cooling_device*"))
+            if (name := read_text(path / "type")) is not None and _THROTTLES.fullmatch(name)
+        ]
+        cpus = sysfs_root / "devices/system/cpu"
+        self._counters = sorted(cpus.glob("cpu[0-9]*/thermal_throttle/package_throttle_count"))
+        self._counts = {path: read_int(path) for path in self._counters}
+        self._load = next((path for name in _GPU if (path := sysfs_root / name / "load").exists()), None)
+        self._devfreq = next((path for name in _DEVFREQ if (path := sysfs_root / name).is_dir()), None)
+
+    def read(self, now_ns: int) -> ThermalState:
+        """One reading; what cannot be read is left out, nothing is raised."""
+        zones: dict[str, float] = {}
+        throttle_c: list[float] = []
+        trip_c: list[float] = []
+        for zone in self._zones:
+            milli_c = read_int(zone.temp)
+            if milli_c is None or not LOWEST_C <= milli_c / 1e3 <= HIGHEST_C:
+                continue
+            zones[zone.name] = max(milli_c / 1e3, zones.get(zone.name, LOWEST_C))
+            if zone.passive_c is not None:
+                throttle_c.append(zone.passive_c - milli_c / 1e3)
+            if zone.critical_c is not None:
+                trip_c.append(zone.critical_c - milli_c / 1e3)
+        load, freq = (None if self._load is None else read_int(self._load)), self._devfreq
+        return ThermalState(
+            stamp_ns=now_ns,
+            zones_c=zones,
+            hottest_c=next((zones[name] for name in JUNCTION if name in zones), max(zones.values(), default=None)),
+            throttle_margin_c=min(throttle_c, default=None),
+            trip_margin_c=min(trip_c, default=None),
+            throttling=self._throttling(),
+            gpu_load=None if load is None else min(max(load / 1e3, 0.0), 1.0),
+            gpu_hz=None if freq is None else read_int(freq / "cur_freq"),
+            gpu_max_hz=None if freq is None else read_int(freq / "max_freq"),
+        )
+
+    def _throttling(self) -> tuple[str, ...]:
+        found = [name for name, path in self._cooling if (read_int(path) or 0) > 0]
+        for path in self._counters:
+            count, last = read_int(path), self._counts[path]
+            if count is not None and last is not None and count > last:
+                found.append(f"{path.parent.parent.name} package")
+            self._counts[path] = count
+        return tuple(found)
+
+
+def _zone(path: Path) -> _Zone | None:
+    name = read_text(path / "type")
+    if name is None:
+        return None
+    trips: dict[str, list[float]] = {"passive": [], "critical": []}
+    for kind_file in sorted(path.glob("trip_point_*_type")):
+        kind = read_text(kind_file)
+        milli_c = read_int(kind_file.with_name(kind_file.name.replace("_type", "_temp")))
+        if kind == "passive" and _bound(path, kind_file.name.split("_")[2]) == {WARNS_ONLY}:
+            continue
+        if kind in trips and milli_c is not None and LOWEST_TRIP_C <= milli_c / 1e3 <= HIGHEST_C:
+            trips[kind].append(milli_c / 1e3)
+    return _Zone(name, path / "temp", min(trips["passive"], default=None), min(trips["critical"], default=None))
+
+
+def _bound(zone: Path, trip: str) -> set[str]:
+    """Types of the cooling devices that a zone's trip point acts on."""
+    files = [path for path in zone.glob("cdev*_trip_point") if read_text(path) == trip]
+    return {name for path in files if (name := read_text(zone / path.name.partition("_")[0] / "type")) is not None}

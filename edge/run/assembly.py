@@ -1,0 +1,188 @@
+"""What runs in a run: both loops, power, and what looks on before arming, wired to one robot's inputs."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from edge.artifacts.manifest import Artifacts
+from edge.flightlog.recorder import Recorder
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.inference.release import ReleaseDelay
+from edge.inference.scheduling import GiveWay, Schedule, TickActivity
+from edge.motion.controller import Controller, ControllerConfig
+from edge.power.governor.plan import read_power_plan
+from edge.power.monitor import Activity, PowerMonitor
+from edge.power.run_power import make_power_monitor
+from edge.run.command_tap import CommandTap
+from edge.run.control_loop import ControlLoop
+from edge.run.reasoning_loop import Mode, ReasoningLoop
+from edge.run.robot_inputs import RobotInputs
+from edge.safety.monitors.semantic import SemanticConfig
+from edge.safety.monitors.watch import Sources, Watch, WatchConfig
+from edge.safety.pre_arm import PreArm
+from edge.safety.supervisor import Supervisor
+from edge.state.ring import TokenRing
+from edge.state.semantic import SemanticSlot
+from firmware_bridge.core.config import RobotConfig
+
+FRAME_MAX_AGE_MS = 500.0
+"""Fault matrix row 1: zero velocity 500 ms after the camera's last good frame."""
+HISTORY_MARGIN_S = 6.0
+"""Older frames are prefilled before the newest is captured, with a slow model seconds before."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run was asked for."""
+
+    instruction: str
+    mode: Mode
+    duration_s: float | None
+    release_delay: ReleaseDelay
+    record: Path | None
+    instructions: Path | None = None
+    """Where further instructions are taken while it drives."""
+    stays: bool = True
+    """Whether it stands where its answers have placed the stop."""
+
+
+@dataclass(frozen=True)
+class Engines:
+    """What computes, opened and warmed up."""
+
+    artifacts: Artifacts
+    policy: Policy
+    language: LanguageModel
+    schedule: Schedule
+    activity: TickActivity
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What runs, not started yet."""
+
+    power: PowerMonitor
+    control: ControlLoop
+    reasoning: ReasoningLoop
+    pre_arm: PreArm
+
+
+def assemble(
+    engines: Engines,
+    robot: RobotConfig,
+    options: RunOptions,
+    inputs: RobotInputs,
+    sink: CommandTap,
+    recorder: Recorder | None,
+    *,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    on_tick: Callable[[bool], None],
+) -> Loops:
+    """Everything for one run; raises ArtifactError when the manifest's plan is not whole."""
+    artifacts, runtime = engines.artifacts, engines.artifacts.runtime
+    period_ns = runtime.tick_period_ms * 1_000_000
+    seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
+    slot = SemanticSlot()
+    ring = TokenRing(math.ceil(seconds * 1e9 / period_ns), engines.policy.tokens_shape)
+    # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
+    loops: list[tuple[ControlLoop, ReasoningLoop]] = []
+
+    def activity() -> Activity:
+        control, reasoning = loops[0]
+        return Activity(
+            ticks=control.statistics.ticks,
+            reasoning=reasoning.busy,
+            generations=reasoning.generations,
+            reasoning_s=reasoning.busy_ns / 1e9,
+            abandoned=reasoning.cancelled + reasoning.failed + reasoning.missed_frames,
+        )
+
+    power = make_power_monitor(
+        artifacts,
+        activity=activity,
+        battery=inputs.battery,
+        on_sample=lambda stamp_ns, record: None if recorder is None else recorder.put("/power", stamp_ns, record),
+        on_findings=inputs.findings.put,
+        say=say,
+    )
+    reasoning = ReasoningLoop(
+        language=engines.language,
+        policy=engines.policy,
+        ring=ring,
+        slot=slot,
+        instruction=options.instruction,
+        frame_offsets_s=runtime.frame_offsets_s,
+        max_new_tokens=runtime.max_new_tokens,
+        release_delay_s=options.release_delay.sampler(),
+        recorder=recorder,
+        stop=stop,
+        mode=options.mode,
+        budget=power.budget,
+        give_way=GiveWay(engines.activity) if engines.schedule.shared else None,
+        role=engines.schedule.reasoning,
+        say=say,
+    )
+    config = ControllerConfig(
+        limits=robot.limits,
+        step_s=runtime.step_s,
+        frame_max_age_ms=FRAME_MAX_AGE_MS,
+        odometry_max_age_ms=float(robot.odometry.max_age_ms),
+    )
+    watch = WatchConfig.standard(
+        config,
+        period_ns,
+        image_px=runtime.image_px,
+        camera_hz=robot.camera.rate_hz,
+        semantic=semantic_config(artifacts, options.mode),
+    )
+    sources = Sources(
+        findings=inputs.findings,
+        attitude=inputs.reader.state,
+        states=lambda: inputs.states,
+        malformed=lambda: inputs.reader.malformed,
+        failed_generations=lambda: reasoning.failed,
+        invalid_texts=lambda: reasoning.invalid_in_a_row,
+    )
+    control = ControlLoop(
+        policy=engines.policy,
+        controller=Controller(config),
+        newest_frame=lambda: inputs.camera.newest,
+        history=inputs.history,
+        ring=ring,
+        slot=slot,
+        sink=sink,
+        recorder=recorder,
+        period_ns=period_ns,
+        step_s=runtime.step_s,
+        stop=stop,
+        watch=Watch(watch, sources),
+        supervisor=Supervisor(),
+        on_tick=on_tick,
+        offset_covariance=inputs.offset_covariance,
+        stays=options.stays,
+    )
+    loops.append((control, reasoning))
+    pre_arm = PreArm(
+        Watch(watch, sources),
+        picture=lambda: inputs.camera.newest,
+        pose=inputs.history.newest,
+        clock=time.monotonic_ns,
+    )
+    return Loops(power, control, reasoning, pre_arm)
+
+
+def semantic_config(artifacts: Artifacts, mode: Mode) -> SemanticConfig:
+    """How old an answer may be, by what the policy was trained for; raises ArtifactError."""
+    # What an untrained model writes is not in the agreed form, and is no fault of the robot's.
+    judge_text = artifacts.trained and mode is not Mode.NO_REASONING
+    trained_s = read_power_plan(artifacts).max_delay_s
+    if not math.isfinite(trained_s):
+        return SemanticConfig(judge_text=judge_text)
+    return SemanticConfig(trained_delay_s=trained_s, judge_text=judge_text)

@@ -1,0 +1,362 @@
+"""The fast thread: 10 Hz on absolute deadlines, from the newest frame to a velocity command; it waits for nobody."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.geometry import SE2
+from edge.core.stats import Samples
+from edge.flightlog.recorder import Recorder
+from edge.inference.graph import GraphError
+from edge.inference.policy import Policy
+from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan
+from edge.motion.guidance import waypoints_now
+from edge.motion.standstill_recovery import TURNING, Stalemate, StalemateConfig
+from edge.motion.stuck_recovery import BACKING_OFF, BackOff, BackOffConfig
+from edge.reasoning.arrival import ARRIVED, is_there
+from edge.safety.faults.findings import Finding
+from edge.safety.faults.table import FAULT_OF_CAUSE
+from edge.safety.monitors.watch import Watch, WatchConfig
+from edge.safety.supervisor import FaultEvent, State, Supervisor, SupervisorInputs, SupervisorOutputs
+from edge.state.frame import Frame
+from edge.state.pose_history import PoseHistory, StampedPose
+from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot, SemanticState
+from firmware_bridge.client import BridgeStatus
+
+BRIDGE_SILENCE_NS = 500_000_000
+"""The bridge reports at 10 Hz; when it has hung there is no point in commanding on."""
+GLANCE_S = 0.01
+"""How often a waiting control thread looks for what must not wait for the next tick."""
+THINKING = "thinking"
+"""Why the robot stands in a mode that drives for a while after each answer only."""
+
+OffsetCovariance = Callable[[int], npt.NDArray[np.float64] | None]
+"""3×3 covariance (m², rad²) of the motion since an anchor's stamp in ns; None while it is not known."""
+
+
+class CommandSink(Protocol):
+    """Where commands go; `BridgeClient` in production."""
+
+    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
+        """Send one command without waiting."""
+
+    def poll(self) -> BridgeStatus | None:
+        """Newest status of the bridge."""
+
+
+@dataclass
+class ControlStatistics:
+    """Figures of all ticks; its size does not depend on how many there were."""
+
+    ticks: int = 0
+    missed: int = 0
+    tick_ms: Samples = field(default_factory=Samples)
+    """From the tick's deadline to its command sent: lateness of the wake-up included."""
+    delay_s: Samples = field(default_factory=Samples)
+    delay_error_ms: Samples = field(default_factory=Samples)
+    """|Δt measured for the action expert − (instant of its call − anchor)|."""
+    unsent: int = 0
+    plans: int = 0
+    plans_not_finite: int = 0
+    """Of `plans`, those that no robot can be driven by: see `edge.motion.controller.is_plan`."""
+    reasons: dict[str, int] = field(default_factory=dict)
+    """Ticks by what decided their velocity: "ok", the reason for zero (ARRIVED among them), BACKING_OFF or TURNING."""
+    faults: dict[str, int] = field(default_factory=dict)
+    """How often each fault of the table was raised."""
+
+
+class ControlLoop:
+    """Frame → shared encoder → ring buffer → semantic state → action expert → supervisor → controller → bridge."""
+
+    def __init__(
+        self,
+        *,
+        policy: Policy,
+        controller: Controller,
+        newest_frame: Callable[[], Frame | None],
+        history: PoseHistory,
+        ring: TokenRing,
+        slot: SemanticSlot,
+        sink: CommandSink,
+        recorder: Recorder | None,
+        period_ns: int,
+        step_s: float,
+        stop: threading.Event,
+        watch: Watch | None = None,
+        supervisor: Supervisor | None = None,
+        on_tick: Callable[[bool], None] | None = None,
+        offset_covariance: OffsetCovariance | None = None,
+        stays: bool = True,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise. `stays`: stand
+        where the words have placed the stop.
+
+        Without `watch` and `supervisor` the standard ones are used, which know only what the loop itself sees.
+        """
+        self._policy = policy
+        self._controller = controller
+        limits = controller.config.limits
+        self._back_off = BackOff(BackOffConfig(limits.vx_min_mps, limits.wz_max_radps))
+        self._stalemate = Stalemate(StalemateConfig(limits.wz_max_radps))
+        self._newest_frame = newest_frame
+        self._history = history
+        self._ring = ring
+        self._slot = slot
+        self._sink = sink
+        self._recorder = recorder
+        self._period_ns = period_ns
+        self._step_s = step_s
+        self._watch = watch or Watch(WatchConfig.standard(controller.config, period_ns))
+        self._supervisor = supervisor or Supervisor()
+        self._on_tick = on_tick
+        self._offset_covariance = offset_covariance
+        self._stays = stays
+        self.last_seq = 0
+        """Sequence number of the last command; arming has used some before the first tick."""
+        self._stop = stop
+        self._clock = clock
+        self._tokens: EncodedFrame | None = None
+        self._last_tick_ns: int | None = None
+        self._moving = False
+        self.supervision = SupervisorOutputs(State.STARTING, 0.0, False, (), (), "")
+        """What the supervisor said last; any thread may read it."""
+        self.ended_by = ""
+        """Who ended `run` before its time: "bridge" or "supervisor"; empty while nobody has."""
+        self.statistics = ControlStatistics()
+
+    def run(self, epoch_ns: int, end_ns: int | None) -> str | None:
+        """Tick at `epoch_ns` plus whole periods until `stop` or `end_ns`; deadlines that were slept over are skipped.
+
+        Returns why the bridge or the supervisor stopped the robot (`ended_by` says which), else None; raises
+        BridgeUnavailable when the bridge has gone.
+        """
+        self._watch.begin()
+        deadline_ns = epoch_ns
+        while end_ns is None or deadline_ns < end_ns:
+            if self._wait_until(deadline_ns):
+                return None
+            if not self.supervision.stop:
+                self.tick(deadline_ns)
+            if self.supervision.stop:
+                self.ended_by = "supervisor"
+                return self.supervision.says
+            status = self._sink.poll()
+            now_ns = self._clock()
+            silent_ns = 0 if status is None else now_ns - status.stamp_ns
+            if status is not None and (status.state == "stopped" or silent_ns > BRIDGE_SILENCE_NS):
+                return self._ended_by_bridge(status, now_ns)
+            behind = (now_ns - deadline_ns) // self._period_ns
+            # Deadlines that a late tick has slept over are skipped, not made up for: each counts as a missed tick.
+            self.statistics.missed += max(0, behind)
+            if self._on_tick is not None:
+                self._on_tick(behind <= 0)
+            deadline_ns += self._period_ns * max(1, behind + 1)
+        return None
+
+    def _ended_by_bridge(self, status: BridgeStatus, now_ns: int) -> str:
+        """Why, in words; what it is in the fault table goes into the log and to the operator."""
+        self.ended_by = "bridge"
+        fault, why = "bridge-hung", f"no word from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
+        if status.state == "stopped":
+            fault, why = FAULT_OF_CAUSE.get(status.cause, ""), status.reason
+        if fault:
+            self._supervise((Finding(fault, why),), now_ns)
+        return why
+
+    def tick(self, deadline_ns: int) -> VelocityCommand:
+        """One pass; returns the command it sent."""
+        start_ns = self._clock()
+        encoded = self._encode(self._newest_frame())
+        encoded_ns = self._clock()
+        semantic = self._slot.state
+        pose = self._history.newest()
+        trajectory: npt.NDArray[np.float32] | None = None
+        delay_s: float | None = None
+        offset = None
+        now_ns = self._clock()
+        if semantic is not None and pose is not None and encoded is not None:
+            delay_s = semantic.delay_s(now_ns)
+            offset = semantic.motion_offset(pose.T_odom_base)
+            called_ns = self._clock()
+            trajectory = self._act(encoded, pose, delay_s, offset, semantic)
+            self.statistics.plans += 1
+            self.statistics.plans_not_finite += not is_plan(trajectory)
+            error_ms = abs(float(np.float32(delay_s)) * 1e3 - (called_ns - semantic.anchor_ns) / 1e6)
+            self.statistics.delay_error_ms.add(error_ms)
+            self.statistics.delay_s.add(delay_s)
+        acted_ns = self._clock()
+        driven_ns = None if encoded is None else encoded.stamp_ns
+        found = self._watch.tick(trajectory, semantic, pose, driven_ns, self._last_tick_ns, acted_ns)
+        self._supervise(found, acted_ns)
+        inputs = ControllerInputs(
+            trajectory=trajectory,
+            # Of the frame that was encoded and driven by, which is not the camera's newest when the encoder fails.
+            frame_age_ms=None if driven_ns is None else (acted_ns - driven_ns) / 1e6,
+            odometry_age_ms=None if pose is None else (acted_ns - pose.stamp_ns) / 1e6,
+            speed_scale=self.supervision.speed_scale,
+            hold=self._hold(semantic, pose, acted_ns),
+        )
+        T_odom_base = None if pose is None else pose.T_odom_base
+        command = self._stalemate.step(
+            self._controller.step(inputs, acted_ns), _meant(semantic, offset), T_odom_base, acted_ns, inputs.speed_scale
+        )
+        command = self._back_off.step(command, T_odom_base, acted_ns, inputs.speed_scale)
+        if command.reason in (BACKING_OFF, TURNING):
+            self._controller.halt(command.reason)  # what comes after it speeds up from standing
+        self._send(command)
+        end_ns = self._clock()
+        self._last_tick_ns = end_ns - deadline_ns
+        statistics = self.statistics
+        statistics.ticks += 1
+        statistics.tick_ms.add((end_ns - deadline_ns) / 1e6)
+        statistics.reasons[command.reason] = statistics.reasons.get(command.reason, 0) + 1
+        if self._recorder is not None:
+            used = None if delay_s is None else semantic
+            record: dict[str, Any] = {
+                "tick": statistics.ticks - 1,
+                "now_ns": now_ns,
+                "start_ns": start_ns,
+                "duration_ms": (end_ns - start_ns) / 1e6,
+                "late_ms": (start_ns - deadline_ns) / 1e6,
+                "encode_ms": (encoded_ns - start_ns) / 1e6,
+                "act_ms": (acted_ns - now_ns) / 1e6,
+                "frame_ns": driven_ns,
+                "frame_age_ms": inputs.frame_age_ms,
+                "generation": None if used is None else used.generation,
+                "anchor_ns": None if used is None else used.anchor_ns,
+                "delay_s": delay_s,
+                "delay_given_s": None if delay_s is None else self._watch.given_delay_s(delay_s),
+                "offset": None if offset is None else offset.as_tuple(),
+                "offset_sd": None if used is None else self._offset_sd(used.anchor_ns),
+                "pose": None if pose is None else pose.T_odom_base.as_tuple(),
+                "state": None if pose is None else (pose.vx_mps, pose.vy_mps, pose.wz_radps),
+                "trajectory": self._seconds(trajectory),
+                "target": None if command.target is None else command.target.as_tuple(),
+                "command": (command.vx_mps, command.vy_mps, command.wz_radps),
+                "reason": command.reason,
+                "supervisor": self.supervision.state.value,
+                "speed_scale": self.supervision.speed_scale,
+                "active": self.supervision.active,
+            }
+            self._recorder.put("/tick", start_ns, record)
+        return command
+
+    def glance(self) -> bool:
+        """Between ticks: what must not wait for the next one; True when the robot was stopped by it."""
+        findings = self._watch.urgent()
+        if not findings:
+            return False
+        now_ns = self._clock()
+        self._supervise(findings, now_ns)
+        if self.supervision.speed_scale > 0 or not self._moving:
+            return self.supervision.stop
+        self._send(self._controller.halt(self.supervision.active[0]))
+        return True
+
+    def _wait_until(self, deadline_ns: int) -> bool:
+        """True when `stop` was set meanwhile; returns early when the supervisor has stopped the run."""
+        while True:
+            left_s = max(0, deadline_ns - self._clock()) / 1e9
+            if self._stop.wait(min(left_s, GLANCE_S)):
+                return True
+            if left_s <= GLANCE_S:
+                return False
+            self.glance()
+            if self.supervision.stop:
+                return False
+
+    def _supervise(self, findings: tuple[Finding, ...], now_ns: int) -> None:
+        self.supervision = self._supervisor.step(SupervisorInputs(findings, armed=True), now_ns)
+        for event in self.supervision.events:
+            self._tell(event)
+
+    def _tell(self, event: FaultEvent) -> None:
+        fault = event.fault
+        if event.raised:
+            self.statistics.faults[fault.name] = self.statistics.faults.get(fault.name, 0) + 1
+        if self._recorder is not None:
+            record = {
+                "name": fault.name,
+                "row": fault.row,
+                "action": fault.action.name,
+                "change": "raised" if event.raised else "cleared",
+                "detail": event.detail,
+                "state": self.supervision.state.value,
+                "speed_scale": self.supervision.speed_scale,
+            }
+            self._recorder.put("/fault", event.stamp_ns, record)
+
+    def _hold(self, semantic: SemanticState | None, pose: StampedPose | None, now_ns: int) -> str | None:
+        """Why the robot must stand whatever the plan says."""
+        if self.supervision.speed_scale <= 0:
+            return self.supervision.active[0] if self.supervision.active else "not-supervised"
+        until_ns = self._slot.drive_until_ns
+        if until_ns is not None and now_ns >= until_ns:
+            return THINKING
+        if not self._stays or semantic is None or pose is None:
+            return None
+        return ARRIVED if is_there(semantic.T_odom_stop, pose.T_odom_base) else None
+
+    def _send(self, command: VelocityCommand) -> None:
+        self.last_seq += 1
+        self._moving = (command.vx_mps, command.vy_mps, command.wz_radps) != (0.0, 0.0, 0.0)
+        if not self._sink.send_velocity(self.last_seq, self._clock(), command.vx_mps, command.vy_mps, command.wz_radps):
+            self.statistics.unsent += 1
+
+    def _encode(self, frame: Frame | None) -> EncodedFrame | None:
+        """Encode a good frame once: a frame seen before, or not fit to be used, gives the tokens there are."""
+        # Of the capture, not of now: a robot that starts to turn has moved before the picture shows it.
+        T_odom_base = None if frame is None else self._history.at(frame.stamp_ns)
+        fit = self._watch.picture(frame, T_odom_base, self._clock())
+        if frame is None or not fit or (self._tokens is not None and frame.stamp_ns == self._tokens.stamp_ns):
+            return self._tokens
+        if T_odom_base is None:
+            return self._tokens
+        try:
+            tokens = self._policy.encode(frame.pixels, self._ring.next_buffer())
+        except GraphError:
+            return self._tokens
+        self._tokens = EncodedFrame(frame.stamp_ns, T_odom_base, tokens)
+        self._ring.put(self._tokens)
+        if self._recorder is not None:
+            self._recorder.put("/camera", frame.stamp_ns, frame.jpeg)
+        return self._tokens
+
+    def _act(
+        self, encoded: EncodedFrame, pose: StampedPose, delay_s: float, offset: SE2, semantic: SemanticState
+    ) -> npt.NDArray[np.float32]:
+        state = (pose.vx_mps, pose.vy_mps, pose.wz_radps)
+        try:
+            return self._policy.act(encoded.tokens, state, self._watch.given_delay_s(delay_s), offset, semantic)
+        except GraphError:
+            # No plan at all: the controller takes what is not finite as bad output and stops.
+            return np.full((1, 3), np.nan, dtype=np.float32)
+
+    def _offset_sd(self, anchor_ns: int) -> list[float] | None:
+        """Standard deviations (m, m, rad) of the motion since the anchor, for the log."""
+        covariance = None if self._offset_covariance is None else self._offset_covariance(anchor_ns)
+        return None if covariance is None else [float(v) for v in np.sqrt(np.maximum(np.diag(covariance), 0.0))]
+
+    def _seconds(self, trajectory: npt.NDArray[np.float32] | None) -> list[list[float]] | None:
+        """The plan at whole seconds, which is what the flight log keeps of it."""
+        if trajectory is None:
+            return None
+        every = max(1, round(TARGET_TIME_S / self._step_s))
+        return [[float(v) for v in row] for row in trajectory[every - 1 :: every]]
+
+
+def _meant(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
+    """The waypoints that were said last, [points, 2], m in the robot's frame now; None of words that mean to wait."""
+    if semantic is None or semantic.waypoints is None or offset is None or semantic.waits:
+        return None
+    points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
+    return points

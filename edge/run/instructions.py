@@ -1,0 +1,123 @@
+"""New instructions for a runner that drives: a local socket, one JSON object a datagram, never waited for.
+
+A stop phrase is no instruction: it stops the robot, and no instruction is accepted after it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from edge.reasoning.prompt import InstructionError, check_instruction
+from edge.run.stop_phrase import is_stop_phrase
+
+MAX_BYTES: Final = 4096
+"""Of a datagram: 400 characters of an instruction, each in the longest form that JSON has for it."""
+MAX_A_POLL: Final = 4
+
+
+class InstructionSocket:
+    """Takes `{"instruction": TEXT}` and answers `{"accepted": TEXT}` or `{"error": WHY}` to a sender with an address.
+
+    The answer to a stop phrase is `{"stopped": TEXT, "confirmed": BOOL, "bridge": PATH}`.
+
+    Only the user whose process this is may write to it (mode 0600). Raises OSError when the path is taken or cannot be
+    made.
+    """
+
+    def __init__(self, path: Path, check: Callable[[str], None], stop: Callable[[], bool], bridge: Path) -> None:
+        """`check` raises InstructionError for a text that the model has no room for.
+
+        `stop` stops the robot and returns whether its bridge, which listens at `bridge`, has confirmed it.
+        """
+        self.stopped = False
+        """Whether a stop phrase has come."""
+        self._path = path
+        self._check = check
+        self._stop = stop
+        self._bridge = bridge
+        with contextlib.suppress(OSError):
+            if stat.S_ISSOCK(path.lstat().st_mode) and not _answers(path):
+                path.unlink()  # of a runner that was killed
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        umask = os.umask(0o177)
+        try:
+            self._socket.bind(str(path))
+        except OSError as error:
+            self._socket.close()
+            raise OSError(f"--instructions {path}: expected a free path for a socket ({error.strerror})") from error
+        finally:
+            os.umask(umask)
+        self._socket.setblocking(False)
+
+    def poll(self) -> str | None:
+        """The newest good instruction since the last poll, in one line; None without one, and after a stop phrase."""
+        newest: str | None = None
+        for _ in range(MAX_A_POLL):
+            try:
+                data, sender = self._socket.recvfrom(MAX_BYTES + 1)
+            except OSError:  # nothing there
+                break
+            try:
+                text = parse(data)
+                if is_stop_phrase(text):
+                    self.stopped, newest = True, None
+                    confirmed = self._stop()
+                    self._answer(sender, {"stopped": text, "confirmed": confirmed, "bridge": str(self._bridge)})
+                    continue
+                if self.stopped:
+                    raise InstructionError("a stop phrase has ended this run: `edge-bridge arm` and start a new one")
+                self._check(text)
+            except InstructionError as error:
+                self._answer(sender, {"error": str(error)})
+                continue
+            newest = text
+            self._answer(sender, {"accepted": text})
+        return newest
+
+    def close(self) -> None:
+        """Close and remove the socket."""
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+    def _answer(self, sender: str | None, answer: dict[str, str | bool]) -> None:
+        if sender:  # one that is not bound has no address
+            with contextlib.suppress(OSError):  # it has gone or does not read
+                self._socket.sendto(json.dumps(answer).encode(), sender)
+
+
+def check_first_instruction(text: str) -> str:
+    """The instruction to begin a run with, in one line; raises InstructionError, also for a stop phrase."""
+    line = check_instruction(text)
+    if is_stop_phrase(line):
+        raise InstructionError(f"instruction {line!r} is a stop phrase: expected what the robot is to do")
+    return line
+
+
+def parse(data: bytes) -> str:
+    """The instruction of a datagram, in one line; raises InstructionError."""
+    if len(data) > MAX_BYTES:
+        raise InstructionError(f"expected at most {MAX_BYTES} bytes, found {len(data)}")
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict) or set(content) != {"instruction"} or not isinstance(content["instruction"], str):
+        raise InstructionError(f'expected {{"instruction": "..."}}, found {data[:60]!r}')
+    return check_instruction(content["instruction"])
+
+
+def _answers(path: Path) -> bool:
+    """Whether somebody holds this socket open."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,191 @@
+"""`edge-say`: gives a driving runner another instruction, or stops the robot when the text is a stop phrase."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import socket
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED, command_line
+from edge.run.stop_phrase import is_stop_phrase
+from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
+
+ANSWER_S = 2.0
+STOP: Final = "stop"
+"""What the runner is sent for every stop phrase."""
+ROBOT_FILE_SOCKET: Final = "bridge.sock"
+"""Name that the shipped robot files give the bridge's socket."""
+
+EXAMPLES = """examples:
+  edge-run --artifacts out/nano --robot go2.toml --instructions say.sock --instruction "go down the corridor"
+  edge-say "turn left and stop at the vending machine" --to say.sock
+  edge-say stop --to say.sock
+
+An instruction is followed from the next generation on; until then the robot drives by the previous one.
+
+emergency stop: "stop", "halt", "freeze", "emergency stop", "stop now" and the like stop the robot and are never given
+to the model. The bridge stops it as after `edge-bridge stop` and refuses to arm until `edge-bridge arm`; the run ends.
+Case and punctuation do not matter. With any other word, as in "stop at the second door" or "stop, then turn left", the
+text is an instruction: the model decides when to stop, or does not. It is no emergency stop. The fastest stops are the
+keys of the robot's remote and `edge-bridge stop`, which need no runner.
+
+exit codes: 0 the runner has accepted the instruction, or the bridge has confirmed the stop; 1 the runner has refused
+            the instruction or is silent, or the stop is not confirmed: use the remote; 2 bad arguments, or no runner
+            takes instructions there; 130 interrupted
+"""
+
+
+class SayError(RuntimeError):
+    """The instruction has not arrived; one line: why."""
+
+
+def say(path: Path, instruction: str, timeout_s: float = ANSWER_S) -> str:
+    """Hand an instruction over and return what was accepted. Raises InstructionError, SayError, OSError."""
+    from edge.reasoning.prompt import check_instruction  # loads NumPy and the tokenizer: a stop must not wait for them
+
+    with _question(path, check_instruction(instruction)) as asking:
+        answer = _answer(asking, path, timeout_s)
+    if not isinstance(answer, dict) or "accepted" not in answer:
+        why = answer.get("error", answer) if isinstance(answer, dict) else answer
+        raise SayError(f"the runner has refused it: {why}")
+    return str(answer["accepted"])
+
+
+def stop_robot(path: Path, bridge: Path | None = None) -> int:
+    """Stop the robot by the operator's socket of every bridge found and by the runner; returns the exit code.
+
+    `path`: the runner's instruction socket; `bridge`: the only bridge to ask, None for those that `edge-bridge stop`
+    asks and the runner's own.
+    """
+    from firmware_bridge.operate import operate
+
+    bridges = [bridge] if bridge else [each for each in (SERVICE_SOCKET, _default_bridge()) if not _is_absent(each)]
+    with contextlib.ExitStack() as stack:
+        try:
+            asking: socket.socket | None = stack.enter_context(_question(path, STOP))
+        except OSError as error:
+            asking = None
+            sys.stderr.write(f"edge-say: {path}: no runner takes instructions there ({error.strerror or error})\n")
+        code = operate(STOP, *bridges)[0] if bridges else EXIT_REFUSED
+        answer = None if asking is None else _stop_answer(asking, path)
+    runners = None if answer is None else Path(str(answer.get("bridge")))
+    if runners is not None and (code != EXIT_DONE or runners not in bridges) and bridge in (None, runners):
+        # The runner names its bridge: what is known of that one alone decides.
+        code = operate(STOP, runners)[0]
+    if code == EXIT_DONE and (bridge is not None or runners is not None):
+        sys.stdout.write("stopped: the bridge confirms it; before the robot moves again: `edge-bridge arm`, new run\n")
+        return EXIT_DONE
+    if code == EXIT_REFUSED and bridge is None and answer is not None and answer.get("confirmed") is True:
+        sys.stdout.write(
+            "stopped: the runner has ended its run and its bridge confirms it; no operator's stop was possible, so a "
+            "new run can arm: to prevent that, sudo edge-bridge stop\n"
+        )
+        return EXIT_DONE
+    found = "a bridge has stopped, which need not be this runner's" if code == EXIT_DONE else "no bridge confirms it"
+    sys.stderr.write(f"edge-say: the stop is NOT confirmed: {found}; use the remote, or switch the robot off\n")
+    return EXIT_CHECK_FAILED
+
+
+@contextlib.contextmanager
+def _question(path: Path, instruction: str) -> Iterator[socket.socket]:
+    """A socket over which the runner was asked and can answer. Raises OSError."""
+    with tempfile.TemporaryDirectory(prefix="tic-") as own, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+        asking.bind(str(Path(own) / "a"))
+        asking.settimeout(ANSWER_S if instruction != STOP else 0.0)  # a full queue must not delay the operator's stop
+        asking.sendto(json.dumps({"instruction": instruction}).encode(), str(path))
+        yield asking
+
+
+def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
+    """What the runner answers. Raises SayError, OSError."""
+    asking.settimeout(timeout_s)
+    try:
+        return json.loads(asking.recv(65_536))
+    except TimeoutError:
+        raise SayError(f"{path}: no answer within {timeout_s:g} s; expected a runner that drives there") from None
+    except ValueError as error:
+        raise SayError(f"{path}: expected a runner's answer, found something else ({error})") from error
+
+
+def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
+    """The runner's answer to a stop phrase; None without one that can be used."""
+    try:
+        answer = _answer(asking, path, ANSWER_S)
+    except (SayError, OSError) as error:
+        sys.stderr.write(f"edge-say: {error}\n")
+        return None
+    if isinstance(answer, dict) and "stopped" in answer and "bridge" in answer:
+        return answer
+    sys.stderr.write(f"edge-say: {path}: expected that the runner stops, it answers {answer}\n")
+    return None
+
+
+def _default_bridge() -> Path:
+    return runtime_dir() / ROBOT_FILE_SOCKET
+
+
+def _is_absent(bridge: Path) -> bool:
+    """Whether there is certainly no bridge; one that this user cannot look at counts as present."""
+    try:
+        Path(f"{bridge}{OPERATOR_SUFFIX}").lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "edge-say", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("text", metavar="TEXT", help="what the robot is to do, in plain words; a stop phrase stops it")
+    p.add_argument("--to", type=Path, required=True, metavar="PATH", help="the runner's --instructions")
+    p.add_argument(
+        "--socket",
+        type=Path,
+        metavar="PATH",
+        help="socket of edge-bridge for a stop phrase (default: the installed service's, this user's, the runner's)",
+    )
+    return p
+
+
+@command_line("edge-say")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        if is_stop_phrase(args.text):
+            return stop_robot(args.to, args.socket)
+        return _hand_over(args.to, args.text)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+def _hand_over(path: Path, text: str) -> int:
+    from edge.reasoning.prompt import InstructionError
+
+    try:
+        accepted = say(path, text)
+    except SayError as error:
+        sys.stderr.write(f"edge-say: {error}\n")
+        return EXIT_CHECK_FAILED
+    except InstructionError as error:
+        sys.stderr.write(f"edge-say: {error}\n")
+        return EXIT_BAD_INPUT
+    except OSError as error:
+        sys.stderr.write(f"edge-say: {path}: expected the socket of a runner ({error.strerror or error})\n")
+        return EXIT_BAD_INPUT
+    sys.stdout.write(f"{accepted}\n")
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

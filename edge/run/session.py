@@ -1,0 +1,398 @@
+"""One run: wires the threads together, arms, drives, and takes everything down again, the robot first."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import psutil
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts
+from edge.core.deadline import Deadline
+from edge.flightlog.recorder import Recorder, space_refusal
+from edge.inference.graph import GraphError
+from edge.inference.language import ContextOverflowError, LanguageModel
+from edge.inference.policy import Policy
+from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
+from edge.inference.warm_up import check_tick, warm_up
+from edge.reasoning.prompt import InstructionError
+from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
+from edge.run.assembly import Engines, Loops, RunOptions, assemble
+from edge.run.command_tap import CommandTap
+from edge.run.instructions import InstructionSocket
+from edge.run.reasoning_loop import Mode
+from edge.run.result import run_record, run_result
+from edge.run.robot_inputs import RobotInputs
+from edge.run.service import ServiceReporter
+from edge.safety.faults.findings import Finding
+from edge.safety.faults.table import FAULTS
+from edge.safety.reasoning_watch import Hang, ReasoningWatch
+from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
+from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.notify import Notifier
+
+CAMERA_LEAD = 0.5
+"""Share of a tick period by which a frame is asked for before the tick that uses it."""
+READY_TIMEOUT_S = 10.0
+OPEN_S = 60.0
+"""As a service: the most that hashing, opening and warming up a large model's graphs takes."""
+END_S = 7.0
+"""How long everything may take to end, together; systemd kills a service after 10 s (TimeoutStopSec)."""
+JOIN_S = 3.0
+"""Of it, the most for both loops' threads: a call of a graph is interrupted."""
+STOP_CONFIRM_S = 1.0
+"""Of it, the most for the bridge's word that the robot has been told to stand."""
+STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
+"""Fault that ends a run when the instruction channel brings a stop phrase."""
+LINES = 200
+"""Lines for the operator that wait to be printed; more are dropped, oldest first."""
+
+
+class RunSession:
+    """One run of `edge-run` against one robot."""
+
+    def __init__(
+        self, artifacts: Artifacts, robot: RobotConfig, options: RunOptions, say: Callable[[str], None]
+    ) -> None:
+        """Open the graphs and warm them up. Raises ArtifactError, or InstructionError when the prompt is too long."""
+        runtime = artifacts.runtime
+        self._artifacts = artifacts
+        self._robot = robot
+        self._options = options
+        self._print = say
+        # Threads leave their lines here, the main thread hands them on.
+        self._lines: deque[str] = deque(maxlen=LINES)
+        self._period_ns = runtime.tick_period_ms * 1_000_000
+        self._schedule = schedule_for(artifacts)
+        self._lines.extend(self._schedule.notes)
+        self._loops: Loops | None = None
+        self._reporter = ServiceReporter(Notifier(os.environ), tick_period_ns=self._period_ns, describe=self._describe)
+        self._reporter.starting("opening the graphs", OPEN_S)
+        if artifacts.guided_by_waypoints and options.mode is Mode.NO_REASONING:
+            raise InstructionError(
+                f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
+                f"writes; run it with {Mode.ASYNC.value} or {Mode.SYNC.value}"
+            )
+        activity = TickActivity(self._period_ns)
+        policy = Policy(artifacts, schedule=self._schedule, activity=activity)
+        language = LanguageModel(artifacts, schedule=self._schedule)
+        self._check_instruction(language, options.instruction)
+        try:
+            tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+        except (GraphError, ContextOverflowError) as error:
+            raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
+        check_tick(artifacts, tick_ms)
+        self._engines = Engines(artifacts, policy, language, self._schedule, activity)
+        self._stop = threading.Event()
+        self._stop_requested = False
+        self._faults: list[str] = []
+        self._finished = threading.Event()
+        self._began = False
+        self.hung = False
+        """Whether reasoning hangs in a call that nothing but the end of the process ends."""
+
+    def _open_instructions(self, bridge: BridgeClient) -> InstructionSocket | None:
+        if self._options.instructions is None:
+            return None
+        try:
+            return InstructionSocket(
+                self._options.instructions,
+                check=lambda text: self._check_instruction(self._engines.language, text),
+                stop=lambda: self._stop_by_phrase(bridge),
+                bridge=self._robot.bridge.socket,
+            )
+        except OSError as error:
+            raise RefusedError(str(error)) from error
+
+    def _check_instruction(self, language: LanguageModel, text: str) -> None:
+        language.check_instruction(text, len(self._artifacts.runtime.frame_offsets_s))
+
+    def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
+        """Stop the robot and end the run; whether the bridge confirms the stop within STOP_CONFIRM_S."""
+        bridge.stop()
+        if STOP_PHRASE not in self._faults:
+            self._faults.append(STOP_PHRASE)
+        self._stop_requested = True
+        self._stop.set()
+        return disarm(bridge, limit_s=STOP_CONFIRM_S)
+
+    def _take_instructions(self, told: InstructionSocket | None, loops: Loops) -> None:
+        """Hand a new instruction on to reasoning; a stop phrase has stopped the robot when this returns."""
+        instruction = None if told is None else told.poll()
+        if instruction is not None:
+            loops.reasoning.submit(instruction)
+            self._print(f"new instruction: {instruction}")
+
+    def request_stop(self) -> None:
+        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
+        self._stop_requested = True
+
+    def run(self) -> dict[str, Any]:
+        """Arm, drive, stop; returns the result.
+
+        Raises RefusedError, ArtifactError, BridgeUnavailable, DdsError, CalibrationError or StoppedEarlyError before
+        the robot has moved.
+        """
+        refusal = None if self._options.record is None else space_refusal(self._options.record)
+        if refusal is not None:
+            raise RefusedError(f"--record {self._options.record}: {refusal}")
+        self._reporter.starting("waiting for the robot", READY_TIMEOUT_S + self._robot.bridge.arm_timeout_s + OPEN_S)
+        bridge = BridgeClient(self._robot.bridge.socket)
+        inputs: RobotInputs | None = None
+        recorder: Recorder | None = None
+        told: InstructionSocket | None = None
+        result: dict[str, Any] | None = None
+        end: Deadline | None = None
+        try:
+            sink = CommandTap(bridge)
+            inputs = RobotInputs(
+                self._robot,
+                image_px=self._artifacts.runtime.image_px,
+                period_ns=self._period_ns,
+                commanded=lambda: sink.commanded,
+                say=self._lines.append,
+                on_death=self._end_by,
+            )
+            inputs.camera.start()
+            self._await_inputs(inputs, bridge)
+            if self._options.record is not None:
+                recorder = Recorder(self._options.record)
+                if recorder.error is not None:
+                    raise RefusedError(recorder.error)
+            loops = self._loops = assemble(
+                self._engines,
+                self._robot,
+                self._options,
+                inputs,
+                sink,
+                recorder,
+                stop=self._stop,
+                say=self._lines.append,
+                on_tick=self._reporter.on_tick,
+            )
+            told = self._open_instructions(bridge)
+            loops.power.start()
+            # After everything that lives as long as the process has been made.
+            refused = lock_memory()
+            if refused is not None:
+                self._lines.append(refused)
+            freeze_garbage()
+            loops.control.last_seq = self._arm(bridge, loops, told)
+            self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
+            started_ns = time.monotonic_ns()
+            process = psutil.Process()
+            process.cpu_percent()
+            self._began = True
+            if recorder is not None:
+                recorder.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
+                inputs.recorder = recorder
+            end = self._drive(loops, inputs, bridge, told)
+            status = self._halt(bridge, end)
+            result = run_result(
+                loops.control,
+                loops.reasoning,
+                inputs,
+                status,
+                power_w=loops.power.statistics(),
+                faults=list(self._faults),
+                duration_s=(time.monotonic_ns() - started_ns) / 1e9,
+            )
+            result["cpu_percent"] = process.cpu_percent()
+            if recorder is not None:
+                recorder.put("/result", time.monotonic_ns(), result)
+        finally:
+            # Whatever ended the run: closing the connection makes the bridge stop the robot.
+            bridge.close()
+            if told is not None:
+                told.close()
+            end = end or Deadline(END_S)
+            if recorder is not None:
+                self._close_recorder(recorder, result, end)
+            if self._loops is not None:
+                end.run("close-power", self._loops.power.close)
+            if inputs is not None:
+                end.run("close-inputs", inputs.close)
+            self._print_lines()
+        return result
+
+    def _end_by(self, why: str) -> None:
+        """A thread that the run cannot do without has died; any thread."""
+        self._faults.append(why)
+        self._finished.set()
+
+    def _describe(self) -> str:
+        if self._loops is None:
+            return "starting"
+        supervision = self._loops.control.supervision
+        faults = f" ({', '.join(supervision.active)})" if supervision.active else ""
+        return f"{supervision.state.value}{faults}, {self._loops.reasoning.generations} generations"
+
+    def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient) -> None:
+        """Until there is a picture and a pose: a robot that an operator arms may be switched on hours later."""
+        waits = self._robot.safety.operator_arm
+        deadline, said = Deadline(READY_TIMEOUT_S), False
+        while not inputs.ready:
+            if self._stop_requested:
+                raise StoppedEarlyError("stopped before the robot was armed")
+            if self._finished.is_set():
+                raise RefusedError(self._faults[0])
+            bridge.poll()  # raises when it has gone
+            missing = "state" if inputs.history.newest() is None else "camera frame"
+            if deadline.left_s() <= 0 and not waits:
+                why = f" ({inputs.camera.last_error})" if inputs.camera.last_error else ""
+                where = f"DDS domain {self._robot.dds.domain} on {self._robot.dds.interface}"
+                raise RefusedError(f"no {missing} from the robot in {READY_TIMEOUT_S:.0f} s on {where}{why}: is it on?")
+            if waits:
+                self._reporter.on_wait(f"waiting for the robot: no {missing} yet")
+                self._print_lines()
+                if deadline.left_s() <= 0 and not said:
+                    said = True
+                    self._print(f"waiting for the robot: no {missing} yet, is it on?")
+            time.sleep(POLL_S)
+
+    def _arm(self, bridge: BridgeClient, loops: Loops, told: InstructionSocket | None) -> int:
+        """Arm, after an operator where the robot file wants one; returns the last sequence number used.
+
+        Raises RefusedError after a stop phrase, StoppedEarlyError after another request to stop.
+        """
+
+        def stop_requested() -> bool:
+            self._take_instructions(told, loops)
+            if told is not None and told.stopped:
+                raise RefusedError(f"not armed: {STOP_PHRASE}")
+            return self._stop_requested
+
+        def on_wait(text: str) -> None:
+            self._reporter.on_wait(text)
+            self._print_lines()
+
+        def in_the_way() -> str:
+            if self._finished.is_set():
+                raise RefusedError(self._faults[0])
+            return loops.pre_arm.in_the_way()
+
+        return arm(
+            bridge,
+            limit_s=self._robot.bridge.arm_timeout_s + 2.0,
+            stop_requested=stop_requested,
+            say=self._print,
+            on_wait=on_wait,
+            in_the_way=in_the_way,
+            operator=self._robot.safety.operator_arm,
+        )
+
+    def _drive(
+        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, told: InstructionSocket | None
+    ) -> Deadline:
+        """Run both threads until the end; this thread only waits and looks on. Returns by when all must have ended."""
+        # The bridge's deadman is already running: the first command must not wait for a whole period.
+        epoch_ns = time.monotonic_ns() + self._period_ns // 2
+        inputs.camera.align(epoch_ns - round(CAMERA_LEAD * self._period_ns))
+        duration_s = self._options.duration_s
+        end_ns = None if duration_s is None else epoch_ns + round(duration_s * 1e9)
+        control, reasoning = loops.control, loops.reasoning
+
+        def drive() -> None:
+            self._lines.extend(enter(self._schedule.control))
+            ended = control.run(epoch_ns, end_ns)
+            if ended is not None:
+                self._faults.append(f"the {control.ended_by} ended the run: {ended}")
+
+        def stop_robot() -> None:
+            # At once, not after the reasoning thread has been waited for.
+            bridge.stop()
+            self._reporter.stopping(self._faults[0] if self._faults else "the run has ended")
+
+        # Daemons: a thread that hangs in a driver must not keep the process from ending.
+        threads = [
+            threading.Thread(target=self._guard("control", drive, stop_robot), name="control", daemon=True),
+            threading.Thread(target=self._guard("reasoning", reasoning.run), name="reasoning", daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        self._look_on(loops, inputs, told)
+        self._stop.set()
+        end = Deadline(END_S)
+        reasoning.cancel()
+        join = Deadline(JOIN_S)
+        for thread in threads:
+            thread.join(join.left_s())
+            if thread.is_alive():
+                self._faults.append(f"the {thread.name} thread did not end within {JOIN_S:g} s")
+        return end
+
+    def _guard(
+        self, name: str, body: Callable[[], None], after: Callable[[], None] | None = None
+    ) -> Callable[[], None]:
+        """The body of a thread whose end is the end of the run; `after` is told when the faults are known."""
+
+        def target() -> None:
+            try:
+                body()
+            except BridgeUnavailable as error:
+                self._faults.append(f"bridge lost: {error}")
+            except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
+                self._faults.append(f"{name} thread died: {type(error).__name__}: {error}")
+            finally:
+                if after is not None:
+                    after()
+                self._finished.set()
+
+        return target
+
+    def _look_on(self, loops: Loops, inputs: RobotInputs, told: InstructionSocket | None) -> None:
+        """Until a thread has ended or a stop is asked for: hand on lines and instructions, watch over reasoning."""
+        reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
+        while not self._finished.wait(POLL_S):
+            if self._stop_requested:
+                self._stop.set()
+            if loops.control.supervision.says != says:
+                says = loops.control.supervision.says
+                self._print(says or "all faults have cleared")
+            self._print_lines()
+            self._take_instructions(told, loops)
+            hang = watch.step(reasoning.last_progress_ns, reasoning.generation_ms.quantile(1.0), time.monotonic_ns())
+            if hang is Hang.INTERRUPT:
+                self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")
+                reasoning.cancel()
+            elif hang is Hang.GIVE_UP and not self.hung:
+                self.hung = True
+                inputs.findings.put((Finding("reasoning-hung", f"for {watch.stood_s:.0f} s"),))
+
+    def _halt(self, bridge: BridgeClient, end: Deadline) -> BridgeStatus | None:
+        """Wait until the bridge has put zero on the wire (it does so in any case, within its deadman)."""
+        status: BridgeStatus | None = None
+        try:
+            confirm = Deadline(end.left_s(STOP_CONFIRM_S))
+            while confirm.left_s() > 0:
+                status = bridge.poll()
+                if status is not None and status.state == "stopped" and status.zero_after_stop:
+                    return status
+                time.sleep(0.01)
+            self._faults.append(f"the bridge did not confirm zero velocity within {STOP_CONFIRM_S:g} s")
+        except BridgeUnavailable as error:
+            if not self._faults:
+                self._faults.append(f"bridge lost: {error}")
+        return status
+
+    def _close_recorder(self, recorder: Recorder, result: dict[str, Any] | None, end: Deadline) -> None:
+        recorder.close(end.left_s())
+        if not self._began:
+            recorder.path.unlink(missing_ok=True)  # an empty log would only mislead
+            return
+        dropped = sum(recorder.dropped.values())
+        if result is not None:
+            result["recorder"] = recorder.statistics()
+        if recorder.error is not None:
+            self._print(f"the flight log is incomplete: {recorder.error}")
+        elif dropped:
+            self._print(f"the flight log lacks {dropped} records: writing was slower than the run")
+
+    def _print_lines(self) -> None:
+        while self._lines:
+            self._print(self._lines.popleft())

@@ -1,0 +1,303 @@
+"""Faults that the runner itself notices: its inputs, its model, its machine."""
+
+from __future__ import annotations
+
+from edge.safety.faults.row import Action, Escalation, Fault
+
+_HERE = "runner"
+_LOOP = "tests/edge/run/test_control_loop_faults.py::test_"
+_ROBOT = "tests/edge/run/test_robot_inputs.py::test_"
+
+INPUTS: tuple[Fault, ...] = (
+    Fault(
+        "camera-stopped", 1, Action.ZERO, 500, _HERE,
+        "There is no new picture to drive by.",
+        "Check the camera's cable and service; driving goes on 1 s after pictures are back.",
+        _LOOP + "a_camera_that_stops",
+    ),
+    Fault(
+        "camera-frozen", 2, Action.ZERO, 500, _HERE,
+        "The camera repeats pictures, or its scene stays the same, although the robot has moved.",
+        "If the robot did not slip on the spot, restart the camera service; driving goes on when the scene changes.",
+        _LOOP + "a_picture_that_does_not_change_while_the_robot_moves",
+    ),
+    Fault(
+        "camera-stale", 3, Action.ZERO, 300, _HERE,
+        "Pictures are more than 300 ms old when they arrive, too old to drive by.",
+        "Look for a queue or a slow network between camera and runner.",
+        _LOOP + "pictures_that_arrive_old",
+    ),
+    Fault(
+        "camera-from-future", 4, Action.ZERO, 300, _HERE,
+        "A picture carries a time that has not come yet.",
+        "Check what stamps the pictures: stamps must be this machine's monotonic clock.",
+        _LOOP + "a_picture_from_the_future",
+    ),
+    Fault(
+        "camera-slow", 5, Action.LIMIT, 1000, _HERE,
+        "The camera sends far fewer pictures than it should.",
+        "Look for load on the robot's computer or network; the robot drives at half speed.",
+        _LOOP + "half_of_the_pictures_missing",
+        speed_scale=0.5,
+    ),
+    Fault(
+        "camera-too-slow", 5, Action.ZERO, 2000, _HERE,
+        "The camera sends less than 40 % of its pictures.",
+        "Look for load on the robot's computer or network.",
+        _LOOP + "two_thirds_of_the_pictures_missing",
+    ),
+    Fault(
+        "frame-refused", 6, Action.LIMIT, 500, _HERE,
+        "A picture was black, saturated, torn or of the wrong size and was not used.",
+        "Nothing to do unless it comes back: then clean or replace the camera.",
+        _LOOP + "one_bad_picture",
+    ),
+    Fault(
+        "frames-refused", 6, Action.ZERO, 500, _HERE,
+        "Three pictures in a row were black, saturated, torn or of the wrong size.",
+        "Uncover or clean the lens, check the light, then the camera's cable.",
+        _LOOP + "three_bad_pictures_in_a_row",
+    ),
+    Fault(
+        "camera-swapped", 7, Action.STOP, 2000, _HERE,
+        "The pictures have another size than at the start: it is another camera or another setting.",
+        "Put the camera back that the robot was calibrated with and start the runner again.",
+        _LOOP + "another_camera",
+    ),
+    Fault(
+        "odometry-jump", 8, Action.ZERO, 100, _HERE,
+        "The robot's pose jumped further than the robot can move; the sample was not used.",
+        "Driving goes on by itself; a second jump stops the run.",
+        _ROBOT + "one_jump_of_the_pose_stops_the_robot_for_a_second",
+        escalation=Escalation("odometry-jumps", 2, 10_000),
+    ),
+    Fault(
+        "odometry-jumps", 8, Action.STOP, 100, _HERE,
+        "The robot's pose jumped twice within 10 s.",
+        "Check the robot's feet, IMU and firmware before arming again.",
+        _ROBOT + "two_jumps_of_the_pose_within_ten_seconds_stop_the_run",
+    ),
+    Fault(
+        "odometry-frozen", 9, Action.ZERO, 700, _HERE,
+        "The robot is told to move and its pose does not change.",
+        "Check that the robot stands free and that its state is not frozen; a second time within 10 s stops the run.",
+        _ROBOT + "a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second",
+        escalation=Escalation("odometry-stays-frozen", 2, 10_000),
+    ),
+    Fault(
+        "odometry-stays-frozen", 9, Action.STOP, 700, _HERE,
+        "The robot was told to move twice within 10 s and its pose did not change.",
+        "Free the robot, or restart it if it is free and its pose stands still, before arming again.",
+        _ROBOT + "a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run",
+    ),
+    Fault(
+        "odometry-not-finite", 10, Action.ZERO, 60, _HERE,
+        "The robot reports a pose or velocity that is no number or cannot be.",
+        "If it stays, restart the robot.",
+        _ROBOT + "a_pose_that_is_not_finite_stops_the_robot_within_its_bound",
+    ),
+    Fault(
+        "odometry-late", 11, Action.LIMIT, 300, _HERE,
+        "The robot's pose arrives late.",
+        "Look for load on the network to the robot; the robot drives at half speed.",
+        _ROBOT + "reports_that_stay_late_limit_the_speed_for_as_long_as_they_do",
+        speed_scale=0.5,
+    ),
+    Fault(
+        "odometry-stale", 11, Action.ZERO, 300, _HERE,
+        "The robot's pose is too old to drive by.",
+        "Check the cable to the robot and that the robot is on.",
+        _LOOP + "odometry_that_stops",
+    ),
+    Fault(
+        "odometry-speed-mismatch", 12, Action.STOP, 300, _HERE,
+        "Two measurements of the robot's speed or of its turning disagree.",
+        "Check for slipping feet, a stuck gyro and a wrong velocity frame in the robot file before arming again.",
+        _ROBOT + "two_speeds_that_disagree_stop_the_run_within_their_bound",
+    ),
+    Fault(
+        "link-lossy", 35, Action.LIMIT, 2000, _HERE,
+        "Many of the robot's state messages are lost.",
+        "Use the cable, not the radio; the robot drives at half speed.",
+        _ROBOT + "half_of_the_states_lost_from_the_start_limits_the_speed",
+        speed_scale=0.5,
+    ),
+    Fault(
+        "tipped-over", 64, Action.STOP, 100, _HERE,
+        "The robot leans by more than 30°: it was pushed, lifted or has fallen.",
+        "Put it on its feet by hand, look for damage, then arm again.",
+        _LOOP + "a_robot_that_tips_over",
+    ),
+    Fault(
+        "battery-low", 50, Action.LIMIT, 5000, _HERE,
+        "The battery is low.",
+        "Bring the robot home; it drives at half speed.",
+        _LOOP + "a_low_battery",
+        clear_ms=10_000,
+        speed_scale=0.5,
+    ),
+    Fault(
+        "battery-empty", 50, Action.STOP, 5000, _HERE,
+        "The battery is nearly empty.",
+        "Let the robot sit down with its remote and charge it.",
+        _LOOP + "an_empty_battery",
+    ),
+)  # fmt: skip
+
+MODEL: tuple[Fault, ...] = (
+    Fault(
+        "output-not-finite", 13, Action.ZERO, 40, _HERE,
+        "The action expert gave something that is not a number, or nothing.",
+        "If it stays, verify the artifacts: edge-export verify DIR.",
+        _LOOP + "an_output_that_is_not_finite",
+        clear_ms=500,
+    ),
+    Fault(
+        "output-out-of-range", 14, Action.LIMIT, 100, _HERE,
+        "The action expert asked for far more speed than the robot may drive; it was cut to the limit.",
+        "Nothing to do unless it comes back.",
+        _LOOP + "one_output_out_of_range",
+        escalation=Escalation("output-out-of-range-often", 5, 1000),
+    ),
+    Fault(
+        "output-out-of-range-often", 14, Action.STOP, 1000, _HERE,
+        "The action expert asked five times within 1 s for far more speed than the robot may drive.",
+        "Do not drive with these artifacts: verify them, then look at the flight log.",
+        _LOOP + "five_outputs_out_of_range",
+    ),
+    Fault(
+        "output-unsteady", 15, Action.LIMIT, 1000, _HERE,
+        "The action expert keeps changing its mind faster than the robot may follow.",
+        "Look at the flight log; the robot drives at half speed.",
+        _LOOP + "an_output_that_wavers",
+        speed_scale=0.5,
+    ),
+    Fault(
+        "output-oscillating", 15, Action.ZERO, 1000, _HERE,
+        "The action expert's output swings from one side to the other at every tick.",
+        "Look at the flight log before driving on with these artifacts.",
+        _LOOP + "an_output_that_oscillates",
+    ),
+    Fault(
+        "output-constant", 16, Action.ZERO, 2500, _HERE,
+        "The action expert gives the same plan although what it sees has changed for 2 s.",
+        "Verify the artifacts; a network that ignores its inputs must not drive.",
+        _LOOP + "an_output_that_never_changes",
+    ),
+    Fault(
+        "semantic-old", 17, Action.LIMIT, 10_300, _HERE,
+        "The last answer of the reasoning is older than the policy was trained for; the speed falls with its age.",
+        "Reasoning is slow: allow fewer tokens or more power.",
+        _LOOP + "an_old_semantic_state",
+    ),
+    Fault(
+        "semantic-expired", 17, Action.ZERO, 15_300, _HERE,
+        "The last answer of the reasoning is too old to drive by.",
+        "Driving goes on with its next answer; a call that hangs is interrupted.",
+        _LOOP + "reasoning_that_hangs",
+    ),
+    Fault(
+        "reasoning-failed", 18, Action.LIMIT, 300, _HERE,
+        "A run of the reasoning failed; the next one is tried.",
+        "Nothing to do unless it comes back.",
+        _LOOP + "one_failure_of_the_reasoning",
+        escalation=Escalation("reasoning-failing", 5, 60_000),
+    ),
+    Fault(
+        "reasoning-failing", 18, Action.STOP, 300, _HERE,
+        "Reasoning failed five times within 60 s.",
+        "Verify the artifacts and look at the memory in use: edge-doctor.",
+        _LOOP + "five_failures_of_the_reasoning",
+    ),
+    Fault(
+        "reasoning-hung", 17, Action.STOP, 30_300, _HERE,
+        "The reasoning hangs in a call that an interrupt does not end.",
+        "The runner ends and its service starts it again; look at the kernel log for the accelerator's driver.",
+        "tests/edge/safety/test_reasoning_watch.py::test_a_call_that_an_interrupt_does_not_end_is_given_up",
+    ),
+    Fault(
+        "semantic-text-invalid", 19, Action.ZERO, 300, _HERE,
+        "Three answers of the reasoning in a row were not in the agreed form.",
+        "Check that the model belongs to these artifacts; driving goes on with its next valid answer.",
+        _LOOP + "three_invalid_texts",
+    ),
+    Fault(
+        "instruction-injected", 20, Action.NOTHING, 0, _HERE,
+        "A text tries to change the robot's limits.",
+        "Nothing to do: no text can reach a limit.",
+        _LOOP + "a_thousand_texts_leave_every_limit_as_it_is",
+    ),
+    Fault(
+        "stop-phrase", 47, Action.STOP, 300, _HERE,
+        "A stop phrase came by the instruction channel.",
+        "Find out why, then edge-bridge arm, then start a new run.",
+        "tests/process/bridge/test_stop_phrase_process.py::"
+        "test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_itself",
+    ),
+    Fault(
+        "semantic-delay-invalid", 21, Action.ZERO, 100, _HERE,
+        "The reasoning's answer carries a time that has not come yet.",
+        "Restart the runner; if it stays, report it with the flight log.",
+        _LOOP + "a_semantic_state_from_the_future",
+    ),
+)  # fmt: skip
+
+MACHINE: tuple[Fault, ...] = (
+    Fault(
+        "tick-late", 22, Action.LIMIT, 1000, _HERE,
+        "The control loop is often late.",
+        "Something else uses the processor: edge-doctor says what; the robot drives at half speed.",
+        _LOOP + "ticks_that_are_often_late",
+        speed_scale=0.5,
+    ),
+    Fault(
+        "tick-overrun", 22, Action.ZERO, 300, _HERE,
+        "The last pass of the control loop took longer than two periods.",
+        "Something else uses the processor: edge-doctor says what.",
+        _LOOP + "a_tick_that_takes_too_long",
+    ),
+    Fault(
+        "wall-clock-moved", 33, Action.NOTHING, 0, _HERE,
+        "The machine's date was changed.",
+        "Nothing to do: control runs on the monotonic clock.",
+        "tests/edge/safety/test_fault_table.py::test_control_code_never_reads_the_wall_clock",
+    ),
+    Fault(
+        "suspended", 34, Action.STOP, 300, _HERE,
+        "The machine slept while the robot was armed: everything that is known is old.",
+        "Turn suspend off on this machine, then arm again.",
+        _LOOP + "a_machine_that_slept",
+    ),
+    Fault(
+        "clock-backwards", 34, Action.STOP, 300, _HERE,
+        "The monotonic clock went backwards.",
+        "Restart the machine; if it stays, its clock source is broken.",
+        _LOOP + "a_clock_that_runs_backwards",
+    ),
+    Fault(
+        "thermal-throttle", 48, Action.LIMIT, 2000, _HERE,
+        "The machine is hot and has lowered its clocks.",
+        "Let it cool: check fan and dust; the robot drives at half speed.",
+        _LOOP + "a_machine_that_throttles",
+        clear_ms=5000,
+        speed_scale=0.5,
+    ),
+    Fault(
+        "thermal-trip", 48, Action.STOP, 2000, _HERE,
+        "The machine is about to switch itself off from heat.",
+        "Let it cool down before arming again.",
+        _LOOP + "a_machine_at_its_thermal_trip",
+    ),
+    Fault(
+        "log-disk-full", 51, Action.NOTHING, 0, _HERE,
+        "The flight log's disk is full: records are dropped and counted, driving goes on.",
+        "Free space before the next run.",
+        "tests/edge/flightlog/test_recorder.py::test_a_disk_that_is_full_stops_writing_and_is_reported",
+    ),
+    Fault(
+        "log-disk-stalled", 52, Action.NOTHING, 0, _HERE,
+        "The flight log's disk hangs: records are dropped and counted, driving goes on.",
+        "Check the disk before the next run.",
+        "tests/edge/flightlog/test_recorder.py::test_a_hanging_disk_costs_the_caller_records_not_time",
+    ),
+)  # fmt: skip

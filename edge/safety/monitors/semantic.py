@@ -1,0 +1,74 @@
+"""Is the reasoning's answer fit to drive by? Its age, its text, and whether new ones come at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edge.safety.faults.findings import Finding
+from edge.state.semantic import SemanticState
+
+INVALID_IN_A_ROW = 3
+_FAILURES_TOLD = 5
+
+
+@dataclass(frozen=True)
+class SemanticConfig:
+    """How old an answer may be. At `trained_delay_s` the speed begins to fall, `fade_s` later it is zero."""
+
+    trained_delay_s: float = 10.0
+    """The largest Δt that the policy was trained for (the targets' runtime.max_delay_s)."""
+    fade_s: float = 5.0
+    judge_text: bool = False
+    """Whether three texts in a row that are not in the agreed form stop the robot; not for an untrained model."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.trained_delay_s <= 600 and 0 < self.fade_s <= 600):
+            raise ValueError(f"semantic ages must be 0 to 600 s, found {self.trained_delay_s} and {self.fade_s}")
+
+    def given_delay_s(self, delay_s: float) -> float:
+        """Δt as the action expert is told it: never beyond what it was trained for, never negative."""
+        return min(max(delay_s, 0.0), self.trained_delay_s)
+
+
+class SemanticMonitor:
+    """Remembers the last generation and how many texts in a row were invalid."""
+
+    def __init__(self, config: SemanticConfig) -> None:
+        self._config = config
+        self._generation: int | None = None
+        self._invalid = 0
+        self._failed = 0
+
+    def step(self, semantic: SemanticState | None, failed: int, now_ns: int, invalid: int = 0) -> tuple[Finding, ...]:
+        """Judge the newest semantic state; `failed` counts the runs of the reasoning that failed so far.
+
+        `invalid`: texts in a row, up to now, that were not in the agreed form. A policy that is guided by waypoints is
+        never given such a text, so it cannot be seen in the state.
+        """
+        findings: list[Finding] = []
+        for _ in range(min(failed - self._failed, _FAILURES_TOLD)):
+            findings.append(Finding("reasoning-failed", f"{failed} in this run"))
+        self._failed = max(self._failed, failed)
+        self._count(semantic)
+        if self._config.judge_text and max(self._invalid, invalid) >= INVALID_IN_A_ROW:
+            findings.append(Finding("semantic-text-invalid"))
+        if semantic is None:
+            return tuple(findings)
+        delay_s = semantic.delay_s(now_ns)
+        over_s = delay_s - self._config.trained_delay_s
+        if delay_s < 0:
+            findings.append(Finding("semantic-delay-invalid", f"{-delay_s:.3f} s ahead"))
+        elif over_s >= self._config.fade_s:
+            findings.append(Finding("semantic-expired", f"{delay_s:.1f} s old"))
+        elif over_s > 0:
+            findings.append(Finding("semantic-old", f"{delay_s:.1f} s old", 1 - over_s / self._config.fade_s))
+        return tuple(findings)
+
+    def _count(self, semantic: SemanticState | None) -> None:
+        if semantic is None or semantic.generation == self._generation:
+            return
+        self._generation = semantic.generation
+        if semantic.waypoints is not None:
+            self._invalid = 0
+        elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
+            self._invalid += 1

@@ -1,0 +1,141 @@
+"""All monitors together, in the order in which a tick needs them, and where they get what the tick does not know."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.geometry import SE2
+from edge.motion.controller import ControllerConfig
+from edge.safety.faults.findings import Finding, FindingQueue
+from edge.safety.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs, Picture
+from edge.safety.monitors.machine import MachineMonitor
+from edge.safety.monitors.output import OutputConfig, OutputMonitor
+from edge.safety.monitors.robot import Attitude, RobotMonitor, RobotWatchConfig
+from edge.safety.monitors.semantic import SemanticConfig, SemanticMonitor
+from edge.state.pose_history import StampedPose
+from edge.state.semantic import SemanticState
+
+
+def asleep_ns() -> int:
+    """How long this machine has slept since it was started: boot time less monotonic time.
+
+    Boot time is read first: a thread that is held up between the two readings gives less, never more.
+    """
+    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return boot_ns - time.monotonic_ns()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What monitors ask for in every tick; none may wait or raise. The defaults know nothing."""
+
+    findings: FindingQueue = field(default_factory=FindingQueue)
+    """What other threads have found: odometry, battery, heat."""
+    attitude: Callable[[], Attitude | None] = lambda: None
+    states: Callable[[], int | None] = lambda: None
+    """State messages of the robot so far."""
+    malformed: Callable[[], int] = lambda: 0
+    """Of them, those that were dropped because something in them cannot be."""
+    failed_generations: Callable[[], int] = lambda: 0
+    invalid_texts: Callable[[], int] = lambda: 0
+    """Complete texts in a row, up to the newest, that were not in the agreed form, also those never published."""
+    asleep_ns: Callable[[], int] = asleep_ns
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """What each monitor expects."""
+
+    frame: FrameConfig
+    output: OutputConfig
+    semantic: SemanticConfig
+    robot: RobotWatchConfig
+    period_ns: int
+
+    @staticmethod
+    def standard(
+        controller: ControllerConfig,
+        period_ns: int,
+        *,
+        image_px: int | None = None,
+        camera_hz: float | None = None,
+        semantic: SemanticConfig | None = None,
+    ) -> WatchConfig:
+        """The fault matrix's values for a robot and a tick; `image_px` None: whatever size the camera gives."""
+        tick_hz = 1e9 / period_ns
+        stale_ms = min(controller.odometry_max_age_ms, RobotWatchConfig.stale_ms)
+        return WatchConfig(
+            frame=FrameConfig(image_px, tick_hz if camera_hz is None else min(camera_hz, tick_hz)),
+            output=OutputConfig(controller.limits, controller.step_s, period_ns / 1e9),
+            semantic=semantic or SemanticConfig(),
+            robot=RobotWatchConfig(late_ms=min(RobotWatchConfig.late_ms, stale_ms), stale_ms=stale_ms),
+            period_ns=period_ns,
+        )
+
+
+class Watch:
+    """One of each monitor."""
+
+    def __init__(self, config: WatchConfig, sources: Sources | None = None) -> None:
+        self._sources = sources or Sources()
+        self._frame = FrameMonitor(config.frame)
+        self._output = OutputMonitor(config.output)
+        self._semantic = SemanticMonitor(config.semantic)
+        self._robot = RobotMonitor(config.robot)
+        self._machine = MachineMonitor(config.period_ns)
+        self._pictures = FrameOutputs(False, 0, ())
+        self.given_delay_s = config.semantic.given_delay_s
+
+    def begin(self) -> None:
+        """Driving begins now: what other threads found while the robot was stood up is over."""
+        self._sources.findings.take()
+        self._robot.begin(self._sources.malformed())
+
+    def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
+        """Before the encoder: whether the newest picture may be used. What was found is told by `tick`."""
+        self._pictures = self._frame.step(picture, T_odom_base, now_ns)
+        return self._pictures.usable
+
+    def urgent(self) -> tuple[Finding, ...]:
+        """What must not wait for the next tick: other threads' findings, a tipped robot, a report that cannot be."""
+        sources = self._sources
+        return (*sources.findings.take(), *self._robot.urgent(sources.attitude(), sources.malformed()))
+
+    def standing(self, picture: Picture | None, pose: StampedPose | None, now_ns: int) -> tuple[Finding, ...]:
+        """Before arming: what was found of the newest picture, the robot and by other threads."""
+        self.picture(picture, None if pose is None else pose.T_odom_base, now_ns)
+        return (
+            *self.urgent(),
+            *self._pictures.findings,
+            *self._frame.age(None if picture is None else picture.stamp_ns, now_ns),
+            *self._robot.step(pose, self._sources.states(), now_ns),
+        )
+
+    def tick(
+        self,
+        trajectory: npt.NDArray[np.float32] | None,
+        semantic: SemanticState | None,
+        pose: StampedPose | None,
+        driven_ns: int | None,
+        last_tick_ns: int | None,
+        now_ns: int,
+    ) -> tuple[Finding, ...]:
+        """After the action expert: what was found of the picture and of everything else, the urgent included.
+
+        `driven_ns`: when the picture that is driven by was captured; `last_tick_ns`: how long the last tick took.
+        """
+        sources = self._sources
+        return (
+            *self.urgent(),
+            *self._pictures.findings,
+            *self._frame.age(driven_ns, now_ns),
+            *self._output.step(trajectory, self._pictures.content, now_ns),
+            *self._semantic.step(semantic, sources.failed_generations(), now_ns, sources.invalid_texts()),
+            *self._robot.step(pose, sources.states(), now_ns),
+            *self._machine.step(last_tick_ns, sources.asleep_ns(), now_ns),
+        )

@@ -1,0 +1,60 @@
+"""The semantic state: what the control thread knows of the last released generation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.geometry import SE2
+from edge.state.reasoning_text import Waypoints, means_to_wait
+
+Context = Mapping[str, npt.NDArray[np.generic]]
+"""The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
+
+
+@dataclass(frozen=True)
+class SemanticState:
+    """Immutable result of one generation, with the anchor that its keys and values belong to.
+
+    It is published by a single reference assignment, so keys, values and anchor can never be of two generations.
+    """
+
+    generation: int
+    anchor_ns: int
+    T_odom_anchor: SE2
+    ready_ns: int
+    last_layer_kv: npt.NDArray[np.float32]
+    """K‖V of the language model's last layer, [1, T, kv_dim]."""
+    context: Context
+    text: str
+    waypoints: Waypoints | None
+    text_complete: bool = True
+    """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
+    T_odom_stop: SE2 | None = None
+    """Where this answer and those before it mean to stop (`edge.reasoning.arrival`)."""
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether its words mean to let somebody pass first; read once, not in every tick."""
+        return means_to_wait(self.text)
+
+    def delay_s(self, now_ns: int) -> float:
+        """Δt: now − anchor (inference time plus time since it finished)."""
+        return (now_ns - self.anchor_ns) / 1e9
+
+    def motion_offset(self, T_odom_base: SE2) -> SE2:
+        """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
+        return self.T_odom_anchor.inverse() @ T_odom_base
+
+
+class SemanticSlot:
+    """Where the reasoning thread leaves its newest result; reading and replacing a field are single operations."""
+
+    def __init__(self) -> None:
+        self.state: SemanticState | None = None
+        self.drive_until_ns: int | None = None
+        """Until when there may be driving; None: no such limit."""

@@ -1,0 +1,295 @@
+"""Cache of finished build stages: what a stage is made from names its result, so nothing is made twice.
+
+An entry is a directory `<key>/` with the stage's files and `entry.json`, their sizes and hashes. It is built in
+`<key>.partial` and renamed, so an interrupted stage leaves no entry; its hashes are checked on every use, so a damaged
+one is rebuilt, not shipped. Files leave the cache by copy only: nothing done to an output can reach what is kept here.
+"""
+
+from __future__ import annotations
+
+import ast
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from edge.core.cli import write_whole
+
+ENTRY_NAME = "entry.json"
+RESULT_NAME = "result.json"
+PACKAGES = ("numpy", "onnx", "onnxscript", "safetensors", "tokenizers", "torch")
+VARIANTS = ("onnxruntime", "opencv-python")
+"""Packages that also come under longer names (`onnxruntime-gpu`, `opencv-python-headless`): every one counts."""
+SOURCE_FOLDERS = ("edge", "export")
+DATA_SUFFIXES = (".json", ".toml")
+_LOCK_NAME = "lock"
+_TIMINGS_NAME = "timings.json"
+_MARKER_NAME = ".tic-vla-edge-cache"
+_OURS = re.compile(r"[0-9a-f]{64}(\.partial|\.building)?", re.ASCII)
+"""Names of entries and of what is around one while it is built; nothing of another name is ever removed."""
+_CHUNK_BYTES = 1 << 22
+
+
+class CacheError(OSError):
+    """A cache directory that cannot be used; its text is the one line to show."""
+
+
+def default_cache_dir(environ: Mapping[str, str]) -> Path:
+    """`$XDG_CACHE_HOME/tic-vla-edge`, or `~/.cache/tic-vla-edge` where that is not set to an absolute path."""
+    named = Path(environ.get("XDG_CACHE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".cache") / "tic-vla-edge"
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, read in pieces; raises OSError."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while piece := stream.read(_CHUNK_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+@lru_cache
+def source_sha256(modules: tuple[str, ...]) -> str:
+    """Hash of our modules, of all of ours that they import, and of the data files beside these.
+
+    Another version of that code finds none of the old entries; an edit anywhere else leaves them valid.
+    """
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
+    waiting, found = list(modules), dict[str, Path]()
+    while waiting:
+        name = waiting.pop()
+        path = _module_file(root, name)
+        if path is not None and name not in found:
+            found[name] = path
+            waiting += [imported for imported in _imports(path) if imported.split(".")[0] in SOURCE_FOLDERS]
+    folders = {path.parent for path in found.values()}
+    data = {path for folder in folders for path in folder.iterdir() if path.suffix in DATA_SUFFIXES}
+    for path in sorted({*found.values(), *data}):
+        digest.update(f"{path.relative_to(root).as_posix()}:{file_sha256(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _module_file(root: Path, name: str) -> Path | None:
+    """A module's file; None for a name inside a module."""
+    stem = root.joinpath(*name.split("."))
+    candidates = [stem.with_suffix(".py"), stem / "__init__.py"]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _imports(path: Path) -> set[str]:
+    """Names that a file imports, at its top or inside functions; `from a import b` may mean the module a.b."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+@lru_cache
+def package_versions() -> dict[str, str]:
+    """Installed versions of the packages that a result depends on."""
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    for distribution in importlib.metadata.distributions():
+        name = str(distribution.metadata["Name"] or "").lower().replace("_", "-")
+        if any(name == variant or name.startswith(f"{variant}-") for variant in VARIANTS):
+            found[name] = distribution.version
+    return dict(sorted(found.items()))
+
+
+def stage_key(stage: str, parts: Mapping[str, Any], modules: Sequence[str]) -> str:
+    """SHA-256 of everything that a stage's result follows from: `parts` (plain JSON) and the code of `modules`."""
+    source = source_sha256(tuple(sorted(modules)))
+    content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def fsync_path(path: Path) -> None:
+    """Force a file or directory to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
+    """A cache to work with; afterwards the entries used longest ago go until the rest fits `limit_bytes`.
+
+    Entries go only while no other process has the cache open. Raises CacheError, also for a directory of another use.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        _claim(directory)
+        descriptor = os.open(directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+    except CacheError:
+        raise
+    except OSError as error:
+        raise CacheError(
+            f"cache {directory}: cannot be written ({error.strerror}); name another with --cache DIR or use --no-cache"
+        ) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        cache = StageCache(directory, say)
+        try:
+            yield cache
+        finally:
+            if _try_lock(descriptor):
+                cache.prune(limit_bytes)
+    finally:
+        os.close(descriptor)
+
+
+def _claim(directory: Path) -> None:
+    """Mark a directory as a cache of ours; raises CacheError for one that holds anything else."""
+    marker = directory / _MARKER_NAME
+    if marker.exists():
+        return
+    known = (_LOCK_NAME, _TIMINGS_NAME)
+    others = sorted(p.name for p in directory.iterdir() if p.name not in known and not _OURS.fullmatch(p.name))
+    if others:
+        raise CacheError(
+            f"cache {directory}: holds {others[0]}, which no cache of ours does; name an empty or a new directory"
+        )
+    marker.touch()
+
+
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class StageCache:
+    """Finished stages in a directory, each under the hash of what it was made from; made by `open_cache`."""
+
+    directory: Path
+    say: Callable[[str], None]
+
+    def fetch_or_build(self, key: str, build: Callable[[Path], None]) -> tuple[Path, bool]:
+        """Directory of a stage's files and whether they were there already; else `build` writes them.
+
+        A second process that wants the same stage waits for the first and takes its result. Whatever `build` raises
+        comes through and leaves no entry.
+        """
+        entry = self.directory / key
+        with self._locked(key):
+            if entry.exists():
+                damage = _damage(entry)
+                if damage is None:
+                    os.utime(entry / ENTRY_NAME)  # its age counts from its last use
+                    return entry, True
+                self.say(f"cache: {damage}; building it again")
+                shutil.rmtree(entry)
+            partial = self.directory / f"{key}.partial"
+            shutil.rmtree(partial, ignore_errors=True)  # left by a process that was killed
+            partial.mkdir()
+            try:
+                build(partial)
+                _seal(partial)
+                partial.rename(entry)
+                fsync_path(self.directory)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+        return entry, False
+
+    def result(self, key: str, compute: Callable[[], Mapping[str, Any]]) -> tuple[dict[str, Any], bool]:
+        """A stage whose result is plain JSON, and whether it was there already."""
+
+        def build(directory: Path) -> None:
+            text = json.dumps(compute(), indent=1, sort_keys=True, allow_nan=False) + "\n"
+            (directory / RESULT_NAME).write_text(text, encoding="utf-8")
+
+        entry, cached = self.fetch_or_build(key, build)
+        content: dict[str, Any] = json.loads((entry / RESULT_NAME).read_text(encoding="utf-8"))
+        return content, cached
+
+    def timings(self, run: str) -> dict[str, float]:
+        """Seconds that each stage took the last time it was built for this kind of run; empty when unknown."""
+        known = self._all_timings().get(run)
+        pairs = known.items() if isinstance(known, dict) else ()
+        return {k: float(v) for k, v in pairs if isinstance(v, int | float) and not isinstance(v, bool) and v >= 0}
+
+    def remember_timings(self, run: str, seconds: Mapping[str, float]) -> None:
+        """Keep the seconds of the stages that were built; they only serve the next run's estimate."""
+        content = self._all_timings()
+        content[run] = {**self.timings(run), **{k: round(v, 3) for k, v in seconds.items()}}
+        write_whole(self.directory / _TIMINGS_NAME, json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+    def _all_timings(self) -> dict[str, Any]:
+        try:
+            content = json.loads((self.directory / _TIMINGS_NAME).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}  # never there before, or damaged: an estimate is not worth an error
+        return content if isinstance(content, dict) else {}
+
+    def prune(self, limit_bytes: int) -> None:
+        """Drop leftovers of killed processes and the entries used longest ago, until the rest fits."""
+        ours = [path for path in self.directory.iterdir() if _OURS.fullmatch(path.name) and not path.is_symlink()]
+        for leftover in [path for path in ours if path.suffix]:
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+        entries = [path for path in ours if not path.suffix and path.is_dir()]
+        total = sum(map(_size_bytes, entries))
+        for entry in sorted(entries, key=_last_used_ns):
+            if total <= limit_bytes:
+                return
+            total -= _size_bytes(entry)
+            shutil.rmtree(entry)
+
+    @contextmanager
+    def _locked(self, key: str) -> Iterator[None]:
+        descriptor = os.open(self.directory / f"{key}.building", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def _seal(directory: Path) -> None:
+    """Record what is in a finished stage, and force all of it to the disk before it gets its name."""
+    files = sorted(path for path in directory.iterdir())
+    content = {path.name: {"sha256": file_sha256(path), "bytes": path.stat().st_size} for path in files}
+    entry = directory / ENTRY_NAME
+    entry.write_text(json.dumps({"files": content}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    for path in [*files, entry, directory]:
+        fsync_path(path)
+
+
+def _damage(entry: Path) -> str | None:
+    """What is wrong with an entry; None when every file is what was recorded and no file is beside them."""
+    try:
+        files = json.loads((entry / ENTRY_NAME).read_text(encoding="utf-8"))["files"]
+        found = sorted(path.name for path in entry.iterdir() if path.name != ENTRY_NAME)
+        if found != sorted(files):
+            return f"{entry.name[:12]}… holds {found}, recorded were {sorted(files)}"
+        for name, recorded in files.items():
+            if file_sha256(entry / name) != recorded["sha256"]:
+                return f"{entry.name[:12]}…/{name} is not what was stored"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"{entry.name[:12]}… cannot be read ({error})"
+    return None
+
+
+def _size_bytes(entry: Path) -> int:
+    return sum(path.stat().st_size for path in entry.iterdir())
+
+
+def _last_used_ns(entry: Path) -> int:
+    record = entry / ENTRY_NAME
+    return record.stat().st_mtime_ns if record.exists() else 0

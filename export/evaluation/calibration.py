@@ -1,0 +1,276 @@
+"""Calibration data: named, hashed walks of a robot through people; never random.
+
+A name is a set that ships in `export/calibration_sets/`, `folder:PATH` (a user's images in the order of their names) or
+`video:PATH`. What a user's pictures do not say (poses, velocities) is assumed, and `Clip.assumed` says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.geometry import SE2
+from edge.reasoning.prompt import InstructionError, check_instruction
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Picture = npt.NDArray[np.uint8]
+
+SETS = Path(__file__).parents[1] / "calibration_sets"
+CLIP_S = 20.0
+"""Shortest clip: 9 s of the frames before an anchor, 10 s of growing delay after it, and 1 s to choose anchors in."""
+MAX_GAP_S = 1.5
+MAX_CLIPS = 3
+"""Clips taken from a user's folder or video: more would cost minutes at paper size and change no decision."""
+MAX_SIDE_PX = 960
+ASSUMED_SPEED_MPS = 0.5
+ASSUMED_INSTRUCTION = "walk straight ahead"
+IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
+
+
+class CalibrationError(ValueError):
+    """A calibration set that is not known, cannot be read or is too short."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture, uint8 RGB [h, w, 3], where the robot was and how fast it moved (vx m/s, vy m/s, ωz rad/s)."""
+
+    stamp_ns: int
+    image: Picture
+    T_odom_base: SE2
+    velocity: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """At least 20 s of frames about 1 s apart, oldest first, and the instruction that was followed."""
+
+    name: str
+    instruction: str
+    frames: tuple[Frame, ...]
+    assumed: str = ""
+    """What was not recorded but assumed, in words; empty when everything was recorded."""
+
+    def __post_init__(self) -> None:
+        stamps = [frame.stamp_ns / 1e9 for frame in self.frames]
+        gaps = [b - a for a, b in itertools.pairwise(stamps)]
+        length_s = stamps[-1] - stamps[0] if stamps else 0.0
+        if length_s < CLIP_S - 1e-6:
+            raise CalibrationError(f"clip {self.name}: {length_s:.1f} s long, at least {CLIP_S:.0f} s are needed")
+        if min(gaps) <= 0 or max(gaps) > MAX_GAP_S:
+            raise CalibrationError(
+                f"clip {self.name}: frames are {min(gaps):.2f} to {max(gaps):.2f} s apart, expected about 1 s"
+            )
+        try:
+            check_instruction(self.instruction)
+        except InstructionError as error:
+            raise CalibrationError(f"clip {self.name}: {error}") from error
+
+
+@dataclass(frozen=True)
+class CalibrationSet:
+    """Clips with the SHA-256 of every file they came from."""
+
+    name: str
+    """Of a set that ships, or kind and base name of a user's own (`folder:corridor`): no path of a machine."""
+    sha256: str
+    clips: tuple[Clip, ...]
+
+    @property
+    def frames(self) -> int:
+        """Number of pictures."""
+        return sum(len(clip.frames) for clip in self.clips)
+
+    def to_dict(self) -> dict[str, object]:
+        """What the manifest keeps: name, hash, counts and what was assumed."""
+        assumed = sorted({clip.assumed for clip in self.clips if clip.assumed})
+        return {
+            "name": self.name,
+            "sha256": self.sha256,
+            "clips": len(self.clips),
+            "frames": self.frames,
+            "assumed": "; ".join(assumed),
+        }
+
+
+def list_calibration_sets() -> list[str]:
+    """Names of the sets that ship."""
+    return sorted(path.parent.name for path in SETS.glob("*/set.toml"))
+
+
+def load_calibration(name: str) -> CalibrationSet:
+    """The set of that name, `folder:PATH` or `video:PATH`; raises CalibrationError with one clear line."""
+    kind, colon, path = name.partition(":")
+    if colon and kind in USER_KINDS and path:
+        return USER_KINDS[kind](f"{kind}:{Path(path).resolve().name}", Path(path))
+    if name not in list_calibration_sets():
+        known = ", ".join(list_calibration_sets())
+        raise CalibrationError(
+            f"calibration set {name!r} is not known; expected one of: {known}, folder:PATH, video:PATH"
+        )
+    return read_set(SETS / name)
+
+
+def read_set(directory: Path) -> CalibrationSet:
+    """A set from its directory (set.toml and the pictures it lists, nothing else); raises CalibrationError."""
+    where = f"calibration set {directory.name}"
+    try:
+        contents = {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
+        content = tomllib.loads(contents["set.toml"].decode("utf-8"))
+    except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CalibrationError(f"{where}: set.toml cannot be read ({error})") from error
+    _check_keys(content, {"schema", "name", "description", "clips"}, where)
+    if content["schema"] != 1 or content["name"] != directory.name or not isinstance(content["clips"], list):
+        raise CalibrationError(f"{where}: expected schema 1, the directory's name and a list of clips")
+    clips = tuple(_clip(item, contents, where) for item in content["clips"])
+    listed = {file["file"] for item in content["clips"] for file in item["frames"]}
+    if listed | {"set.toml"} != set(contents):
+        other = sorted(set(contents) - listed - {"set.toml"})
+        raise CalibrationError(f"{where}: holds files that set.toml does not list: {', '.join(other[:3])}")
+    if not clips:
+        raise CalibrationError(f"{where}: has no clips")
+    return CalibrationSet(directory.name, _hash(contents), clips)
+
+
+def _check_keys(content: object, keys: set[str], where: str) -> None:
+    found = set(content) if isinstance(content, dict) else set()
+    if found != keys:
+        raise CalibrationError(f"{where}: unknown keys {sorted(found - keys)}, missing keys {sorted(keys - found)}")
+
+
+def _clip(item: Any, contents: dict[str, bytes], where: str) -> Clip:
+    _check_keys(item, {"name", "instruction", "frames"}, where)
+    frames = []
+    if not isinstance(item["frames"], list):
+        raise CalibrationError(f"{where}: frames of a clip must be an array")
+    for row in item["frames"]:
+        _check_keys(row, {"file", "stamp_s", "pose", "velocity"}, where)
+        file, pose, velocity = row["file"], row["pose"], row["velocity"]
+        if file not in contents:
+            raise CalibrationError(f"{where}: {file} is missing")
+        if not isinstance(pose, list) or not isinstance(velocity, list):
+            raise CalibrationError(f"{where}: {file}: pose and velocity must be arrays")
+        numbers = [row["stamp_s"], *pose, *velocity]
+        finite = all(isinstance(v, int | float) and math.isfinite(v) for v in numbers)
+        if len(pose) != 3 or len(velocity) != 3 or not finite:
+            raise CalibrationError(f"{where}: {file}: stamp_s, pose and velocity must be finite: 1, 3 and 3 numbers")
+        vx, vy, wz = (float(v) for v in velocity)
+        image = _decode(contents[file], f"{where}: {file}")
+        frames.append(Frame(round(row["stamp_s"] * 1e9), image, SE2(*map(float, pose)), (vx, vy, wz)))
+    return Clip(str(item["name"]), str(item["instruction"]), tuple(frames))
+
+
+def _hash(contents: dict[str, bytes]) -> str:
+    digest = hashlib.sha256()
+    for name, data in sorted(contents.items()):
+        digest.update(f"{name}\0{len(data)}\0".encode())
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def _decode(data: bytes, where: str) -> Picture:
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if bgr is None:
+        raise CalibrationError(f"{where} is not a readable image")
+    return _rgb(bgr)
+
+
+def _rgb(bgr: npt.NDArray[Any]) -> Picture:
+    """RGB, at most MAX_SIDE_PX a side: a minute of full camera pictures would take gigabytes."""
+    scale = MAX_SIDE_PX / max(bgr.shape[:2])
+    if scale < 1:
+        size = (max(1, round(bgr.shape[1] * scale)), max(1, round(bgr.shape[0] * scale)))
+        bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _windows(count: int, where: str) -> list[range]:
+    """Up to MAX_CLIPS stretches of 20 s, spread over `count` pictures that are 1 s apart."""
+    length = round(CLIP_S) + 1
+    if count < length:
+        raise CalibrationError(f"{where}: {count} pictures 1 s apart, at least {length} are needed")
+    clips = min(MAX_CLIPS, count // length)
+    starts = [round(i * (count - length) / max(1, clips - 1)) for i in range(clips)]
+    return [range(start, start + length) for start in starts]
+
+
+def _assumed_clip(name: str, images: list[Picture], stamps: str) -> Clip:
+    frames = tuple(
+        Frame(i * 1_000_000_000, image, SE2(i * ASSUMED_SPEED_MPS, 0.0, 0.0), (ASSUMED_SPEED_MPS, 0.0, 0.0))
+        for i, image in enumerate(images)
+    )
+    assumed = f"a straight walk at {ASSUMED_SPEED_MPS:g} m/s{stamps}, instruction {ASSUMED_INSTRUCTION!r}"
+    return Clip(name, ASSUMED_INSTRUCTION, frames, assumed)
+
+
+def _load_folder(name: str, folder: Path) -> CalibrationSet:
+    where = f"calibration folder {folder}"
+    try:
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+        digest, images = hashlib.sha256(), {}
+        used = [i for window in _windows(len(paths), where) for i in window]
+        for index, path in enumerate(paths):
+            data = path.read_bytes()
+            digest.update(f"{path.name}\0{len(data)}\0".encode())
+            digest.update(data)
+            if index in used:
+                images[index] = _decode(data, f"{where}: {path.name}")
+    except OSError as error:
+        raise CalibrationError(f"{where} cannot be read ({error.strerror})") from error
+    clips = [
+        _assumed_clip(f"images-{window.start}", [images[i] for i in window], " with 1 s between images")
+        for window in _windows(len(paths), where)
+    ]
+    return CalibrationSet(name, digest.hexdigest(), tuple(clips))
+
+
+def _load_video(name: str, path: Path) -> CalibrationSet:
+    where = f"calibration video {path}"
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise CalibrationError(f"{where} cannot be read ({error.strerror})") from error
+    images = _video_frames(path, where)
+    clips = [_assumed_clip(f"video-{w.start}s", [images[i] for i in w], "") for w in _windows(len(images), where)]
+    return CalibrationSet(name, digest.hexdigest(), tuple(clips))
+
+
+def _video_frames(path: Path, where: str) -> list[Picture]:
+    """One picture for every second of the video's first ten minutes."""
+    capture = cv2.VideoCapture(str(path))
+    try:
+        fps = capture.get(cv2.CAP_PROP_FPS) if capture.isOpened() else 0.0
+        if not 0.5 <= fps <= 1000.0:
+            raise CalibrationError(f"{where} is not a readable video")
+        images: list[Picture] = []
+        index = 0
+        while len(images) < 600 and capture.grab():
+            # Every picture is grabbed in turn: seeking lands on other frames with other codecs.
+            if index >= len(images) * fps:
+                ok, bgr = capture.retrieve()
+                if not ok:
+                    break
+                images.append(_rgb(bgr))
+            index += 1
+    finally:
+        capture.release()
+    return images
+
+
+USER_KINDS = {"folder": _load_folder, "video": _load_video}

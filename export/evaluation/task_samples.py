@@ -1,0 +1,211 @@
+"""Situations in which the robot is driven by an old semantic state: what the task error is measured on (paper §3.2).
+
+A sample is one generation (frames at t, t−3, t−6, t−9 s, its prompt) and moments after it, Δt = 0…10 s: the frame of
+that moment, the robot's state, and how far it has moved since the generation's newest frame was captured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from tokenizers import Tokenizer
+
+from edge.core.geometry import SE2, interpolate
+from edge.reasoning.path_memory import way_of
+from edge.reasoning.prompt import PromptBuilder, PromptIds
+from edge.state.frame import fit_frame
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
+from edge.state.ring import EncodedFrame
+from export.evaluation.calibration import CLIP_S, CalibrationError, CalibrationSet, Clip
+from export.model.config import TicVlaConfig
+
+Picture = npt.NDArray[np.uint8]
+
+DELAYS_S = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+LARGE_FRAME_MACS = 2e10
+"""Multiply-adds of one encoder frame from which a model counts as large: one sample a clip then takes minutes."""
+FRAME_TOLERANCE_S = 0.6
+
+
+class Runtime(Protocol):
+    """The part of a target's runtime section that samples depend on."""
+
+    @property
+    def frame_offsets_s(self) -> tuple[float, ...]:
+        """Ages of a generation's frames relative to its newest."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One control tick Δt after the anchor; `frame` is an index into `SampleSet.frames`."""
+
+    delay_s: float
+    frame: int
+    state: tuple[float, float, float]
+    """(vx m/s, vy m/s, ωz rad/s)."""
+    offset: SE2
+    """Motion offset (Δx, Δy, Δθ) in the robot frame at the anchor."""
+
+    @property
+    def latency(self) -> tuple[float, float, float, float]:
+        """(Δt, Δx, Δy, Δθ), the action expert's latency input."""
+        return (self.delay_s, *self.offset.as_tuple())
+
+
+@dataclass(frozen=True)
+class PromptPart:
+    """Consecutive prompt tokens and the frame (index into `SampleSet.frames`) whose places are among them."""
+
+    ids: tuple[int, ...]
+    frame: int | None
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One generation and the moments that are driven by it."""
+
+    name: str
+    prompt: tuple[PromptPart, ...]
+    moments: tuple[Moment, ...]
+    waypoints: tuple[tuple[float, float], ...] | None = None
+    """For a model that is guided by waypoints: where the clip's robot was 3, 6 and 9 s after the anchor, in the robot's
+    frame there. They stand for what the language model would have written; None: guided by K‖V."""
+
+
+@dataclass(frozen=True)
+class SampleSet:
+    """Samples over shared frames, uint8 RGB [1, px, px, 3] each."""
+
+    frames: tuple[Picture, ...]
+    samples: tuple[Sample, ...]
+    step_s: float
+    """Time between two points of a planned trajectory."""
+
+    @property
+    def moments(self) -> int:
+        """Number of planned trajectories that are compared."""
+        return sum(len(sample.moments) for sample in self.samples)
+
+
+def is_large(config: TicVlaConfig) -> bool:
+    """Whether one encoder frame of the model takes seconds rather than milliseconds on a CPU."""
+    vision = config.vision
+    block = 4 * vision.hidden**2 + 2 * vision.hidden * vision.mlp
+    return vision.layers * block * vision.grid**2 > LARGE_FRAME_MACS
+
+
+def samples_from(
+    calibration: CalibrationSet,
+    config: TicVlaConfig,
+    runtime: Runtime,
+    tokenizer: bytes,
+    *,
+    delays_s: Sequence[float] = DELAYS_S,
+    anchors_per_clip: int | None = None,
+) -> SampleSet:
+    """Samples of every clip: one anchor a clip for a large model, else, or of a single clip, two.
+
+    A large model so needs ten encoder frames and one prefill a clip, all delays of an anchor share its prefill.
+    Raises CalibrationError.
+    """
+    language = config.language
+    ids = PromptIds(
+        language.im_start_id, language.im_end_id, language.img_start_id, language.img_end_id, language.img_context_id
+    )
+    builder = PromptBuilder(Tokenizer.from_buffer(tokenizer), ids, config.frame_tokens)
+    count = anchors_per_clip or (1 if is_large(config) and len(calibration.clips) > 1 else 2)
+    frames: dict[tuple[int, int], int] = {}
+    pictures: list[Picture] = []
+
+    def index_of(clip: int, frame: int) -> int:
+        if (clip, frame) not in frames:
+            frames[clip, frame] = len(pictures)
+            pictures.append(fit_frame(calibration.clips[clip].frames[frame].image, config.vision.image_px))
+        return frames[clip, frame]
+
+    samples: list[Sample] = []
+    for number, clip in enumerate(calibration.clips):
+        for anchor_s in _anchors(clip, max(runtime.frame_offsets_s), max(delays_s), count):
+            shown = sorted({_nearest(clip, anchor_s - offset_s) for offset_s in runtime.frame_offsets_s})
+            encoded = [
+                EncodedFrame(clip.frames[i].stamp_ns, clip.frames[i].T_odom_base, np.zeros(1, np.float32))
+                for i in shown
+            ]
+            # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
+            way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: shown[-1] + 1])
+            segments = builder.build(encoded, clip.instruction, way)
+            places = [index_of(number, i) for i in shown]
+            prompt = tuple(
+                PromptPart(segment.ids, places[i] if segment.tokens is not None else None)
+                for i, segment in enumerate(segments)
+            )
+            moments = tuple(_moment(clip, anchor_s, delay_s, number, index_of) for delay_s in delays_s)
+            guided = config.action.semantic_interface == "waypoints"
+            waypoints = tuple(_ahead(clip, anchor_s, time_s) for time_s in WAYPOINT_TIMES_S) if guided else None
+            samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, moments, waypoints))
+    if len(samples) < 2:
+        raise CalibrationError(
+            f"calibration set {calibration.name}: gives one sample, two samples are needed to compare"
+        )
+    longest = max(sum(len(part.ids) for part in sample.prompt) for sample in samples)
+    if longest > language.max_context:
+        raise CalibrationError(
+            f"calibration set {calibration.name}: a prompt has {longest} tokens, the model reads {language.max_context}"
+        )
+    return SampleSet(tuple(pictures), tuple(samples), config.action.step_s)
+
+
+def _anchors(clip: Clip, history_s: float, future_s: float, count: int) -> list[float]:
+    first_s = clip.frames[0].stamp_ns / 1e9 + history_s
+    last_s = clip.frames[-1].stamp_ns / 1e9 - future_s
+    if last_s < first_s - FRAME_TOLERANCE_S:
+        raise CalibrationError(
+            f"clip {clip.name}: too short for frames {history_s:g} s back and a delay of {future_s:g} s"
+        )
+    last_s = max(first_s, last_s)
+    if last_s - first_s < FRAME_TOLERANCE_S:
+        count = 1  # all would be the same frames
+    return [first_s + i * (last_s - first_s) / max(1, count - 1) for i in range(count)]
+
+
+def check_clips(calibration: CalibrationSet, runtime: Runtime) -> None:
+    """Raise CalibrationError if the clips are too short for a target's frames and every delay: before any work."""
+    history_s, future_s = max(runtime.frame_offsets_s), max(DELAYS_S)
+    anchors = [anchor_s for clip in calibration.clips for anchor_s in _anchors(clip, history_s, future_s, 2)]
+    if len(anchors) < 2:
+        raise CalibrationError(
+            f"calibration set {calibration.name}: has one clip of {CLIP_S:g} s, which gives one sample and two are "
+            f"needed to compare: give pictures of {2 * CLIP_S + 2:g} s, or smaller runtime.frame_offsets_s"
+        )
+
+
+def _nearest(clip: Clip, time_s: float) -> int:
+    return min(range(len(clip.frames)), key=lambda i: abs(clip.frames[i].stamp_ns / 1e9 - time_s))
+
+
+def _pose(clip: Clip, time_s: float) -> SE2:
+    after = next((i for i, f in enumerate(clip.frames) if f.stamp_ns / 1e9 >= time_s), len(clip.frames) - 1)
+    a, b = clip.frames[max(0, after - 1)], clip.frames[after]
+    if a is b:
+        return b.T_odom_base
+    fraction = (time_s - a.stamp_ns / 1e9) / ((b.stamp_ns - a.stamp_ns) / 1e9)
+    return interpolate(a.T_odom_base, b.T_odom_base, min(1.0, max(0.0, fraction)))
+
+
+def _ahead(clip: Clip, anchor_s: float, time_s: float) -> tuple[float, float]:
+    offset = _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + time_s)
+    return offset.x_m, offset.y_m
+
+
+class _IndexOf(Protocol):
+    def __call__(self, clip: int, frame: int, /) -> int: ...
+
+
+def _moment(clip: Clip, anchor_s: float, delay_s: float, number: int, index_of: _IndexOf) -> Moment:
+    frame = _nearest(clip, anchor_s + delay_s)
+    offset = _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + delay_s)
+    return Moment(delay_s, index_of(number, frame), clip.frames[frame].velocity, offset)

@@ -1,0 +1,1 @@
+"""Tokenizers of the two model sizes."""

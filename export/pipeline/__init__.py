@@ -1,0 +1,1 @@
+"""Builds, verifies and reports an artifact directory."""

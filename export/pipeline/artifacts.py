@@ -1,0 +1,287 @@
+"""Building an artifact directory: files from the cache, gate, manifest; written aside, then renamed into place."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
+from edge.artifacts.manifest import load_artifacts
+from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
+from export.evaluation.gates import WARN, GateResult, require
+from export.graphs.build import graph_contract, graph_parameters
+from export.model.config import TicVlaConfig
+from export.pipeline.build import Pipeline
+from export.pipeline.job import Asked, Job
+from export.pipeline.report import report_html
+from export.pipeline.verify import first_difference
+from export.plan.plan import Plan, plan
+from export.target.file import Target
+from reporting.build_progress import Progress
+
+REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
+NEW, OLD = "new", "old"
+OLDER_SCHEMAS = (1, 2)
+"""Schemas whose directories an export replaces."""
+
+
+def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, Any]:
+    """The manifest's `runtime` section; a plan that fits says how many tokens a generation may have."""
+    language, policy = config.language, target.runtime
+    planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
+    return {
+        "image_px": config.vision.image_px,
+        "frame_tokens": config.frame_tokens,
+        "kv_dim": config.kv_dim,
+        "max_context": language.max_context,
+        "max_new_tokens": planned,
+        "prefill_chunk_tokens": policy.prefill_chunk_tokens,
+        "frame_offsets_s": list(policy.frame_offsets_s),
+        "tick_period_ms": policy.tick_period_ms,
+        "step_s": config.action.step_s,
+        "im_start_id": language.im_start_id,
+        "im_end_id": language.im_end_id,
+        "img_start_id": language.img_start_id,
+        "img_end_id": language.img_end_id,
+        "img_context_id": language.img_context_id,
+        "control_cores": list(policy.control_cores),
+        "reasoning_cores": list(policy.reasoning_cores),
+        "control_priority": policy.control_priority,
+    }
+
+
+def build_artifacts(job: Job, out: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+    """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
+    nothing behind but finished stages in the cache."""
+    check_replaceable(out)
+    with workplace(out) as work:
+        made = work / NEW
+        made.mkdir()
+        report = _write_directory(Pipeline(job, cache, progress), made, progress)
+        for path in [*made.iterdir(), made]:
+            fsync_path(path)
+        check_replaceable(out)  # once more: building took its time
+        _swap(made, out, work / OLD)
+        return report
+
+
+@contextmanager
+def workplace(out: Path) -> Iterator[Path]:
+    """A hidden directory beside `out`, on the same disk, for one export at a time; raises ArtifactError for a second.
+
+    What a killed export left in it goes; the directory that it was just replacing comes back.
+    """
+    work = out.with_name(f".{out.name}.edge-export")
+    work.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = work.exists() and work.stat().st_ino == os.fstat(descriptor).st_ino
+        except BlockingIOError:
+            mine = False
+        if not mine:
+            raise ArtifactError(f"another export is writing {out}; wait for it or name another directory")
+        others = sorted(path.name for path in work.iterdir() if path.name not in (NEW, OLD))
+        if others:
+            raise ArtifactError(f"{work / others[0]}: not ours, so nothing is built there; move it away")
+        if (work / OLD).exists() and not out.exists():
+            (work / OLD).rename(out)
+        try:
+            for left in (NEW, OLD):
+                shutil.rmtree(work / left, ignore_errors=True)
+            yield work
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    finally:
+        os.close(descriptor)
+
+
+def check_replaceable(out: Path) -> None:
+    """An existing directory is replaced only if it is empty, or of ours with nothing of the user's beside it."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    listed = {MANIFEST_NAME, *_files_of(out)}
+    others = sorted(path.name for path in out.iterdir() if path.name not in listed)
+    if others:
+        raise ArtifactError(f"{out / others[0]}: not ours, so {out} is not replaced; name another directory")
+
+
+def _files_of(out: Path) -> dict[str, Any]:
+    """The files that a manifest lists, also one of an older schema if they are all there as it says."""
+    try:
+        return dict(read_manifest(out)["files"])
+    except ArtifactError:
+        try:
+            older = json.loads((out / MANIFEST_NAME).read_bytes())
+            files = dict(older["files"])
+            ours = older["schema_version"] in OLDER_SCHEMAS and all(
+                file_sha256(out / name) == entry["sha256"] for name, entry in files.items()
+            )
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            ours = False
+        if not ours:
+            raise
+        return files
+
+
+def _swap(made: Path, out: Path, retired: Path) -> None:
+    if out.exists():
+        out.rename(retired)
+    try:
+        made.rename(out)
+    except BaseException:
+        if retired.exists():
+            retired.rename(out)
+        raise
+    fsync_path(out.parent)
+
+
+def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, Any]:
+    job = pipeline.job
+    weights = pipeline.weights()
+    (directory / TOKENIZER_NAME).write_bytes(pipeline.tokenizer())
+    pipeline.task_reference()
+    for name in job.target.graph_names:
+        pipeline.reference(name)
+    made = _plan(pipeline)
+    if job.target.runtime.enforce_plan:
+        made.require()
+    graphs: dict[str, Any] = {}
+    for name in job.target.graph_names:
+        files = pipeline.graph(name)
+        for path in files:
+            # Copied, never linked: what happens to the output must not reach the cache.
+            shutil.copyfile(path, directory / path.name)
+        graphs[name] = _graph_entry(pipeline, name, [directory / path.name for path in files])
+    manifest: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "target": job.target.name,
+        "model": _model_section(pipeline),
+        "runtime": manifest_runtime(job.target, job.config, made),
+        "graphs": graphs,
+        "plan": made.to_dict(),
+        "provenance": {
+            "weights_sha256": weights.sha256,
+            "weights_origin": weights.origin,
+            "calibration": job.calibration.to_dict(),
+            "packages": package_versions(),
+            "asked": asked_dict(job.asked),
+            "target": job.target.to_dict(),
+        },
+    }
+    _write_manifest(directory, manifest)
+    for name, result in check_directory(pipeline, directory, progress).items():
+        graphs[name]["parity"] = result.to_dict()
+    with progress.stage("plan and report"):
+        decisions = {name: pipeline.decision(name) for name in job.target.graph_names}
+        found = {"coverage": weights.coverage, "sensitivity": {k: v for k, v in decisions.items() if v is not None}}
+        report = {**{k: v for k, v in manifest.items() if k != "files"}, **found}
+        _write_json(directory / REPORT_JSON, report)
+        (directory / REPORT_HTML).write_text(report_html(report), encoding="utf-8")
+        _write_manifest(directory, manifest)
+    return report
+
+
+def _graph_entry(pipeline: Pipeline, name: str, files: list[Path]) -> dict[str, Any]:
+    target, (precision, reason) = pipeline.job.target, pipeline.precision(name)
+    graph_file = next(path for path in files if path.suffix == ".onnx")
+    contract = graph_contract(graph_file)
+    return {
+        "file": graph_file.name,
+        "data_files": [path.name for path in files if path != graph_file],
+        **contract,
+        "params": graph_parameters(graph_file),
+        "bytes": sum(path.stat().st_size for path in files),
+        "precision": precision.to_dict(),
+        "precision_reason": reason,
+        "form": target.graphs[name].form,
+        "session": target.session(name, contract["inputs"]),
+    }
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    # Not sorted: of a precision's exceptions the first that matches wins.
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
+    names = sorted(path.name for path in directory.iterdir() if path.name != MANIFEST_NAME)
+    manifest["files"] = {
+        name: {"sha256": file_sha256(directory / name), "bytes": (directory / name).stat().st_size} for name in names
+    }
+    _write_json(directory / MANIFEST_NAME, seal(manifest))
+
+
+def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, GateResult]:
+    """The gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
+    artifacts = load_artifacts(directory)
+    results: dict[str, GateResult] = {}
+    for name in pipeline.job.target.graph_names:
+        result = results[name] = pipeline.gate(artifacts, name)
+        require(name, result.verdict)
+        if result.verdict.level == WARN:
+            progress.say(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
+    return results
+
+
+def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+    """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
+    manifest = read_manifest(directory)
+    pipeline = Pipeline(job, cache, progress, run_gates=True)
+    weights = pipeline.weights()
+    if weights.sha256 != manifest["provenance"].get("weights_sha256"):
+        raise ArtifactError(f"{directory}: was made from other weights than {weights.origin}; pass --checkpoint")
+    _check_manifest(pipeline, directory, manifest)
+    pipeline.task_reference()
+    for name in job.target.graph_names:
+        pipeline.reference(name)
+    results = check_directory(pipeline, directory, progress)
+    return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
+
+
+def asked_dict(asked: Asked) -> dict[str, Any]:
+    """Plain JSON form."""
+    return {**vars(asked), "settings": list(asked.settings)}
+
+
+def _plan(pipeline: Pipeline) -> Plan:
+    target = pipeline.job.target
+    return plan(target, pipeline.job.config, {name: pipeline.precision(name)[0] for name in target.graph_names})
+
+
+def _model_section(pipeline: Pipeline) -> dict[str, Any]:
+    config = pipeline.job.config
+    return {"name": config.name, "trained": pipeline.weights().trained, "config": config.to_dict()}
+
+
+def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, Any]) -> None:
+    """Everything that a runner goes by is what this export would write; raises ArtifactError naming the first key."""
+    job, graphs = pipeline.job, manifest["graphs"]
+    expected: dict[str, Any] = {
+        "target": job.target.name,
+        "model": _model_section(pipeline),
+        "runtime": manifest_runtime(job.target, job.config, _plan(pipeline)),
+        "gates": job.target.to_dict()["gates"],
+    }
+    found = {key: manifest[key] for key in ("target", "model", "runtime")}
+    found["gates"] = manifest["provenance"]["target"]["gates"]
+    for name in job.target.graph_names:
+        expected[f"graphs.{name}"] = {
+            "precision": pipeline.precision(name)[0].to_dict(),
+            "form": job.target.graphs[name].form,
+            "session": job.target.session(name, graphs[name]["inputs"]),
+        }
+        found[f"graphs.{name}"] = {key: graphs[name].get(key) for key in ("precision", "form", "session")}
+    for key, value in expected.items():
+        said = first_difference(found[key], json.loads(json.dumps(value)), key)
+        if said is not None:
+            raise ArtifactError(f"{directory / MANIFEST_NAME}: {said}; export again")
+    if (directory / TOKENIZER_NAME).read_bytes() != pipeline.tokenizer():
+        raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer that goes with the weights; export again")

@@ -1,0 +1,1 @@
+"""What fits a target: time, memory and power of a model on a device, modelled or measured."""

@@ -1,0 +1,260 @@
+"""How long one stage takes: measured if it was, else the roofline of its products and bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from edge.artifacts.manifest import LANGUAGE_WHOLE
+from export.model.config import TicVlaConfig
+from export.plan.cost import DECODE, PREFILL, Call, action_call, context_call, language_call, vision_call
+from export.quantize.precision import Precision
+from export.target.file import Target
+from export.target.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured, Provider
+
+SAME_LENGTH = 0.05
+"""A measurement at a length within this share of the wanted one stands for it; else it only scales the model."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A time in ms with its error bar, where one is known, and whether it was measured."""
+
+    ms: float
+    error: float | None
+    """Half width of the error bar as a fraction of `ms`."""
+    tag: str
+    source: str
+
+    @property
+    def high_ms(self) -> float:
+        """Upper end of the error bar (the estimate itself without one)."""
+        return self.ms * (1 + (self.error or 0.0))
+
+    def times(self, factor: float, figure: Figure | None = None) -> Estimate:
+        """The estimate multiplied, also by a figure with an error of its own: other than 1, it makes it modelled."""
+        if figure is None:
+            return replace(self, ms=self.ms * factor)
+        value = figure.value
+        tag = self.tag if value == 1.0 else MODELLED
+        return replace(self, ms=self.ms * factor * value, error=_together(self.error, figure.error), tag=tag)
+
+
+def total(parts: Sequence[Estimate]) -> Estimate:
+    """Sum of estimates; errors add up, because the model errs on all parts of a device alike."""
+    ms = sum(part.ms for part in parts)
+    known = [part for part in parts if part.error is not None]
+    error = sum(part.ms * (part.error or 0.0) for part in parts) / ms if known and ms else None
+    tag = MEASURED if all(part.tag == MEASURED for part in parts) else MODELLED
+    return Estimate(ms, error, tag, "; ".join(dict.fromkeys(part.source for part in parts)))
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """One stage of a tick or a generation: calls of one graph."""
+
+    stage: str
+    graph: str
+    calls: int
+    each: Estimate
+    """The longest of its calls."""
+    whole: Estimate
+    flops: int
+    moved_bytes: int
+    bound: str
+    """What limits it: `compute`, `memory` or `measured`."""
+    energy_j: float | None = None
+    """Energy above idle of all its calls as metered, at other lengths in proportion to time; None: not metered."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """Lengths that a plan is made for."""
+
+    prompt_tokens: int
+    chunk_tokens: int
+    new_tokens: int
+
+    @property
+    def chunks(self) -> list[tuple[int, int]]:
+        """(tokens, tokens before) of every prefill call."""
+        starts = range(0, self.prompt_tokens, self.chunk_tokens)
+        return [(min(self.chunk_tokens, self.prompt_tokens - start), start) for start in starts]
+
+    @property
+    def context_tokens(self) -> int:
+        """Tokens in the semantic state."""
+        return self.prompt_tokens + self.new_tokens
+
+
+def language_graph(target: Target, stage: str) -> str:
+    """The graph that does `prefill` or `decode`."""
+    if LANGUAGE_WHOLE[0] in target.graphs:
+        return LANGUAGE_WHOLE[0]
+    return PREFILL if stage == "prefill" else DECODE
+
+
+def stage_graph(target: Target, stage: str) -> str:
+    """The graph of a stage."""
+    return language_graph(target, stage) if stage in ("prefill", "decode") else stage
+
+
+def stage_calls(config: TicVlaConfig, graph: str, stage: str, work: Work) -> list[tuple[Call, int]]:
+    """(call, how often) of a stage; decoding is taken at its middle length."""
+    if stage == "vision_encoder":
+        return [(vision_call(config), 1)]
+    if stage == "prefill":
+        return [(language_call(config, graph, tokens=n, past=past), 1) for n, past in work.chunks]
+    if stage == "decode":
+        past = work.prompt_tokens + work.new_tokens // 2
+        return [(language_call(config, graph, tokens=1, past=past), work.new_tokens)]
+    if stage == "semantic_context":
+        return [(context_call(config, tokens=work.context_tokens), 1)]
+    return [(action_call(config, context=work.context_tokens), 1)]
+
+
+def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Precision, work: Work) -> StageTime:
+    """Time of a stage's calls with nothing else running."""
+    graph = stage_graph(target, stage)
+    modelled = _modelled(target, config, stage, precision, work)
+    point = _point(target, config.name, graph, stage, precision)
+    if point is None:
+        return modelled
+    wanted, taken = _length(stage, work), point.tokens
+    measured_ms = point.ms if point.ms is not None else 1000.0 / (point.tokens_per_s or math.nan)
+    calls = max(modelled.calls, 1)
+    per = calls if stage == "decode" else 1  # a decode point is per token, any other for the whole stage
+    where = f"measured on {point.machine}, {point.date}"
+    same_chunks = point.chunk_tokens is None or point.chunk_tokens == work.chunk_tokens
+    timed = _timed(config, stage)
+    if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks and timed == config:
+        whole = Estimate(measured_ms * per, point.error, MEASURED, where)
+        # Only the whole was measured: its longest call is the model's share of it.
+        share = modelled.each.ms / modelled.whole.ms if modelled.whole.ms else 1.0
+        energy_j = None if point.energy_j is None else point.energy_j * per
+        return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED, energy_j=energy_j)
+    reference = _modelled(target, timed, stage, precision, _at(stage, work, point))
+    reference_ms = reference.whole.ms / (reference.calls if stage == "decode" else 1)
+    factor = measured_ms / reference_ms
+    at = "" if taken is None else f" at {taken} tokens"
+    source = f"roofline scaled by {factor:.2f}: {where}{at}{'' if timed == config else ', query head'}"
+    scaled = [
+        replace(e.times(factor), error=point.error, tag=MODELLED, source=source)
+        for e in (modelled.whole, modelled.each)
+    ]
+    energy_j = None if point.energy_j is None else point.energy_j * scaled[0].ms / measured_ms
+    return replace(modelled, whole=scaled[0], each=scaled[1], energy_j=energy_j)
+
+
+def _timed(config: TicVlaConfig, stage: str) -> TicVlaConfig:
+    """What a stage's measurements are of: points name a model, and its action expert was measured with queries."""
+    if stage != "action_expert":
+        return config
+    return replace(config, action=replace(config.action, head="query"))
+
+
+def _length(stage: str, work: Work) -> int:
+    if stage == "prefill":
+        return work.prompt_tokens
+    if stage == "decode":
+        return work.prompt_tokens + work.new_tokens // 2
+    return work.context_tokens
+
+
+def _at(stage: str, work: Work, point: Measured) -> Work:
+    """The lengths that a measurement was taken at."""
+    tokens = point.tokens or _length(stage, work)
+    if stage == "prefill":
+        return Work(tokens, point.chunk_tokens or work.chunk_tokens, 0)
+    return Work(tokens, work.chunk_tokens, 1 if stage == "decode" else 0)
+
+
+def _point(target: Target, model: str, graph: str, stage: str, precision: Precision) -> Measured | None:
+    """The newest measurement of exactly this, the last one listed among equals."""
+    policy = target.graphs[graph]
+    threads = policy.threads or 1
+    # A whole language model's points say by their unit which of its two stages they are.
+    per_token = {"prefill": False, "decode": True}.get(stage)
+    found = [
+        point
+        for point in target.measured
+        if (point.model, point.graph, point.precision) == (model, graph, precision.default)
+        and tuple(point.overrides.items()) == precision.overrides
+        and (point.form, point.provider) == (policy.form, policy.provider)
+        and point.threads in (None, threads)
+        and point.mode in (None, target.power.mode)
+        and (graph != LANGUAGE_WHOLE[0] or per_token == (point.tokens_per_s is not None))
+    ]
+    return max(reversed(found), key=lambda point: point.date, default=None)
+
+
+def _modelled(target: Target, config: TicVlaConfig, stage: str, precision: Precision, work: Work) -> StageTime:
+    graph = stage_graph(target, stage)
+    calls = stage_calls(config, graph, stage, work)
+    timed = [(*_call_ms(target, graph, stage, call, precision), call, count) for call, count in calls]
+    ms = sum(call_ms * count for call_ms, _, _, _, count in timed)
+    error = sum(call_ms * count * (e or 0.0) for call_ms, e, _, _, count in timed) / ms if ms else None
+    longest = max(timed, key=lambda item: item[0])
+    source = f"roofline of {target.name}, mode {target.power.mode}"
+    kv_bytes = KV_DTYPES[target.runtime.kv_dtype]
+    activation = target.provider(graph).activation_bytes
+    return StageTime(
+        stage=stage,
+        graph=graph,
+        calls=sum(count for *_, count in timed),
+        each=Estimate(longest[0], longest[1], MODELLED, source),
+        whole=Estimate(ms, error, MODELLED, source),
+        flops=sum(call.flops() * count for *_, call, count in timed),
+        moved_bytes=sum(
+            call.traffic(precision, activation_bytes=activation, cache_bytes=kv_bytes) * count
+            for *_, call, count in timed
+        ),
+        bound=longest[2],
+    )
+
+
+def _call_ms(
+    target: Target, graph: str, stage: str, call: Call, precision: Precision
+) -> tuple[float, float | None, str]:
+    """Time of one call in ms, its relative error, and what bounds it."""
+    provider, roofline, mode = target.provider(graph), target.roofline, target.power.selected
+    efficiency = roofline.compute_efficiency[stage]
+    cores = _cores_share(target, graph, provider)
+    work = [(provider.compute.attention, call.attention_flops)]
+    for name, flops in call.linear_flops(precision).items():
+        roof = provider.compute.roof(name)
+        # A precision without a kernel of its own is expanded and computed in fp32.
+        work.append((roof or provider.compute.fp32 or "fp32", flops))
+    compute_ms = sum(
+        flops / (roofline.peak(roof).value * 1e9 * mode.compute.value * efficiency.value * cores) * 1e3
+        for roof, flops in work
+    )
+    moved = call.traffic(
+        precision, activation_bytes=provider.activation_bytes, cache_bytes=KV_DTYPES[target.runtime.kv_dtype]
+    )
+    bandwidth = roofline.memory_gbps.value * 1e9 * mode.memory.value * roofline.memory_efficiency.value
+    # One core does not saturate the memory bus of a processor; two nearly do.
+    memory_ms = moved / (bandwidth * cores) * 1e3
+    overhead = provider.call_overhead_ms
+    if compute_ms >= memory_ms:
+        peak_error = max((roofline.peak(roof).error or 0.0 for roof, _ in work), default=0.0)
+        bound, ms, error = "compute", compute_ms, _together(efficiency.error, peak_error or None, mode.compute.error)
+    else:
+        bound, ms = "memory", memory_ms
+        error = _together(roofline.memory_efficiency.error, roofline.memory_gbps.error, mode.memory.error)
+    whole = ms + overhead.value
+    spread = ms * (error or 0.0) + overhead.value * (overhead.error or 0.0)
+    return whole, spread / whole if spread else None, bound
+
+
+def _cores_share(target: Target, graph: str, provider: Provider) -> float:
+    if not provider.uses_cores:
+        return 1.0
+    return min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
+
+
+def _together(*errors: float | None) -> float | None:
+    """Independent relative errors of factors."""
+    known = [error for error in errors if error is not None]
+    return math.sqrt(sum(error**2 for error in known)) if known else None

@@ -1,0 +1,142 @@
+"""Runs parts of the torch model as if their weights were rounded, one layer at a time and without changing the model.
+
+A layer's weight is replaced only while that layer computes, by hooks: nothing is copied but the layer at work, and the
+model holds its own tensors again whenever no layer is running.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from export.quantize.precision import Precision
+from export.quantize.weights import Blocks, Channels, quantise_blocks, quantise_channels
+
+Linear = (nn.Linear, nn.Conv2d, nn.Embedding)
+SLAB_ROWS = 8192
+
+
+class Rounder:
+    """Rounds weights once and keeps the packed results of at most `keep_bytes`, the oldest leaving first."""
+
+    def __init__(self, keep_bytes: int = 700_000_000) -> None:
+        self._keep_bytes = keep_bytes
+        self._kept: OrderedDict[tuple[int, str, int], Blocks | Channels] = OrderedDict()
+        self._bytes = 0
+
+    def weight(self, parameter: nn.Parameter, precision: str) -> Tensor:
+        """The parameter [out, …] as a kernel of that precision sees it."""
+        return self._rows(parameter, precision, 0, parameter.shape[0])
+
+    def _rows(self, parameter: nn.Parameter, precision: str, start: int, stop: int) -> Tensor:
+        rows = parameter.data[start:stop]
+        if precision == "fp32":
+            return rows
+        if precision == "fp16":
+            return rows.half().float()
+        # By identity: the search holds the model, so an id cannot come to mean another parameter.
+        key = (id(parameter), precision, start)
+        packed = self._kept.get(key)
+        if packed is None:
+            matrix = rows.reshape(rows.shape[0], -1).numpy()
+            packed = quantise_channels(matrix) if precision == "int8" else quantise_blocks(matrix, precision)
+            self._keep(key, packed)
+        return torch.from_numpy(packed.dequantised()).reshape(rows.shape)
+
+    def choices(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
+        """Most likely token [n] of hidden states [n, d] by a vocabulary matrix; see `logits`."""
+        return self.logits(parameter, hidden, precision).argmax(dim=-1)
+
+    def logits(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
+        """Scores [n, vocab] of hidden states [n, d] by a vocabulary matrix, which is rounded slab by slab."""
+        x = round_u8(hidden) if precision == "int8" else hidden
+        starts = range(0, parameter.shape[0], SLAB_ROWS)
+        return torch.cat(
+            [
+                x @ self._rows(parameter, precision, start, min(start + SLAB_ROWS, parameter.shape[0])).T
+                for start in starts
+            ],
+            dim=-1,
+        )
+
+    def _keep(self, key: tuple[int, str, int], packed: Blocks | Channels) -> None:
+        size = _bytes(packed)
+        while self._kept and self._bytes + size > self._keep_bytes:
+            self._bytes -= _bytes(self._kept.popitem(last=False)[1])
+        if size <= self._keep_bytes:
+            self._kept[key] = packed
+            self._bytes += size
+
+    @contextmanager
+    def applied(
+        self, part: nn.Module, precision: Precision, layers: Collection[str], *, activations: bool = True
+    ) -> Iterator[None]:
+        """While active, every linear layer inside `part` that `layers` names computes in its precision.
+
+        With `activations`, `int8` layers also get their input rounded to 8 bits with one range a call, as the dynamic
+        kernels do, and `fp16` layers get theirs in 16 bits. The model is as before afterwards, also on an error.
+        """
+        handles = []
+        originals: list[tuple[nn.Parameter, Tensor]] = []
+        for name in layers:
+            module = part.get_submodule(name)
+            assert isinstance(module, Linear) and isinstance(module.weight, nn.Parameter)
+            if precision.of(name) != "fp32":
+                originals.append((module.weight, module.weight.data))
+                handles += self._hook(module, precision.of(name), activations)
+        try:
+            yield
+        finally:
+            for handle in handles:
+                handle.remove()
+            for parameter, data in originals:
+                parameter.data = data
+
+    def _hook(self, module: nn.Module, precision: str, activations: bool) -> list[Any]:
+        parameter = module.weight
+        assert isinstance(parameter, nn.Parameter)
+        original = parameter.data
+        if isinstance(module, nn.Embedding):
+            # Only the rows that were looked up are rounded: the table is as large as the rest of the language model.
+            return [module.register_forward_hook(lambda _module, _inputs, rows: _table_rows(rows, precision))]
+
+        def before(_module: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...] | None:
+            rounded = self.weight(parameter, precision)
+            parameter.data = rounded
+            if not activations or isinstance(module, nn.Conv2d) or precision not in ("int8", "fp16"):
+                return None
+            x = inputs[0]
+            return (x.half().float() if precision == "fp16" else round_u8(x), *inputs[1:])
+
+        def after(_module: nn.Module, _inputs: object, _output: object) -> None:
+            parameter.data = original
+
+        return [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
+
+
+def round_u8(x: Tensor) -> Tensor:
+    """x rounded to 256 steps between its smallest and largest value, zero among them (`DynamicQuantizeLinear`)."""
+    low, high = float(x.min().clamp(max=0)), float(x.max().clamp(min=0))
+    if high == low:
+        return x
+    scale = (high - low) / 255
+    zero = round(-low / scale)
+    return (torch.clamp(torch.round(x / scale) + zero, 0, 255) - zero) * scale
+
+
+def _table_rows(rows: Tensor, precision: str) -> Tensor:
+    """Looked-up rows of an embedding table, which is stored in 16 bits or in 8 bits with one scale a row."""
+    if precision == "fp16":
+        return rows.half().float()
+    flat = rows.reshape(-1, rows.shape[-1]).numpy()
+    return torch.from_numpy(quantise_channels(flat).dequantised()).reshape(rows.shape)
+
+
+def _bytes(packed: Blocks | Channels) -> int:
+    values = packed.packed if isinstance(packed, Blocks) else packed.values
+    return int(values.nbytes + packed.scales.nbytes)

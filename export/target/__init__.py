@@ -1,0 +1,1 @@
+"""Targets as validated dataclasses, read from `export/targets/*.toml` or from a user's file."""

@@ -1,0 +1,318 @@
+"""The bridge's rules, without clock, socket or DDS: `BridgeCore.step(inputs, now_ns) -> Outputs`.
+
+States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
+* disarmed: the bridge sends nothing, with two exceptions: a robot found moving when the bridge starts is stopped, and
+  so is a robot that moves when an operator asks for an emergency stop.
+* arming: the robot names its version and is stood up call by call, each confirmed by the mode it reports. A danger or
+  a time-out refuses with a reason.
+* armed: the newest good command goes out at the bridge's own rate through limits and slew.
+* stopped: latched. A zero Move and a StopMove go out at once, then zero Moves at the same rate without end, so that a
+  late Move never lasts longer than a period. StopMove is repeated while the robot moves. No message of the robot's
+  network ends the zeros: only an operator's `edge-bridge release` does, so that a person can use the remote.
+An emergency stop (operator, remote keys, local input) latches in every state. Only an operator's arm for a waiting
+runner ends it (`permit.py`).
+A command is good when it is finite, its sequence number is larger than every earlier one of the connection, and its age
+lies between zero and the deadman time. Nothing that is received here can raise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig
+from firmware_bridge.core.dangers import NO_BATTERY, NO_STATE, DangerWatch, Reason, is_moving, is_walking
+from firmware_bridge.core.link import Arm, BridgeStatus, Release, Stop, Velocity
+from firmware_bridge.core.permit import OperatorPermit
+from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
+from firmware_bridge.unitree.messages import ids
+
+_NS_PER_MS: Final = 1_000_000
+_NS_PER_S: Final = 1_000_000_000
+_NEVER_NS: Final = -(2**62)
+_ZERO: Final = (0.0, 0.0, 0.0)
+# What brings a robot in this mode one step nearer to walking; a mode that is not listed gets RecoveryStand, which the
+# maker documents as working from any posture.
+_NEXT_CALL: Final = {
+    ids.MODE_IDLE: ids.STAND_UP,
+    ids.MODE_LIE_DOWN: ids.STAND_UP,
+    ids.MODE_JOINT_LOCK: ids.BALANCE_STAND,
+    ids.MODE_LOCOMOTION: ids.STOP_MOVE,  # another client was driving: stop first
+}
+_CALL_AGAIN_NS: Final = 3 * _NS_PER_S  # standing up takes up to 2 s and must not be started over
+_MODES_ARMED: Final = frozenset({ids.MODE_IDLE, ids.MODE_BALANCE_STAND, ids.MODE_LOCOMOTION})
+_STOP_AGAIN_NS: Final = 100 * _NS_PER_MS
+_FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second after its commander has died
+_STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: a robot that moves this long after a stop does not obey it
+_ASLEEP_NS: Final = 100 * _NS_PER_MS
+_STILL_MOVING: Final = "THE ROBOT STILL MOVES: stop it with its own remote"
+_NO_RUNNER: Final = "operator's arm refused: no runner asks to arm; start edge-run or read its last line, then repeat"
+_LATCHED: Final = "`edge-bridge arm` ends this while a runner waits"
+
+
+class BridgeCore:
+    """State machine and gate. One instance per bridge process; `step` may be called as often as one likes."""
+
+    def __init__(
+        self, bridge: BridgeConfig, limits: LimitsConfig, safety: SafetyConfig, now_ns: int, *, latch: str = ""
+    ) -> None:
+        """`latch`: reason of an emergency stop that an earlier bridge process has left, or empty."""
+        self.clipped = 0
+        self._safety = safety
+        self._period_ns = _NS_PER_S // bridge.rate_hz
+        self._deadman_ns = bridge.deadman_ms * _NS_PER_MS
+        self._arm_timeout_ns = int(bridge.arm_timeout_s * _NS_PER_S)
+        self._state_timeout_ns = bridge.state_timeout_ms * _NS_PER_MS
+        self._low = (limits.vx_min_mps, -limits.vy_max_mps, -limits.wz_max_radps)
+        self._high = (limits.vx_max_mps, limits.vy_max_mps, limits.wz_max_radps)
+        # Growth a tick, from the nominal period: a late tick must not allow a larger jump.
+        self._growth = tuple(a / bridge.rate_hz for a in (limits.accel_mps2, limits.accel_mps2, limits.alpha_radps2))
+        self._state, self._cause, self._reason = "disarmed", "none", "waiting for a client to arm"
+        self._watch = DangerWatch(safety, self._state_timeout_ns)
+        self._permit = OperatorPermit(safety.operator_arm, latch)
+        self._had_client = self._ever_armed = self._released = False
+        self._asleep_ns: int | None = None
+        self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
+        self._called: dict[int, int] = {}  # api id -> when, during this arming
+        self._arm_until_ns = self._good_until_ns = 0
+        self._next_ns = now_ns
+        self._target = self._last_command = _ZERO
+        self._last_seq, self._commands, self._rejected = -1, 0, 0
+        self._requests: list[Move | Call] = []
+
+    def step(self, inputs: Inputs, now_ns: int) -> Outputs:
+        """Take what happened, decide what goes to the robot now."""
+        self._requests = []
+        self._watch.note(inputs, now_ns)
+        self._note_connection(inputs, now_ns)
+        if self._state == "armed" and now_ns > self._good_until_ns:
+            # Before the messages: what has queued up while this process stood still must not feed the deadman.
+            self._stop("deadman", "deadman: no good command in time", now_ns)
+        self._hear_operator(inputs, now_ns)
+        danger = self._danger(now_ns)
+        if danger is not None:
+            self._stop(*danger, now_ns)
+        self._stop_if_found_moving(now_ns)
+        for message in inputs.messages:
+            if isinstance(message, Arm):
+                self._arm(now_ns)
+            elif isinstance(message, Stop):
+                self._stop("client_stop", "stopped by the client", now_ns)
+            elif isinstance(message, Velocity):
+                self._accept(message, now_ns)
+            else:
+                self._rejected += 1  # only the bridge sends a status, only an operator releases
+        if inputs.shutdown:
+            self._stop("shutdown", "bridge shut down", now_ns)
+        elif not inputs.client:
+            self._stop("client_lost", "connection to the runner lost", now_ns)
+        if self._state == "arming" and danger is None:
+            self._stand_up(now_ns)
+        elif self._state == "armed":
+            self._check_armed(now_ns)
+        if now_ns >= self._next_ns:
+            self._tick(now_ns)
+        wake_ns = min(self._next_ns, self._good_until_ns + 1) if self._state == "armed" else self._next_ns
+        return Outputs(tuple(self._requests), self.status(now_ns), wake_ns, self._permit.latch)
+
+    def status(self, now_ns: int) -> BridgeStatus:
+        """State of the bridge as its clients see it."""
+        blocked, zero_after_stop = self._blocked(now_ns), self._state != "armed" and not self._released
+        counters = (max(self._last_seq, 0), self._commands, self._rejected, self._last_command, zero_after_stop)
+        causes = (self._cause, "none" if blocked is None else blocked[0])
+        motion, speed_mps = self._watch.motion(now_ns, self._stopped_ns)
+        disobeys = self._state == "stopped" and not self._released and now_ns - self._stopped_ns >= _STOPPING_NS
+        reason = f"{self._reason}; {_STILL_MOVING}" if disobeys and motion == "moving" else self._reason
+        permit = self._permit.state(now_ns)
+        return BridgeStatus(now_ns, self._state, reason, *counters, *causes, permit, motion, speed_mps)
+
+    def _note_connection(self, inputs: Inputs, now_ns: int) -> None:
+        if inputs.client and not self._had_client:
+            self._last_seq = -1  # numbering is per connection
+        if not (inputs.client and self._had_client):
+            # Also when a client is new: the last Arm of the client before it may have arrived with its disconnection.
+            self._permit.void(disconnected=True)
+        self._had_client = inputs.client
+        if self._asleep_ns is not None and inputs.asleep_ns - self._asleep_ns > _ASLEEP_NS:
+            self._stop("suspended", "this machine was suspended", now_ns)
+        self._asleep_ns = inputs.asleep_ns
+
+    def _hear_operator(self, inputs: Inputs, now_ns: int) -> None:
+        """Emergency stops of every source, then an operator's arm or release; a stop beside them wins."""
+        stop = any(isinstance(message, Stop) for message in inputs.operator)
+        for pressed, reason in (
+            (stop, "emergency stop by an operator"),
+            (inputs.estop, "emergency stop pressed at the local input"),
+            (inputs.robot.remote_estop, "emergency stop pressed on the remote"),
+        ):
+            if pressed:
+                self._permit.hold(reason)
+        if stop:
+            self._released = False
+            self._engage(now_ns)
+        elif any(isinstance(message, Arm) for message in inputs.operator):
+            self._take_permission(now_ns)
+        elif any(isinstance(message, Release) for message in inputs.operator):
+            self._release()
+        known = (Arm, Stop, Release)  # only the runner's socket commands
+        self._rejected += sum(not isinstance(message, known) for message in inputs.operator)
+
+    def _engage(self, now_ns: int) -> None:
+        """An operator's stop of a robot that this bridge has not driven: stop it if it moves."""
+        robot = self._watch.fresh(now_ns, self._state_timeout_ns)
+        if self._state == "disarmed" and robot is not None and is_walking(robot):
+            self._state, self._ever_armed = "armed", True
+            self._stop("estop", self._permit.latch, now_ns)
+
+    def _take_permission(self, now_ns: int) -> None:
+        if not self._permit.is_needed or self._state in ("arming", "armed"):
+            return
+        if not self._permit.give(now_ns):
+            self._cause, self._reason = "operator", _NO_RUNNER
+        elif self._watch.danger(now_ns) is None:  # a danger voids it in this same step
+            self._cause, self._reason = "none", "permitted by an operator, waiting for the runner to arm"
+
+    def _release(self) -> None:
+        """Send nothing until the next arming or emergency stop, so that a person can use the remote."""
+        if self._state in ("stopped", "disarmed"):
+            self._released = True
+            self._permit.void()
+            self._reason = "released by an operator: the bridge sends nothing until the next arming"
+
+    def _danger(self, now_ns: int) -> Reason | None:
+        """What forbids motion now, in every state."""
+        if self._permit.latch and not self._permit.allows(now_ns):
+            return "estop", f"{self._permit.latch}; {_LATCHED}"
+        return self._watch.danger(now_ns)
+
+    def _blocked(self, now_ns: int) -> Reason | None:
+        """Why an arm would be refused now."""
+        reason = self._danger(now_ns) or self._watch.obstacle(now_ns)
+        if reason is None and not self._permit.allows(now_ns):
+            return "operator", "waiting for an operator's `edge-bridge arm`"
+        return reason
+
+    def _arm(self, now_ns: int) -> None:
+        if self._state in ("arming", "armed"):
+            return
+        self._permit.ask(now_ns)
+        if not self._permit.allows(now_ns):
+            # Before everything else and without a change of state: a runner may ask for hours.
+            latch = f" ({self._permit.latch})" if self._permit.latch else ""
+            self._cause, self._reason = "operator", f"arm refused: waiting for an operator's `edge-bridge arm`{latch}"
+            return
+        self._permit.use()
+        self._state, self._cause, self._reason = "arming", "none", "waiting for the robot's state"
+        self._released = False
+        self._arm_until_ns, self._good_until_ns = now_ns + self._arm_timeout_ns, 0
+        self._called, self._watch.version, self._asked_ns = {}, None, _NEVER_NS
+
+    def _accept(self, command: Velocity, now_ns: int) -> None:
+        """The gate. A command that is not good counts as absent, so the deadman goes on running."""
+        velocity = (command.vx_mps, command.vy_mps, command.wz_radps)
+        fresh = 0 <= now_ns - command.stamp_ns <= self._deadman_ns
+        driving = self._state in ("arming", "armed")
+        if not (driving and fresh and command.seq > self._last_seq and all(map(math.isfinite, velocity))):
+            self._rejected += 1
+            return
+        self._last_seq = command.seq
+        self._good_until_ns = command.stamp_ns + self._deadman_ns
+        vx, vy, wz = (min(max(v, low), high) for v, low, high in zip(velocity, self._low, self._high, strict=True))
+        self.clipped += (vx, vy, wz) != velocity
+        if self._state == "armed":
+            self._target = (vx, vy, wz)
+
+    def _stand_up(self, now_ns: int) -> None:
+        robot, blocked, late = self._watch.robot, self._blocked(now_ns), now_ns >= self._arm_until_ns
+        waited = f"after {self._arm_timeout_ns / _NS_PER_S:g} s"
+        if robot is None or blocked in (NO_STATE, NO_BATTERY):  # may still arrive
+            cause, reason = blocked or NO_STATE
+            if late:
+                self._stop(cause, f"{reason} {waited}", now_ns)
+        elif blocked is not None:
+            self._stop(*blocked, now_ns)
+        elif late:
+            if self._watch.version is None:
+                self._stop("wrong_robot", f"the robot's sport service does not answer {waited}", now_ns)
+            else:
+                self._stop("not_standing", f"the robot is in mode {robot.mode}, not standing {waited}", now_ns)
+        elif self._watch.version is None:
+            if now_ns - self._asked_ns >= _NS_PER_S:
+                self._asked_ns, self._reason = now_ns, "asking the robot for its version"
+                self._requests.append(Call(ids.API_VERSION))
+        else:
+            walks = robot.mode == ids.MODE_BALANCE_STAND and is_moving(robot)
+            self._stand_up_from(ids.MODE_LOCOMOTION if walks else robot.mode, now_ns)
+
+    def _stand_up_from(self, mode: int, now_ns: int) -> None:
+        call = _NEXT_CALL.get(mode, ids.RECOVERY_STAND)
+        if mode == ids.MODE_BALANCE_STAND:
+            self._state, self._reason, self._ever_armed = "armed", "driving", True
+            self._permit.finish()
+            # The runner streams commands while arming; one that only starts now gets a deadman time to do so.
+            self._good_until_ns = max(self._good_until_ns, now_ns + self._deadman_ns)
+            self._next_ns = now_ns
+        elif now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
+            self._called[call] = now_ns
+            self._reason = f"{ids.SPORT_API_NAMES[call]} sent, robot in mode {mode}"
+            self._requests.append(Call(call))
+
+    def _check_armed(self, now_ns: int) -> None:
+        robot = self._watch.fresh(now_ns, self._state_timeout_ns)
+        if robot is None:
+            self._stop("state_silent", "the robot's state has gone silent", now_ns)
+        elif robot.mode not in _MODES_ARMED:
+            self._stop("wrong_mode", f"the robot left its walking modes (mode {robot.mode})", now_ns)
+
+    def _stop(self, cause: str, reason: str, now_ns: int) -> None:
+        self._permit.void()
+        if self._state not in ("arming", "armed"):
+            return
+        refused = self._state == "arming" and cause not in ("client_stop", "client_lost", "shutdown")
+        if self._state == "armed":
+            self._move(_ZERO)
+            self._next_ns = now_ns + self._period_ns
+        if self._state == "armed" or self._called:  # an arming that has sent nothing stays silent
+            self._send_stop(now_ns)
+        self._state = "disarmed" if refused and not self._ever_armed else "stopped"
+        self._cause, self._reason = cause, f"arm refused: {reason}" if refused else reason
+        self._target, self._stopped_ns = _ZERO, now_ns
+
+    def _stop_if_found_moving(self, now_ns: int) -> None:
+        """A bridge that died while driving left a moving robot behind; its successor stops it before anything else."""
+        robot, first_ns = self._watch.robot, self._watch.first_report_ns
+        if self._state != "disarmed" or self._ever_armed or first_ns is None or robot is None:
+            return
+        if is_walking(robot) and now_ns - first_ns <= _FOUND_MOVING_NS:
+            self._state, self._ever_armed = "armed", True  # the state of its predecessor
+            self._stop("robot_moving", "the robot was moving when the bridge started; stopped it", now_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        self._next_ns += self._period_ns
+        if self._next_ns <= now_ns:  # after a stall: one command now, no burst
+            self._next_ns = now_ns + self._period_ns
+        if self._state == "armed":
+            blind = self._watch.fresh(now_ns, self._deadman_ns) is None  # a lost report must not end a run
+            self._move(_ZERO if blind else self._slew())
+        elif self._ever_armed and not self._released:  # arming again too: the robot still gets zeros
+            self._move(_ZERO)
+            again = self._watch.moved_lately(now_ns) and now_ns - self._stop_sent_ns >= _STOP_AGAIN_NS
+            if self._state == "stopped" and again:
+                self._send_stop(now_ns)
+
+    def _slew(self) -> tuple[float, float, float]:
+        """The target, approached: each component may grow by accel/rate a tick, and shrink or change sign at once."""
+        vx, vy, wz = (
+            math.copysign(min(abs(to), (abs(at) if at * to > 0 else 0.0) + growth), to)
+            for to, at, growth in zip(self._target, self._last_command, self._growth, strict=True)
+        )
+        return vx, vy, wz
+
+    def _move(self, velocity: tuple[float, float, float]) -> None:
+        self._requests.append(Move(*velocity))
+        self._last_command = velocity
+        self._commands += 1
+
+    def _send_stop(self, now_ns: int) -> None:
+        self._stop_sent_ns = now_ns
+        self._requests.append(Call(ids.STOP_MOVE))

@@ -1,0 +1,56 @@
+"""How long a generation takes in virtual time: a constant, or times that were measured, drawn anew for each one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+
+from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile
+
+__all__ = ["LatencyError", "LatencyProfile", "LatencySampler", "Timing", "load_profile", "parse_latency"]
+
+_TAG = 0x1A7E
+
+
+@dataclass(frozen=True)
+class Timing:
+    """A generation started at t: its newest frame is that of t + `anchor_after_ns`, it is there at t + `total_ns`."""
+
+    total_ns: int
+    anchor_after_ns: int
+
+
+class LatencySampler:
+    """Draws for one episode: the same profile, seed and episode id give the same times."""
+
+    def __init__(self, profile: LatencyProfile, seed: int, episode_id: str) -> None:
+        self._profile = profile
+        self._rng = np.random.default_rng((seed, crc32(episode_id.encode()), _TAG))
+
+    def draw(self) -> Timing:
+        """The next generation's times."""
+        times, anchors = self._profile.generation_s, self._profile.anchor_after_s
+        index = int(self._rng.integers(len(times))) if len(times) > 1 else 0
+        return Timing(_ns(times[index]), _ns(anchors[index]) if anchors else 0)
+
+
+def parse_latency(argument: str) -> LatencyProfile:
+    """Read `--latency S|profile:FILE`; raises LatencyError with one clear line."""
+    kind, _, where = argument.partition(":")
+    if kind == "profile":
+        return load_profile(Path(where))
+    try:
+        seconds = float(argument)
+    except ValueError:
+        raise LatencyError(f"--latency {argument!r}: expected seconds, or profile:FILE") from None
+    try:
+        return LatencyProfile.constant(seconds)
+    except LatencyError as error:
+        raise LatencyError(f"--latency {argument!r}: {error}") from error
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

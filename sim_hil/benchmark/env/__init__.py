@@ -1,0 +1,1 @@
+"""One episode as a world to act in: observations, outcome, metrics, reward, Gymnasium."""

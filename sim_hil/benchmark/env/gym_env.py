@@ -1,0 +1,199 @@
+"""The benchmark as a Gymnasium environment, `DynaNav-v0`: one episode a reset, one control period of 0.1 s a step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import hypot, isfinite
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from edge.core.geometry import SE2
+from sim_hil.benchmark.env.observation import Observation
+from sim_hil.benchmark.env.reward import PAPER, Contacts, RewardWeights, reward
+from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
+from sim_hil.benchmark.suite.episode import Episode, load_suite
+from sim_hil.benchmark.suite.robots import robot_grid
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene
+
+ENV_ID: Final = "DynaNav-v0"
+LOW: Final = (-0.5, -0.35, -1.2)
+HIGH: Final = (1.5, 0.35, 1.2)
+"""Range of the action: vx m/s, vy m/s, wz rad/s; a robot that cannot move sideways ignores the second."""
+MAX_GRIDS: Final = 8
+"""Scenes, once for each robot, whose free space is kept between episodes."""
+
+Pictures = NDArray[np.uint8]
+
+
+class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
+    """Observations: `image` uint8 [height, width, 3], `state` (vx, vy, wz), `pose` (x, y, theta) and `time`, SI.
+
+    `image` is there only with a camera. The pose is odometry's, which drifts as told. An episode ends (`terminated`)
+    at the goal or in a fall and is cut off (`truncated`) by its timeout. `info` names the episode and its instruction,
+    holds the `outcome` once it is over, and `distance_m` in a straight line. The reward is the paper's equation 5; its
+    progress is along the shortest feasible way.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium types it
+
+    def __init__(
+        self,
+        suite: str | Sequence[Episode],
+        *,
+        camera: tuple[int, int] | None = (128, 128),
+        drift: str = "none",
+        weights: RewardWeights = PAPER,
+        scenes: Mapping[str, Scene] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """`suite`: a name, a file, or episodes; `scenes` stand in for loading them by name. Raises SuiteError.
+
+        There is no default: what learns must not be given "dynanav", the suite that it is measured on.
+        """
+        episodes = load_suite(suite) if isinstance(suite, str) else tuple(suite)
+        if not episodes:
+            raise ValueError("DynaNav: expected at least one episode")
+        self.episodes = {episode.id: episode for episode in episodes}
+        self.render_mode = render_mode
+        self._options = WorldOptions(camera=camera, drift=drift)
+        self._weights = weights
+        self._scenes = scenes if scenes is not None else {}
+        self._world: EpisodeWorld | None = None
+        self._grids: dict[tuple[str, str], NavGrid] = {}
+        self.action_space = spaces.Box(np.array(LOW, np.float32), np.array(HIGH, np.float32))
+        parts: dict[str, spaces.Space[Any]] = {
+            "state": spaces.Box(-np.inf, np.inf, (3,), np.float32),
+            "pose": spaces.Box(-np.inf, np.inf, (3,), np.float32),
+            "time": spaces.Box(0.0, np.inf, (1,), np.float32),
+        }
+        if camera is not None:
+            parts["image"] = spaces.Box(0, 255, (camera[1], camera[0], 3), np.uint8)
+        self.observation_space = spaces.Dict(parts)
+
+    @property
+    def world(self) -> EpisodeWorld:
+        """The running episode's world, for privileged policies. Raises RuntimeError before the first reset."""
+        if self._world is None:
+            raise RuntimeError("DynaNav: expected a reset first")
+        return self._world
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode: `options` {"episode": ID, "crowd_seed": N, "wording": N}, all of them optional.
+
+        Without an ID one is drawn, by `seed` where it is given. An episode has its own crowd seed. Raises ValueError.
+        """
+        super().reset(seed=seed)
+        given = dict(options or {})
+        name = given.pop("episode", None)
+        crowd_seed, wording = given.pop("crowd_seed", None), int(given.pop("wording", 0))
+        if given:
+            raise ValueError(f"DynaNav: unknown option {sorted(given)[0]!r}, expected episode, crowd_seed or wording")
+        if name is None:
+            name = list(self.episodes)[int(self.np_random.integers(len(self.episodes)))]
+        if name not in self.episodes:
+            raise ValueError(f"DynaNav: no episode {name!r} in this suite")
+        episode = self.episodes[name]
+        if crowd_seed is not None:
+            episode = replace(episode, seed=int(crowd_seed))
+        self._close_world()
+        self._world = EpisodeWorld(episode, self._options, scene=self._scenes.get(episode.scene))
+        self._instruction = episode.instructions[wording % len(episode.instructions)]
+        self._contacts = Contacts()
+        self._grid = self._grid_of(self._world)
+        self._field = self._grid.distance_field(episode.goal_xy)
+        self._left_m = self._way_m(float("nan"))
+        if not isfinite(self._left_m):
+            self._close_world()
+            raise ValueError(f"DynaNav: episode {name}: expected a way from its start to its goal, found none")
+        return self._observed(), self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Drive 0.1 s with (vx m/s, vy m/s, wz rad/s), clipped to the action's range."""
+        world = self.world
+        vx, vy, wz = (float(v) for v in np.clip(action, LOW, HIGH))
+        before, left_before_m = world.pose(), self._left_m
+        world.step((vx, vy, wz))
+        after = world.pose()
+        self._left_m = self._way_m(left_before_m)
+        value = reward(
+            reached=world.end == "reached",
+            distance_before_m=left_before_m,
+            distance_after_m=self._left_m,
+            collision_began=self._contacts.began(world.touching),
+            speed_mps=10.0 * hypot(after.x_m - before.x_m, after.y_m - before.y_m),
+            weights=self._weights,
+        )
+        return self._observed(), value, world.end in ("reached", "fell"), world.end == "timeout", self._info()
+
+    def _grid_of(self, world: EpisodeWorld) -> NavGrid:
+        """Free space for the robot in the scene; the last few are kept."""
+        robot = world.episode.robot
+        key = (world.episode.scene, robot)
+        if key not in self._grids:
+            if len(self._grids) >= MAX_GRIDS:
+                self._grids.pop(next(iter(self._grids)))
+            self._grids[key] = robot_grid(world.scene, robot)
+        return self._grids[key]
+
+    def _way_m(self, where_none_m: float) -> float:
+        """Length of the way left to the goal, m; where there is none, as in an aisle too narrow, the one given."""
+        pose = self.world.pose()
+        left_m = self._grid.blended_at(self._field, pose.x_m, pose.y_m)
+        return left_m if isfinite(left_m) else where_none_m
+
+    def _distance(self, pose: SE2) -> float:
+        goal_x, goal_y = self.world.episode.goal_xy
+        return hypot(goal_x - pose.x_m, goal_y - pose.y_m)
+
+    def _observed(self) -> dict[str, Any]:
+        seen: Observation = self.world.observe()
+        parts: dict[str, Any] = {
+            "state": np.array(seen.state, np.float32),
+            "pose": np.array(seen.T_odom_base.as_tuple(), np.float32),
+            "time": np.array((seen.time_s,), np.float32),
+        }
+        if seen.image is not None:
+            parts["image"] = seen.image
+        return parts
+
+    def _info(self) -> dict[str, Any]:
+        world = self.world
+        info: dict[str, Any] = {
+            "episode": world.episode.id,
+            "instruction": self._instruction,
+            "distance_m": self._distance(world.pose()),
+            "collided": world.collided,
+        }
+        if world.done:
+            info["outcome"] = world.outcome()
+        return info
+
+    def render(self) -> Pictures | None:
+        """The robot's view now, 320 x 180, in render mode rgb_array; else None."""
+        return self.world.picture(320, 180) if self.render_mode == "rgb_array" else None
+
+    def _close_world(self) -> None:
+        if self._world is not None:
+            self._world.close()
+            self._world = None
+
+    def close(self) -> None:
+        """Release the world; may be called twice."""
+        self._close_world()
+
+
+def register() -> None:
+    """Make `gymnasium.make("DynaNav-v0")` known; may be called twice."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(id=ENV_ID, entry_point="sim_hil.benchmark.env.gym_env:DynaNavEnv")
+
+
+register()

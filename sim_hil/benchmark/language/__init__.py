@@ -1,0 +1,1 @@
+"""Routes through a scene as instructions in words, and back."""

@@ -1,0 +1,147 @@
+"""Openings along a way, found in the geometry: where one can leave a corridor, aisle or sidewalk to left or right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Area, Scene, Vec2
+
+LINEAR = frozenset(("corridor", "aisle", "sidewalk", "crossing"))  # areas that one follows along their length
+_STEP_M = 0.1
+_BODY_M = 0.3  # an opening is where something of this radius gets through
+_BEYOND_M = 0.45
+_SIDEWAYS_M = 1.0  # a crossed corridor that reaches this far aside is an opening to that side
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The upright box round an area, m."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def along_x(self) -> bool:
+        """Whether it is longer along x."""
+        return self.x1 - self.x0 >= self.y1 - self.y0
+
+
+def bounds_of(area: Area) -> Bounds:
+    """The upright box round an area's polygon."""
+    xs, ys = zip(*area.polygon, strict=True)
+    return Bounds(min(xs), min(ys), max(xs), max(ys))
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A way out to one side: from `low` to `high` along the direction of travel, into `area`."""
+
+    side: str
+    low_m: float
+    high_m: float
+    area: Area
+
+    @property
+    def middle_m(self) -> float:
+        """Along the direction of travel."""
+        return (self.low_m + self.high_m) / 2
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A direction of travel along x or y: `along` grows ahead, `across` to the left."""
+
+    direction: Vec2  # a unit vector along an axis
+
+    def along(self, p: Vec2) -> float:
+        """Coordinate ahead, m."""
+        return p[0] * self.direction[0] + p[1] * self.direction[1]
+
+    def across(self, p: Vec2) -> float:
+        """Coordinate to the left, m."""
+        return p[1] * self.direction[0] - p[0] * self.direction[1]
+
+    def point(self, along: float, across: float) -> Vec2:
+        """World point of the two coordinates."""
+        dx, dy = self.direction
+        return (along * dx - across * dy, along * dy + across * dx)
+
+    def span(self, box: Bounds) -> tuple[Vec2, Vec2]:
+        """(from, to) ahead and (from, to) to the left of a box."""
+        corners = [(box.x0, box.y0), (box.x1, box.y1)]
+        ahead = sorted(self.along(c) for c in corners)
+        left = sorted(self.across(c) for c in corners)
+        return (ahead[0], ahead[1]), (left[0], left[1])
+
+
+def opening_class(kind: str) -> str:
+    """What is counted together: corridors with aisles, rooms (doors), each other kind."""
+    return "passage" if kind in ("corridor", "aisle") else kind
+
+
+def is_open(grid: NavGrid, a: Vec2, b: Vec2) -> bool:
+    """Whether a small body gets straight from one point to the other."""
+    count = max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 0.1) + 1)
+    share = np.linspace(0, 1, count)[:, None]
+    points = np.array(a) * (1 - share) + np.array(b) * share
+    return bool(np.all(grid.clearances_at(points) >= _BODY_M))
+
+
+def side_openings(
+    scene: Scene, grid: NavGrid, frame: Frame, followed: list[Area], crossed: list[Area], side: str
+) -> list[Opening]:  # fmt: skip
+    """Openings to one side of the areas that are followed in a direction, in the order in which they are passed.
+
+    `crossed` are corridors that the way runs across: they open to either side.
+    """
+    sign = 1.0 if side == "left" else -1.0
+    own = {area.label for area in (*followed, *crossed)}
+    found: list[Opening] = []
+    edges = []
+    for area in followed:
+        (low, high), across = frame.span(bounds_of(area))
+        edge = across[1] if side == "left" else across[0]
+        edges.append(edge)
+        for other in scene.areas:
+            if other.label in own:
+                continue
+            (o_low, o_high), (o_right, o_left) = frame.span(bounds_of(other))
+            near = o_right if side == "left" else o_left
+            if abs(near - edge) > 0.02:
+                continue
+            start, end = max(low, o_low), min(high, o_high)
+            if end - start > 0.3:
+                found += _gaps(grid, frame, (start, end), edge, sign, side, other)
+    for area in crossed:
+        (low, high), across = frame.span(bounds_of(area))
+        reach = (across[1] - max(edges)) if side == "left" else (min(edges) - across[0])
+        if edges and reach >= _SIDEWAYS_M:
+            found.append(Opening(side, low, high, area))
+    return sorted(found, key=lambda opening: opening.middle_m)
+
+
+def _gaps(
+    grid: NavGrid, frame: Frame, span: Vec2, edge: float, sign: float, side: str, area: Area
+) -> list[Opening]:  # fmt: skip
+    count = max(2, int((span[1] - span[0]) / _STEP_M) + 1)
+    along = np.linspace(span[0], span[1], count)
+    open_ = np.ones(count, bool)
+    for beyond in (-_BEYOND_M, -_BEYOND_M / 2, 0.0, _BEYOND_M / 2, _BEYOND_M):
+        points = np.array([frame.point(float(a), edge + sign * beyond) for a in along])
+        open_ &= grid.clearances_at(points) >= _BODY_M
+    found, index = [], 0
+    while index < count:
+        if not open_[index]:
+            index += 1
+            continue
+        first = index
+        while index < count and open_[index]:
+            index += 1
+        low, high = max(span[0], along[first] - _BODY_M), min(span[1], along[index - 1] + _BODY_M)
+        found.append(Opening(side, float(low), float(high), area))
+    return found

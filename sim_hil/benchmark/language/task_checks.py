@@ -1,0 +1,125 @@
+"""Checks of a task on its scene: landmarks seen on the way, a goal not reached through a wall, turns that bend."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from math import atan2, degrees, hypot, pi
+
+import numpy as np
+
+from sim_hil.benchmark.language.instruction_reading import read
+from sim_hil.benchmark.language.route import Passed, Told
+from sim_hil.benchmark.language.visibility import Sightlines
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene, Vec2
+
+MIN_PIXELS = 40.0  # of a 128 x 128 picture: about 6 x 6, enough for a colour and a shape
+RANGE_INDOORS_M, RANGE_OUTDOORS_M = 12.0, 30.0
+_POSE_M = 0.4
+_STEP_M = 0.1
+_LOOK, _RUN = 22, 6  # steps: a turn lies within 2.2 m of where it is told; directions are taken over 0.6 m
+_LEAST_TURN_RAD = pi / 9  # 20 degrees: a shortest path rounds its corners slantwise
+_OPEN = frozenset(("plaza", "yard"))
+
+
+def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
+    """Poses (x m, y m, heading rad) every 0.4 m along a path, looking along it."""
+    poses: list[tuple[float, float, float]] = []
+    for a, b in itertools.pairwise(path):
+        length = hypot(b[0] - a[0], b[1] - a[1])
+        if length < 1e-6:
+            continue
+        heading = atan2(b[1] - a[1], b[0] - a[0])
+        count = max(1, round(length / _POSE_M))
+        poses += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count, heading) for k in range(count)]
+    if poses:
+        poses.append((path[-1][0], path[-1][1], poses[-1][2]))
+    return poses
+
+
+def named_landmarks(texts: Sequence[str], told: Told) -> tuple[str, ...]:
+    """Labels of the things that any of the texts names, the goal first, then in the order of the way."""
+    names = {claim.name for text in texts for claim in read(text) if claim.name}
+    along: list[Passed] = []
+    for step in told.steps:
+        along += [*step.passed, *step.near]
+    along += told.passed
+    labels = [told.goal_label]
+    for thing in along:
+        if thing.name in names and thing.label not in labels:
+            labels.append(thing.label)
+    return tuple(labels)
+
+
+def named_too_small(
+    scene: Scene, lines: Sightlines, path: Sequence[Vec2], labels: Sequence[str]
+) -> list[str]:  # fmt: skip
+    """Landmarks that are nowhere along the path large enough in the picture, one line each."""
+    range_m = RANGE_INDOORS_M if scene.ceiling_height_m > 0 else RANGE_OUTDOORS_M
+    poses, found = poses_along(path), []
+    things = {thing.label: thing for thing in scene.objects}
+    for label in labels:
+        if label not in things:
+            found.append(f"{label}: no such landmark in the scene")
+            continue
+        sight = lines.best(poses, things[label], range_m)
+        if sight.pixels < MIN_PIXELS:
+            found.append(f"{label}: at most {sight.pixels:.0f} px in the picture, {MIN_PIXELS:.0f} expected")
+    return found
+
+
+def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
+    """How much further than it should be the goal is, m, from the worst free spot within the threshold; 0: sound.
+
+    A spot behind a wall lies within the circle but a long way off: a robot there would count as having arrived.
+    """
+    field = grid.distance_field(goal)
+    low = grid.cell(goal[0] - threshold_m, goal[1] - threshold_m)
+    high = grid.cell(goal[0] + threshold_m, goal[1] + threshold_m)
+    worst = 0.0
+    for row in range(low[0], high[0] + 1):
+        for column in range(low[1], high[1] + 1):
+            x, y = grid.centre(row, column)
+            gap = hypot(x - goal[0], y - goal[1])
+            if gap < threshold_m and grid.free[row, column]:
+                worst = max(worst, float(min(field[row, column], 1e6)) - (2.0 * threshold_m + 0.5))
+    return float(np.maximum(worst, 0.0))
+
+
+def wrong_bends(told: Told, path: Sequence[Vec2]) -> list[str]:
+    """The told turns against the bare path: where each one is said to be, the path must bend that way.
+
+    Not onto a plaza or a yard: their borders are open, and a straight line may run slantwise across.
+    """
+    dense = _dense(path)
+    places = [_nearest(dense, step.at) for step in told.steps]
+    found = []
+    for index, (step, at) in enumerate(zip(told.steps, places, strict=True)):
+        if step.side == "straight" or step.kind in _OPEN:
+            continue
+        # No further than half way to the turns before and after: they bend the path too.
+        first = max(at - _LOOK, (places[index - 1] + at) // 2 if index else 0)
+        last = min(at + _LOOK, (at + places[index + 1]) // 2 if index + 1 < len(places) else len(dense) - 1)
+        before = _minus(dense[min(first + _RUN, at)], dense[first])
+        after = _minus(dense[last], dense[max(last - _RUN, at)])
+        bend = (atan2(after[1], after[0]) - atan2(before[1], before[0]) + pi) % (2 * pi) - pi
+        if (bend > 0) != (step.side == "left") or abs(bend) < _LEAST_TURN_RAD:
+            found.append(f"turn {step.side} into the {step.name}: the path bends by {degrees(bend):.0f} degrees there")
+    return found
+
+
+def _dense(path: Sequence[Vec2]) -> list[Vec2]:
+    points = [path[0]]
+    for a, b in itertools.pairwise(path):
+        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / _STEP_M))
+        points += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count) for k in range(1, count + 1)]
+    return points
+
+
+def _nearest(points: Sequence[Vec2], to: Vec2) -> int:
+    return min(range(len(points)), key=lambda index: hypot(*_minus(points[index], to)))
+
+
+def _minus(a: Vec2, b: Vec2) -> Vec2:
+    return (a[0] - b[0], a[1] - b[1])

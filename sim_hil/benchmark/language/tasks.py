@@ -1,0 +1,191 @@
+"""Tasks drawn from a scene: a start, a landmark to go to, and the way between them told; for episodes and training."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import atan2, cos, hypot, pi, sin
+
+import numpy as np
+
+from sim_hil.benchmark.language.openings import LINEAR, bounds_of
+from sim_hil.benchmark.language.route import RouteError, Told, tell
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Area, Scene, SceneObject, Vec2, Vec3
+
+GOAL_GAP_M = 0.95  # from a landmark's front to the goal: a robot stands there without touching it
+_LYING = frozenset(("carpet",))
+_STANDS_M = {"umbrella": 0.15, "umbrella_table": 0.5}  # half of what stands on the ground below the cloth
+# One stops where one gets to these, whichever way they look.
+_FREE_STANDING = frozenset(
+    ("forklift", "pallet_jack", "fountain", "umbrella", "umbrella_table", "kiosk", "statue", "drum", "traffic_cone",
+     "box_stack", "wet_floor_sign", "meeting_table")
+)  # fmt: skip
+_NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "clock", "planter"))
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where to go: `path` is the shortest way from `start` to `goal`, m, for the grid's robot; `told` says it."""
+
+    start: Vec3
+    goal: Vec2
+    goal_label: str
+    path: tuple[Vec2, ...]
+    told: Told
+
+
+def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
+    """Where to stop at a landmark, on the grid's free floor: before its front, or on a carpet; None: nowhere."""
+    x, y, _ = thing.position_m
+    if thing.kind in _LYING:
+        return (round(x, 2), round(y, 2)) if grid.is_free(x, y) else None
+    for gap in (GOAL_GAP_M, GOAL_GAP_M - 0.2, GOAL_GAP_M + 0.2, GOAL_GAP_M - 0.4):
+        reach = _STANDS_M.get(thing.kind, thing.size_m[0] / 2) + gap
+        for turn in (0.0, 0.4, -0.4):
+            angle = thing.heading_rad + turn
+            px, py = round(x + reach * cos(angle), 2), round(y + reach * sin(angle), 2)
+            if grid.is_free(px, py):
+                return (px, py)
+    return None
+
+
+def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> Task:
+    """The task to go from a start to a landmark; raises RouteError when it cannot be done or told."""
+    goal = goal_before(grid, thing)
+    if goal is None:
+        raise RouteError(f"there is no room before the {thing.landmark}")
+    path = grid.path((start[0], start[1]), goal)
+    if path is None:
+        raise RouteError(f"there is no way to the {thing.landmark}")
+    if thing.kind in _FREE_STANDING:
+        goal = _first_beside(grid, thing, path) or goal
+        path = grid.path((start[0], start[1]), goal)
+        if path is None:
+            raise RouteError(f"there is no way to the {thing.landmark}")
+    told = tell(scene, grid, path, thing)
+    return Task(start, goal, thing.label, tuple(path), told)
+
+
+def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 | None:
+    """Where a way first comes close to a thing that has no side to stop before."""
+    for a, b in itertools.pairwise(path):
+        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / 0.1))
+        for k in range(count + 1):
+            x, y = a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count
+            point = (round(x, 2), round(y, 2))
+            if outline_gap_m(thing, point) < GOAL_GAP_M and grid.is_free(*point):
+                return point
+    return None
+
+
+def outline_gap_m(thing: SceneObject, point: Vec2) -> float:
+    """Distance from a point to what a thing stands on, m: its bounding box, or its parts where it is a parasol."""
+    boxes = thing.boxes if thing.kind in ("umbrella", "umbrella_table", "tree") else (thing.box,)
+    gaps = []
+    for box in boxes:
+        dx, dy = point[0] - box.centre_m[0], point[1] - box.centre_m[1]
+        c, s = box.axis
+        along, across = abs(dx * c + dy * s) - box.size_m[0] / 2, abs(dy * c - dx * s) - box.size_m[1] / 2
+        gaps.append(hypot(max(along, 0.0), max(across, 0.0)))
+    return min(gaps)
+
+
+def goals(scene: Scene) -> list[SceneObject]:
+    """Landmarks that one can be sent to."""
+    return [thing for thing in scene.landmarks() if thing.kind not in _NOT_GOALS]
+
+
+def starts(scene: Scene) -> list[Area]:
+    """Areas in which one can begin: those that one walks along, and rooms that one leaves."""
+    return [area for area in scene.areas if area.kind in (*LINEAR, "room") and area.kind != "crossing"]
+
+
+def draw_start(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Vec3:
+    """A free pose along a corridor, looking one way, or in a room. Raises RouteError when none was found."""
+    areas = starts(scene)
+    # Corridors by their length; a room now and then.
+    weights = np.array([_weight(area) for area in areas])
+    for _ in range(50):
+        area = areas[int(rng.choice(len(areas), p=weights / weights.sum()))]
+        box = bounds_of(area)
+        x = round(float(rng.uniform(box.x0 + 0.6, box.x1 - 0.6)), 2)
+        y = round(float(rng.uniform(box.y0 + 0.6, box.y1 - 0.6)), 2)
+        flip = bool(rng.integers(2))
+        if area.kind == "room":
+            heading = float(round(float(rng.uniform(-pi, pi)), 2))
+        else:
+            heading = (pi if flip else 0.0) if box.along_x else (-pi / 2 if flip else pi / 2)
+        if grid.clearance_m(x, y) >= grid.required_m + 0.15:
+            return (x, y, heading)
+    raise RouteError("no free start was found")
+
+
+def _weight(area: Area) -> float:
+    box = bounds_of(area)
+    return 2.0 if area.kind == "room" else max(box.x1 - box.x0, box.y1 - box.y0)
+
+
+def sample_task(
+    scene: Scene, grid: NavGrid, rng: np.random.Generator, *, things: Sequence[SceneObject] | None = None,
+    length_m: tuple[float, float] = (4.0, 80.0), tries: int = 12,
+) -> Task:  # fmt: skip
+    """One task by chance, to one of `things` (any goal of the scene), its way's length within limits.
+
+    Raises RouteError when none of the starts drawn can be told unmistakably: draw again.
+    """
+    found = goals(scene) if things is None else things
+    if not found:
+        raise RouteError("the scene has no landmark to go to")
+    thing = found[int(rng.integers(len(found)))]
+    goal = goal_before(grid, thing)
+    if goal is None:
+        raise RouteError(f"there is no room before the {thing.landmark}")
+    field = grid.distance_field(goal)
+    why = "no start at such a distance was drawn"
+    for _ in range(tries):
+        start = draw_start(scene, grid, rng)
+        # The grid's own distances are up to 3 % long; the path's length is what counts to the caller.
+        if not length_m[0] <= grid.field_at(field, start[0], start[1]) <= length_m[1]:
+            continue
+        try:
+            return _facing(make_task(scene, grid, start, thing))
+        except RouteError as error:
+            why = str(error)
+    raise RouteError(why)
+
+
+def _facing(task: Task) -> Task:
+    """The same task, the robot looking where it must go; raises RouteError when the way begins beside it."""
+    start = task.start
+    away = _first_direction(task.path)
+    if task.told.leaves_room:  # stand so that the door is ahead
+        return replace(task, start=(start[0], start[1], round(away, 3)))
+    if abs(_wrapped(away - start[2])) > pi / 2:  # look the other way along the corridor
+        start = (start[0], start[1], _wrapped(start[2] + pi))
+    task = replace(task, start=start)
+    if not begins_ahead(task):
+        raise RouteError("the way begins to the robot's side")
+    return task
+
+
+def begins_ahead(task: Task) -> bool:
+    """Whether the robot looks where its way begins: words that say "go on" are true only then."""
+    return abs(_wrapped(_first_direction(task.path) - task.start[2])) <= pi / 3
+
+
+def _first_direction(path: tuple[Vec2, ...]) -> float:
+    """Where a path leads in its first two metres."""
+    left, at = 2.0, path[0]
+    for a, b in itertools.pairwise(path):
+        length = hypot(b[0] - a[0], b[1] - a[1])
+        at = b if length <= left else (a[0] + (b[0] - a[0]) * left / length, a[1] + (b[1] - a[1]) * left / length)
+        left -= length
+        if left <= 0:
+            break
+    return atan2(at[1] - path[0][1], at[0] - path[0][0])
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + pi) % (2 * pi) - pi

@@ -1,0 +1,1 @@
+"""Policies that drive an episode: exported models, baselines, the expert, external servers."""

@@ -1,0 +1,246 @@
+"""An exported model in virtual time: the runner's own control loop, limits and supervisor, on the episode's clock.
+
+Odometry reaches it as the world reports it, so that its drift is in every anchor and motion offset.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.core.geometry import SE2
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy as Model
+from edge.motion.controller import Controller, ControllerConfig, VelocityCommand
+from edge.run.assembly import FRAME_MAX_AGE_MS, semantic_config
+from edge.run.control_loop import ControlLoop
+from edge.run.reasoning_loop import Mode
+from edge.safety.monitors.watch import Sources, Watch, WatchConfig
+from edge.safety.supervisor import Supervisor
+from edge.state.frame import Frame, fit_frame
+from edge.state.pose_history import PoseHistory, StampedPose
+from edge.state.ring import TokenRing
+from edge.state.semantic import SemanticSlot, SemanticState
+from firmware_bridge.client import BridgeStatus
+from firmware_bridge.core.config import RobotConfig
+from sim_hil.benchmark.conditions.conditions import ConditionsError
+from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
+from sim_hil.benchmark.env.observation import Observation
+from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.suite.episode import Episode
+
+CONTROL_PERIOD_NS = 100_000_000
+RING_S = 16.0
+"""Of frames: the 9 s that a generation looks back, and what a late newest frame may take."""
+_START_NS = 1_000_000_000
+"""The loop's clock at an episode's start; its stamps are never zero."""
+
+
+class ArtifactsPolicy:
+    """Drives episodes with an artifact directory; one thread for every graph, so that it computes alike everywhere."""
+
+    privileged = False
+    needs_image = True
+
+    def __init__(
+        self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig, stays: bool = False
+    ) -> None:
+        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they cannot do.
+
+        `stays`: it stands where its answers have placed the stop.
+        """
+        self._artifacts = load_artifacts(directory)
+        check_suits(self._artifacts, mode)
+        self._mode, self._latency, self._robot, self._stays = Mode(mode), latency, robot, stays
+        self._model = Model(self._artifacts, threads=1)
+        self._language = LanguageModel(self._artifacts, threads=1)
+        self._drive: _Drive | None = None
+        self.name = f"artifacts:{self._artifacts.model_name}"
+
+    @property
+    def manifest_sha256(self) -> str:
+        """Which artifacts these are."""
+        return self._artifacts.manifest_sha256
+
+    @property
+    def camera(self) -> tuple[int, int]:
+        """(width, height) of the picture that it looks at: the whole field of view, squeezed."""
+        return (self._artifacts.runtime.image_px,) * 2
+
+    def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
+        """Begin an episode with no frames and no semantic state. Raises InstructionError for too long a prompt."""
+        self._language.check_instruction(instruction, len(self._artifacts.runtime.frame_offsets_s))
+        draw = LatencySampler(self._latency, seed, episode.id).draw
+        self._drive = _Drive(
+            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._stays
+        )
+
+    def act(self, observation: Observation) -> tuple[float, float, float]:
+        """The command of one control period. Raises ValueError without a picture or before an episode."""
+        if self._drive is None or observation.image is None:
+            raise ValueError("artifacts: expected an episode that has begun and a picture in every observation")
+        return self._drive.tick(observation, observation.image)
+
+    def notes(self) -> dict[str, Any]:
+        """What the last act knew: delay, text, waypoints, why it stood."""
+        return {} if self._drive is None else self._drive.notes
+
+    def generations(self) -> list[Mapping[str, Any]]:
+        """Generations released so far in this episode, their times from its start."""
+        return [] if self._drive is None else self._drive.generations()
+
+    def close(self) -> None:
+        """Let go of the graphs."""
+        self._drive = None
+
+
+class _Drive:
+    """One episode."""
+
+    def __init__(
+        self, artifacts: Artifacts, model: Model, language: LanguageModel, robot: RobotConfig, mode: Mode,
+        instruction: str, draw: Any, stays: bool,
+    ) -> None:  # fmt: skip
+        runtime = artifacts.runtime
+        if runtime.tick_period_ms * 1_000_000 != CONTROL_PERIOD_NS:
+            raise ArtifactError(
+                f"{artifacts.directory}: made for a tick of {runtime.tick_period_ms} ms, the benchmark's is "
+                f"{CONTROL_PERIOD_NS // 1_000_000} ms; export with runtime.tick_period_ms = 100"
+            )
+        self._image_px = runtime.image_px
+        self._now_ns = 0
+        self._frame: Frame | None = None
+        self._history = PoseHistory(512)
+        self._slot = SemanticSlot()
+        self._ring = TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, model.tokens_shape)
+        seen = _DelayTold(model, blocking=mode is Mode.SYNC)
+        self._told = seen
+        self._reasoner = LockstepReasoner(
+            language=language,
+            policy=model,
+            ring=self._ring,
+            slot=self._slot,
+            instruction=instruction,
+            frame_offsets_s=runtime.frame_offsets_s,
+            max_new_tokens=runtime.max_new_tokens,
+            draw=draw,
+            mode=mode,
+        )
+        config = ControllerConfig(
+            robot.limits, runtime.step_s, FRAME_MAX_AGE_MS, odometry_max_age_ms=float(robot.odometry.max_age_ms)
+        )
+        watch = WatchConfig.standard(
+            config, CONTROL_PERIOD_NS, image_px=runtime.image_px, semantic=semantic_config(artifacts, mode)
+        )
+        sources = Sources(
+            failed_generations=lambda: self._reasoner.failed,
+            invalid_texts=lambda: self._reasoner.invalid_in_a_row,
+            asleep_ns=lambda: 0,
+        )
+        self._loop = ControlLoop(
+            policy=seen,  # type: ignore[arg-type]  # the calls of a tick, with the delay that the mode tells
+            controller=Controller(config),
+            newest_frame=lambda: self._frame,
+            history=self._history,
+            ring=self._ring,
+            slot=self._slot,
+            sink=_NoBridge(),
+            recorder=None,
+            period_ns=CONTROL_PERIOD_NS,
+            step_s=runtime.step_s,
+            stop=threading.Event(),
+            watch=Watch(watch, sources),
+            supervisor=Supervisor(),
+            stays=stays,
+            clock=lambda: self._now_ns,
+        )
+        self.notes: dict[str, Any] = {}
+
+    def tick(self, observation: Observation, image: npt.NDArray[np.uint8]) -> tuple[float, float, float]:
+        now_ns = self._now_ns = _START_NS + round(observation.time_s * 1e9)
+        self._frame = Frame(now_ns, fit_frame(image, self._image_px), b"")
+        self._history.put(StampedPose(now_ns, observation.T_odom_base, *observation.state))
+        self._reasoner.release(now_ns)
+        self._told.last = None
+        command = VelocityCommand(0.0, 0.0, 0.0, None, "stopped")
+        if not self._loop.supervision.stop:
+            command = self._loop.tick(now_ns)
+            self._reasoner.start(now_ns)
+        self.notes = self._note(command, now_ns)
+        return command.vx_mps, command.vy_mps, command.wz_radps
+
+    def _note(self, command: VelocityCommand, now_ns: int) -> dict[str, Any]:
+        told, semantic, supervision = self._told.last, self._slot.state, self._loop.supervision
+        since_ns = self._reasoner.thinking_since_ns
+        return {
+            "delay_s": None if told is None else told[0],
+            "offset": None if told is None else list(told[1].as_tuple()),
+            "generation": None if semantic is None else semantic.generation,
+            "text": "" if semantic is None else semantic.text,
+            "waypoints": None if semantic is None else semantic.waypoints,
+            "thinking_s": None if since_ns is None else (now_ns - since_ns) / 1e9,
+            "reason": command.reason,
+            "target": None if command.target is None else list(command.target.as_tuple()),
+            "speed_scale": supervision.speed_scale,
+            "says": supervision.says or self._reasoner.failure or "",
+            "stopped_by": supervision.active[0] if supervision.stop and supervision.active else "",
+        }
+
+    def generations(self) -> list[Mapping[str, Any]]:
+        keys = ("started_s", "anchor_s", "released_s")
+        return [
+            {**record, **{key: round(record[key] - _START_NS / 1e9, 3) for key in keys}}
+            for record in self._reasoner.released
+        ]
+
+
+class _DelayTold:
+    """The model as a tick calls it. Blocking: the world waits while it thinks, so delay and motion offset are zero."""
+
+    def __init__(self, model: Model, *, blocking: bool) -> None:
+        self._model = model
+        self._blocking = blocking
+        self.last: tuple[float, SE2] | None = None
+        """Delay and motion offset that the action expert was told last."""
+
+    def encode(self, frame: npt.NDArray[np.uint8], out: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float32]:
+        """Frame → visual tokens."""
+        return self._model.encode(frame, out)
+
+    def act(
+        self, visual_tokens: npt.NDArray[np.float32], state: tuple[float, float, float], delay_s: float, offset: SE2,
+        semantic: SemanticState,
+    ) -> npt.NDArray[np.float32]:  # fmt: skip
+        """Planned trajectory."""
+        if self._blocking:
+            delay_s, offset = 0.0, SE2(0.0, 0.0, 0.0)
+        self.last = delay_s, offset
+        return self._model.act(visual_tokens, state, delay_s, offset, semantic)
+
+
+class _NoBridge:
+    """Takes the commands, which the episode is given by `act`."""
+
+    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
+        """Always sent."""
+        return True
+
+    def poll(self) -> BridgeStatus | None:
+        """There is no bridge."""
+        return None
+
+
+def check_suits(artifacts: Artifacts, mode: str) -> None:
+    """Raise ConditionsError for a mode that a policy cannot do."""
+    if artifacts.guided_by_waypoints and mode == Mode.NO_REASONING.value:
+        raise ConditionsError(
+            f"--mode {mode}: {artifacts.directory} is guided by the waypoints that reasoning writes; expected async "
+            "or sync"
+        )

@@ -1,0 +1,251 @@
+"""How the expert moves along its way among people: many short futures are driven in thought, and the best one begun.
+
+Each future follows the way at one speed, shifted to one side by some distance, or turns, waits or backs off; people go
+on as they walk. A future is judged by how far it comes, how near it passes people and walls, and how jerky it starts.
+Sampled velocities with predicted people: after van den Berg's velocity obstacles and Fox's dynamic window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.benchmark.policies.expert_route import SPACING_M
+from sim_hil.crowd.people import PERSON_RADIUS_M
+from sim_hil.scene.nav_grid import NavGrid
+
+Array = NDArray[np.float64]
+STEP_S: Final = 0.2
+STEPS: Final = 20
+CONTROL_S: Final = 0.1
+PERSON_M: Final = 0.5  # the benchmark's collision distance, centre to centre
+_SHIFTS_M: Final = (0.0, 0.18, -0.18, 0.4, -0.4, 0.7, -0.7, 1.1, -1.1, 1.6, -1.6)
+_SIDES: Final = np.array(_SHIFTS_M)
+_PACES: Final = (1.0, 0.75, 0.5, 0.25)
+# Futures that do not follow the way: share of the top speed, share of the top turning rate.
+_FIXED: Final = ((0.0, 0.0), (0.0, 0.7), (0.0, -0.7), (-0.25, 0.0), (-0.25, 0.4), (-0.25, -0.4))
+
+
+@dataclass(frozen=True)
+class Driving:
+    """How a robot is driven: comfortable limits, and distances kept; m, s, rad."""
+
+    speed_mps: float = 1.0
+    turn_radps: float = 1.0
+    accel_mps2: float = 1.0
+    brake_mps2: float = 1.6
+    turn_accel_radps2: float = 3.0
+    body_radius_m: float = 0.27
+    body_reach_m: float = 0.1
+    margin_m: float = 0.15  # beyond the collision distance
+    comfort_m: float = 0.55
+
+    def __post_init__(self) -> None:
+        if min(self.speed_mps, self.turn_radps, self.accel_mps2, self.brake_mps2, self.turn_accel_radps2) <= 0:
+            raise ValueError("expert: every limit must be positive")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen: the velocity to command, and the future that it begins.
+
+    `future` [STEPS, 2] m in the world and `headings_rad` [STEPS], at STEP_S, 2 STEP_S, … from now.
+    """
+
+    vx_mps: float
+    wz_radps: float
+    future: Array
+    headings_rad: Array
+    shift_m: float
+    cost: float
+    """Below zero: it comes ahead; much above: something is in the way."""
+
+
+class Motion:
+    """Chooses velocities, one every CONTROL_S; remembers the last, for smoothness."""
+
+    def __init__(self, grid: NavGrid, driving: Driving) -> None:
+        self._grid = grid
+        self._driving = driving
+        self._speed, self._turn, self._shift = 0.0, 0.0, 0.0
+        pairs = [(pace, shift) for pace in _PACES for shift in _SHIFTS_M] + [(0.0, 0.0)]
+        follow = len(pairs)
+        self._pace = np.array([pace for pace, _ in pairs] + [0.0] * len(_FIXED)) * driving.speed_mps
+        self._side = np.array([shift for _, shift in pairs] + [0.0] * len(_FIXED))
+        rows = [_SHIFTS_M.index(shift) for _, shift in pairs] + [0] * len(_FIXED)
+        self._side_row = np.array(rows, dtype=np.int64)
+        self._is_fixed = np.arange(follow + len(_FIXED)) >= follow
+        self._fixed_v = np.array([0.0] * follow + [v for v, _ in _FIXED]) * driving.speed_mps
+        self._fixed_w = np.array([0.0] * follow + [w for _, w in _FIXED]) * driving.turn_radps
+        self._waits = (self._pace == 0.0) & ~self._is_fixed
+        self._times = (np.arange(STEPS) + 1) * STEP_S
+        self._near_term = np.array([exp(-time / 2.5) for time in self._times])
+
+    def choose(
+        self,
+        pose: tuple[float, float, float],
+        speed_mps: float,
+        route: Array,
+        people: Array,
+        velocities: Array,
+        *,
+        patience: float = 1.0,
+    ) -> Choice:
+        """The velocity for the next control period.
+
+        `pose` x m, y m, heading rad; `speed_mps` measured; `route` [n, 2] points SPACING_M apart from here on;
+        `people` [k, 2] m, `velocities` [k, 2] m/s. `patience` below 1 lets it pass people closer than is comfortable.
+        """
+        # A robot that something holds back must not think that it still drives at the speed it was told.
+        self._speed = min(max(self._speed, speed_mps - 0.35), speed_mps + 0.35)
+        x, y, v, turned, wanted_v, wanted_w = self._drive(pose, route)
+        cost = self._progress(x, y, route) + self._walls(x, y, turned)
+        if len(people):
+            cost = cost + self._people(x, y, v, turned, people, velocities, patience)
+        cost = cost + 0.06 * np.abs(wanted_v - self._speed) + 0.03 * np.abs(wanted_w - self._turn)
+        cost = cost + 0.06 * np.abs(self._side - self._shift) + 0.03 * np.abs(self._side)
+        best = int(np.argmin(cost))
+        driving = self._driving
+        self._speed = _slew(
+            self._speed, float(wanted_v[best]), driving.brake_mps2 * CONTROL_S, driving.accel_mps2 * CONTROL_S
+        )
+        turn_step = driving.turn_accel_radps2 * CONTROL_S
+        self._turn = _slew(self._turn, float(wanted_w[best]), turn_step, turn_step)
+        self._shift = float(self._side[best])
+        future = np.stack((x[:, best], y[:, best]), axis=1)
+        return Choice(self._speed, self._turn, future, turned[:, best].copy(), self._shift, float(cost[best]))
+
+    def stand(self, pose: tuple[float, float, float], speed_mps: float) -> Choice:
+        """Brake and then stand, whoever comes: for who has arrived. `speed_mps` measured."""
+        driving = self._driving
+        v = _stopping(speed_mps, driving.brake_mps2, self._times)
+        w = _stopping(self._turn, driving.turn_accel_radps2, self._times)
+        headings = pose[2] + np.cumsum(w) * STEP_S
+        ways = np.stack((np.cos(headings), np.sin(headings)), axis=1) * v[:, None] * STEP_S
+        self._speed = float(_stopping(speed_mps, driving.brake_mps2, np.array(CONTROL_S)))
+        self._turn = float(_stopping(self._turn, driving.turn_accel_radps2, np.array(CONTROL_S)))
+        self._shift = 0.0
+        return Choice(self._speed, self._turn, np.array(pose[:2]) + np.cumsum(ways, axis=0), headings, 0.0, 0.0)
+
+    def _drive(self, pose: tuple[float, float, float], route: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """All futures at once: x, y, v, heading [STEPS, futures], and what each wants first, v and w."""
+        driving, count = self._driving, len(self._pace)
+        line, left = _line_and_left(route)
+        last = len(line) - 1
+        # The way, shifted to each side, flat: where a future aims is one look-up.
+        aims_x = (line[:, 0] + _SIDES[:, None] * left[:, 0]).ravel()
+        aims_y = (line[:, 1] + _SIDES[:, None] * left[:, 1]).ravel()
+        row = self._side_row * (last + 1)
+        x, y, heading = (np.full(count, value) for value in pose)
+        c, s = np.cos(heading), np.sin(heading)
+        v, w = np.full(count, self._speed), np.full(count, self._turn)
+        # Where along the way the robot is: the nearest of the first few points.
+        gaps = np.hypot(line[:15, 0] - pose[0], line[:15, 1] - pose[1])
+        along = np.full(count, float(np.argmin(gaps)) * SPACING_M)
+        out = np.empty((4, STEPS, count))
+        first: tuple[Array, Array] = (v, w)
+        top, turn_step = driving.turn_radps, driving.turn_accel_radps2 * STEP_S
+        brake, accel = driving.brake_mps2 * STEP_S, driving.accel_mps2 * STEP_S
+        for step in range(STEPS):
+            ahead = ((along + 0.45 + 0.45 * np.abs(v)) * (1.0 / SPACING_M)).astype(np.int64)
+            at = row + np.minimum(ahead, last)
+            dx, dy = aims_x[at] - x, aims_y[at] - y
+            fore, side = c * dx + s * dy, c * dy - s * dx
+            error = np.arctan2(side, fore)
+            aimed = np.maximum(fore, 0.0) / np.maximum(np.sqrt(fore * fore + side * side), 1e-6)
+            want_v = np.where(self._is_fixed, self._fixed_v, self._pace * aimed * aimed)
+            turning = np.minimum(np.maximum(1.8 * error, -top), top)
+            # Waiting is standing still unless the way lies off to one side.
+            turning = np.where(self._waits & (np.abs(error) < 0.5), 0.0, turning)
+            want_w = np.where(self._is_fixed, self._fixed_w, turning)
+            if step == 0:
+                first = (want_v, want_w)
+            v = v + np.minimum(np.maximum(want_v - v, -brake), accel)
+            w = w + np.minimum(np.maximum(want_w - w, -turn_step), turn_step)
+            heading = heading + w * STEP_S
+            c, s = np.cos(heading), np.sin(heading)
+            x = x + v * c * STEP_S
+            y = y + v * s * STEP_S
+            along = along + np.maximum(v * aimed, 0.0) * STEP_S
+            out[0, step], out[1, step], out[2, step], out[3, step] = x, y, v, heading
+        return out[0], out[1], out[2], out[3], *first
+
+    def _progress(self, x: Array, y: Array, route: Array) -> Array:
+        """Minus the share of the way at top speed that a future comes along the route; [futures]."""
+        end = np.stack((x[-1], y[-1]), axis=1)
+        gaps = np.hypot(end[:, None, 0] - route[None, :, 0], end[:, None, 1] - route[None, :, 1])
+        nearest = np.argmin(gaps, axis=1)
+        behind = np.where(nearest == 0, gaps[:, 0], 0.0)
+        reach = self._driving.speed_mps * STEPS * STEP_S
+        off = np.maximum(gaps[np.arange(len(end)), nearest] - 1.2, 0.0)
+        return np.asarray(-(nearest * SPACING_M - behind - off) / reach)
+
+    def _walls(self, x: Array, y: Array, heading: Array) -> Array:
+        """What coming near solid things costs; [futures]."""
+        driving = self._driving
+        dx, dy = driving.body_reach_m * np.cos(heading), driving.body_reach_m * np.sin(heading)
+        nose = self._grid.clearances_at(np.stack((x + dx, y + dy), axis=-1))
+        tail = self._grid.clearances_at(np.stack((x - dx, y - dy), axis=-1))
+        room = np.minimum(nose, tail) - driving.body_radius_m
+        # From where it stands now it may always leave, also a place that is too narrow.
+        here = float(np.min(room[0])) if len(room) else 0.0
+        hit = _within((min(0.08, here) - room) / 0.1, 2.0)
+        tight = _within(1.0 - room / 0.25, 1.0)
+        return np.asarray(9.0 * np.max(hit * self._near_term[:, None], axis=0) + 0.25 * np.mean(tight * tight, axis=0))
+
+    def _people(
+        self, x: Array, y: Array, v: Array, heading: Array, people: Array, velocities: Array, patience: float
+    ) -> Array:
+        """What passing near people costs; [futures]."""
+        times = np.minimum(self._times, 3.0)
+        px = people[:, 0] + velocities[:, 0] * times[:, None]
+        py = people[:, 1] + velocities[:, 1] * times[:, None]
+        driving = self._driving
+        dx, dy = x[:, None, :] - px[:, :, None], y[:, None, :] - py[:, :, None]
+        # From the middle the benchmark's distance counts, at the nose what would touch.
+        reach_x, reach_y = driving.body_reach_m * np.cos(heading), driving.body_reach_m * np.sin(heading)
+        nose = np.sqrt((dx + reach_x[:, None, :]) ** 2 + (dy + reach_y[:, None, :]) ** 2)
+        gaps = np.minimum(np.sqrt(dx * dx + dy * dy) - PERSON_M, nose - (driving.body_radius_m + PERSON_RADIUS_M))
+        # Nobody walks exactly as foreseen, least of all somebody who walks fast.
+        unsure = 0.05 * self._times[:, None] * np.minimum(np.hypot(velocities[:, 0], velocities[:, 1]), 1.5)
+        # The slower, the nearer it may pass; and so it may who has waited long.
+        margin_m = driving.margin_m * max(patience, 0.4) * (0.4 + 0.6 * _within(np.abs(v) / 0.8, 1.0))
+        room = gaps - margin_m[:, None, :] - np.minimum(unsure, 0.25)[:, :, None]
+        hit = _within(-room / 0.25, 2.5)
+        near = _within(1.0 - room / (driving.comfort_m * patience), 1.0)
+        # People walk round a robot that stands: running into it is up to them. Into one that drives, less so.
+        blame = (0.3 + 0.7 * _within(np.abs(v) / 0.35, 1.0))[:, None, :]
+        weights = self._near_term[:, None, None] * blame
+        worst = np.max(hit * weights, axis=0)
+        return np.asarray(
+            4.0 * np.max(worst, axis=0)
+            + 1.0 * np.sum(np.mean(hit * weights, axis=0), axis=0)
+            + 0.7 * np.sum(np.mean(near * near * weights, axis=0), axis=0)
+        )
+
+
+def _line_and_left(route: Array) -> tuple[Array, Array]:
+    """The route with at least two points, and the unit vector to the left of the way at each."""
+    if len(route) < 2:
+        route = np.vstack((route, route + np.array((1e-3, 0.0))))
+    ways = np.diff(route, axis=0, append=2 * route[-1:] - route[-2:-1])
+    lengths = np.maximum(np.hypot(ways[:, 0], ways[:, 1]), 1e-9)
+    return route, np.stack((-ways[:, 1] / lengths, ways[:, 0] / lengths), axis=1)
+
+
+def _stopping(value: float, rate: float, times_s: NDArray[np.floating]) -> Array:
+    """What is left at these times of a value that is brought to zero."""
+    return np.asarray(np.sign(value) * np.maximum(abs(value) - rate * times_s, 0.0))
+
+
+def _slew(value: float, target: float, down: float, up: float) -> float:
+    return value + min(max(target - value, -down), up)
+
+
+def _within(values: Array, top: float) -> Array:
+    """Clipped to 0..top, without numpy.clip's overhead, which counts for arrays as small as these."""
+    return np.minimum(np.maximum(values, 0.0), top)

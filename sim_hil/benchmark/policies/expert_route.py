@@ -1,0 +1,283 @@
+"""Where the expert means to go: the cheapest way to the goal with room to spare, led round people who stand in it.
+
+Ways are searched for on cells twice as wide as the navigation grid's, each standing for its roomiest point, so that the
+whole scene can be searched anew, with a price on the places that people take up, twice a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import hypot
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from sim_hil.scene.nav_grid import NavGrid, links
+from sim_hil.scene.scene import Scene, Vec2
+
+Array = NDArray[np.float64]
+
+SPACING_M: Final = 0.1  # between the points of a route
+ROOM_M: Final = 0.5  # nearer than this beyond its clearance to a wall, a metre costs more
+_WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
+_STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
+# Distance from somebody who stands there, m, and what a metre costs more at it: between two people one may pass.
+_CROWD: Final = ((0.5, 60.0), (0.7, 12.0), (1.4, 0.0))
+_WAY_M: Final = 2.0  # nearer than this to the way that it was told, it is on it
+_STRAY_PRICE: Final = 5.0  # twice as far from it, a metre costs so much more
+_SHORT_PRICE: Final = 4.0  # each metre that one ends short of the goal is as bad as so many metres of way
+_SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
+_NO_ROOM: Final = 1000.0
+_DETOUR: Final = 1.01  # a straight piece may cost so much more than the crooked one
+_KEEP: Final = (1.2, 2.5)  # the way so far is kept while it costs at most so many times a better one, and so much more
+
+
+class RoutePlanner:
+    """Ways to one goal. `clearance_m` is the least distance from the robot's centre to anything solid.
+
+    Within `near_m` of the goal is near enough where people keep the robot from the goal itself. `told`, m, is the way
+    to keep to where there are several. Raises ValueError when the scene has no room for it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        goal_xy: Vec2,
+        clearance_m: float,
+        max_step_m: float,
+        near_m: float = 0.0,
+        told: Sequence[Vec2] = (),
+    ) -> None:
+        self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
+        self._goal = goal_xy
+        self._price = self._static_price(scene) * self._stray_price(told)
+        self._coarsen()
+        self._ends, self._end_prices = self._ends_near(near_m)
+        self._costs, self._onwards = self._search(np.zeros((0, 2)))
+        self._empty_costs = self._costs
+        self._searched = b""
+
+    def _static_price(self, scene: Scene) -> Array:
+        lack = np.clip(1.0 - (self.grid.clearances - self.grid.required_m) / ROOM_M, 0.0, 1.0)
+        price = 1.0 + _WALL_PRICE * lack * lack
+        street = np.zeros(self.grid.shape, np.uint8)
+        # Crossings last: they are streets that one may cross.
+        for kind, value in (("street", 1), ("crossing", 0)):
+            for area in scene.areas:
+                if area.kind == kind:
+                    cells = [self.grid.cell(x, y)[::-1] for x, y in area.polygon]
+                    cv2.fillPoly(street, [np.array(cells, np.int32)], value)
+        return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
+
+    def _stray_price(self, told: Sequence[Vec2]) -> Array:
+        """What leaving the told way multiplies the price of each cell by."""
+        off = np.ones(self.grid.shape, np.uint8)
+        if not told:
+            return off.astype(np.float64)
+        cells = [self.grid.cell(x, y)[::-1] for x, y in told]
+        cv2.polylines(off, [np.array(cells, np.int32)], isClosed=False, color=0)
+        gap_m = cv2.distanceTransform(off, cv2.DIST_L2, 5) * self.grid.resolution_m
+        return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)
+
+    def _coarsen(self) -> None:
+        """Join every two by two cells to one: free where one of them is, and standing for the roomiest of them."""
+        grid = self.grid
+        rows, columns = (size + size % 2 for size in grid.shape)
+        room = np.full((rows, columns), -np.inf)
+        room[: grid.shape[0], : grid.shape[1]] = np.where(grid.free, grid.clearances, -np.inf)
+        quads = room.reshape(rows // 2, 2, columns // 2, 2).transpose(0, 2, 1, 3).reshape(rows // 2, columns // 2, 4)
+        pick = np.argmax(quads, axis=2)
+        free = np.isfinite(quads.max(axis=2))
+        row = 2 * np.arange(rows // 2)[:, None] + pick // 2
+        column = 2 * np.arange(columns // 2)[None, :] + pick % 2
+        self._ids, source, target, _ = links(free, 2 * grid.resolution_m)
+        self._nodes = np.stack(
+            (
+                grid.origin_m[0] + (column[free] + 0.5) * grid.resolution_m,
+                grid.origin_m[1] + (row[free] + 0.5) * grid.resolution_m,
+            ),
+            axis=1,
+        )
+        self._node_price = self._price[row[free], column[free]]
+        gaps = self._nodes[source] - self._nodes[target]
+        count = len(self._nodes)
+        self._links = csr_matrix((np.hypot(gaps[:, 0], gaps[:, 1]), (source, target)), shape=(count, count))
+        self._link_source = np.repeat(np.arange(count), np.diff(self._links.indptr))
+        self._goal_node = self._node(*self._goal)
+
+    def _node(self, x_m: float, y_m: float) -> int:
+        """The node of the free cell nearest to a point; -1 where there is none within reach."""
+        point = self.grid.nearest_free(x_m, y_m)
+        if point is None:
+            return -1
+        row, column = self.grid.free_cell(*point)
+        return int(self._ids[row // 2, column // 2])
+
+    def _ends_near(self, near_m: float) -> tuple[NDArray[np.int64], Array]:
+        """Nodes at which one has arrived, and what each is worse than the goal itself."""
+        if self._goal_node < 0:
+            return np.zeros(0, np.int64), np.zeros(0)
+        gaps = np.hypot(self._nodes[:, 0] - self._goal[0], self._nodes[:, 1] - self._goal[1])
+        # A place behind a wall is not near the goal, however short the straight line.
+        ways = dijkstra(self._links, directed=False, indices=self._goal_node, limit=2 * near_m + 0.1)
+        ends = np.flatnonzero((gaps < near_m) & (ways < 1.5 * near_m))
+        ends = np.union1d(ends, [self._goal_node])
+        return ends, np.where(ends == self._goal_node, 0.0, _SHORT_PRICE * gaps[ends])
+
+    def _search(self, standing: Array) -> tuple[Array, NDArray[np.int32]]:
+        """Cost of the way to the goal from every node, and each one's next, people standing at [k, 2]."""
+        if self._goal_node < 0:
+            return np.full(len(self._nodes), np.inf), np.full(len(self._nodes), -1, np.int32)
+        price = self._node_price + _crowd_price(self._nodes, standing)
+        joins = self._links
+        data = joins.data * 0.5 * (price[self._link_source] + price[joins.indices])
+        # One more node is joined to every place at which one has arrived.
+        count, total = len(self._nodes), joins.nnz + len(self._ends)
+        priced = csr_matrix(
+            (
+                np.concatenate((data, self._end_prices + price[self._ends] * 1e-6)),
+                np.concatenate((joins.indices, self._ends)),
+                np.append(joins.indptr, total),
+            ),
+            shape=(count + 1, count + 1),
+        )
+        costs, onwards = dijkstra(priced, directed=False, indices=count, return_predecessors=True)
+        return costs[:count], np.where(onwards[:count] == count, -1, onwards[:count])
+
+    def reachable(self, x_m: float, y_m: float) -> bool:
+        """Whether there is a way to the goal from a point."""
+        return bool(np.isfinite(self.left(x_m, y_m)))
+
+    def left(self, x_m: float, y_m: float) -> float:
+        """Price of the way left to the goal, nobody being in it; a metre with room costs 1."""
+        node = self._node(x_m, y_m)
+        return float(self._empty_costs[node]) if node >= 0 else float("inf")
+
+    def route(self, start: Vec2, standing: Array, reach_m: float, before: Array | None = None) -> Array:
+        """[n, 2]: points SPACING_M apart from `start` towards the goal, up to `reach_m` of way, led round people.
+
+        `standing` [k, 2]: who stands about, m. `before`: the route so far, from here on; it is kept unless another is
+        clearly better. Just the start where there is no way.
+        """
+        searched = np.round(standing / _SHUFFLE_M).tobytes()
+        if searched != self._searched:
+            self._costs, self._onwards = self._search(standing)
+            self._searched = searched
+        node = self._node(*start)
+        if node < 0 or not np.isfinite(self._costs[node]):
+            return np.array([start])
+        points, end = [start], node
+        for _ in range(round(reach_m / (2 * self.grid.resolution_m))):
+            points.append((float(self._nodes[end, 0]), float(self._nodes[end, 1])))
+            if self._onwards[end] < 0:
+                if end == self._goal_node:
+                    points.append(self._goal)
+                break
+            end = int(self._onwards[end])
+        fresh = self._relaxed(self._straightened(_spaced(points), standing))
+        if before is None or len(before) < 5:
+            return fresh
+        kept = self._extended(before, reach_m)
+        share, more = _KEEP
+        worth = self._price_of(fresh, standing)
+        return kept if self._price_of(kept, standing) <= share * worth + more else fresh
+
+    def _extended(self, line: Array, reach_m: float) -> Array:
+        """A route lengthened to its reach along the newest search."""
+        missing = reach_m - SPACING_M * (len(line) - 1)
+        node = self._node(float(line[-1, 0]), float(line[-1, 1]))
+        if missing < 1.0 or node < 0 or hypot(*(line[-1] - np.array(self._goal))) < 2 * SPACING_M:
+            return line
+        points = [(float(line[-1, 0]), float(line[-1, 1]))]
+        for _ in range(round(missing / (2 * self.grid.resolution_m))):
+            before, node = node, int(self._onwards[node])
+            if node < 0:
+                if before == self._goal_node:
+                    points.append(self._goal)
+                break
+            points.append((float(self._nodes[node, 0]), float(self._nodes[node, 1])))
+        return np.vstack((line, self._relaxed(_spaced(points))[1:]))
+
+    def _price_of(self, line: Array, standing: Array) -> float:
+        """What a route costs, and the way from its end on to the goal."""
+        node = self._node(float(line[-1, 0]), float(line[-1, 1]))
+        rest = float(self._costs[node]) if node >= 0 else float("inf")
+        return float(np.sum(self._prices_at(line, standing))) * SPACING_M + rest
+
+    def _straightened(self, line: Array, standing: Array) -> Array:
+        """The way with every detour of the grid replaced by a straight piece that costs no more."""
+        prices = self._prices_at(line, standing)
+        paid = np.concatenate(((0.0,), np.cumsum(0.5 * (prices[1:] + prices[:-1])))) * SPACING_M
+
+        def cheap(i: int, j: int) -> bool:
+            a, b = line[i], line[j]
+            points = a + (b - a) * np.linspace(0.0, 1.0, j - i + 1)[:, None]
+            cost = float(np.mean(self._prices_at(points, standing))) * hypot(b[0] - a[0], b[1] - a[1])
+            return cost <= float(paid[j] - paid[i]) * _DETOUR + 1e-3
+
+        corners, at, last = [0], 0, len(line) - 1
+        while at < last:
+            step = 4
+            while step < last - at and cheap(at, at + step):
+                step *= 2
+            low, high = max(step // 2, 1), min(step, last - at)
+            if high == last - at and cheap(at, last):
+                low = high
+            while high - low > 1:
+                middle = (low + high) // 2
+                low, high = (middle, high) if cheap(at, at + middle) else (low, middle)
+            at = min(at + low, last)
+            corners.append(at)
+        return _spaced([(float(x), float(y)) for x, y in line[corners]])
+
+    def _prices_at(self, points: Array, standing: Array) -> Array:
+        """Price of a metre at each point [n, 2], people included; prohibitive where there is no room."""
+        column = ((points[:, 0] - self.grid.origin_m[0]) / self.grid.resolution_m).astype(np.int64)
+        row = ((points[:, 1] - self.grid.origin_m[1]) / self.grid.resolution_m).astype(np.int64)
+        row, column = np.clip(row, 0, self.grid.shape[0] - 1), np.clip(column, 0, self.grid.shape[1] - 1)
+        price = np.where(self.grid.free[row, column], self._price[row, column], _NO_ROOM)
+        return np.asarray(price + _crowd_price(points, standing))
+
+    def _relaxed(self, line: Array) -> Array:
+        """The same way with its corners rounded, as far as there is room."""
+        if len(line) < 5:
+            return line
+        rounded = _smooth(_smooth(line, 5), 3)
+        fits = self.grid.clearances_at(rounded) >= self.grid.required_m - 0.02
+        return np.asarray(np.where(fits[:, None], rounded, line))
+
+
+def _crowd_price(points: Array, standing: Array) -> Array:
+    """What a metre at each point [n, 2] costs more for those who stand about [k, 2]."""
+    price = np.zeros(len(points))
+    gaps_m, prices = zip(*_CROWD, strict=True)
+    for x, y in standing:
+        near = np.flatnonzero((np.abs(points[:, 0] - x) < gaps_m[-1]) & (np.abs(points[:, 1] - y) < gaps_m[-1]))
+        gap = np.hypot(points[near, 0] - x, points[near, 1] - y)
+        # The dearest of those around: in a dense group a metre is no worse than in the middle of one person.
+        price[near] = np.maximum(price[near], np.interp(gap, gaps_m, prices))
+    return price
+
+
+def _spaced(points: list[Vec2]) -> Array:
+    """The polyline as points SPACING_M apart."""
+    line = np.array(points)
+    steps = np.hypot(*np.diff(line, axis=0).T) if len(line) > 1 else np.zeros(0)
+    along = np.concatenate(((0.0,), np.cumsum(steps)))
+    marks = np.arange(0.0, along[-1] + SPACING_M / 2, SPACING_M)
+    return np.stack((np.interp(marks, along, line[:, 0]), np.interp(marks, along, line[:, 1])), axis=1)
+
+
+def _smooth(line: Array, half: int) -> Array:
+    """Each point moved to the mean of the `half` before and after it; the ends stay."""
+    padded = np.vstack((np.repeat(line[:1], half, 0), line, np.repeat(line[-1:], half, 0)))
+    sums = np.cumsum(np.vstack((np.zeros((1, 2)), padded)), axis=0)
+    smooth = (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)
+    # Towards the ends, where one side runs out, the mean would pull the line off its end points.
+    inward = np.minimum(np.arange(len(line)), np.arange(len(line))[::-1])
+    share = np.clip(inward / half, 0.0, 1.0)[:, None]
+    return np.asarray(line * (1 - share) + smooth * share)

@@ -1,0 +1,1 @@
+"""Results of episodes: records, the run directory, summaries, report, video."""

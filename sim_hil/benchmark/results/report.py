@@ -1,0 +1,248 @@
+"""`report.html` of a benchmark run: one self-contained page from the run's own files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.core.cli import write_whole
+from reporting import page
+from reporting.plot_style import delay_histogram
+from sim_hil.benchmark.conditions.conditions import Conditions
+from sim_hil.benchmark.results import report_figures
+from sim_hil.benchmark.results.episode_log import read_log
+from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.results.store import EPISODES, VIDEOS, ResultStore
+from sim_hil.benchmark.results.summary import METRICS, grouped_by
+from sim_hil.benchmark.results.video import last_picture
+from sim_hil.scene.scene import SceneError, load_scene
+
+REPORT = "report.html"
+SHOWN_TEXTS = 12
+SHOWN_ENDINGS = 12
+SHOWN_HITS = 4
+_CARD_PX = 640
+_HEADLINE = {
+    "sr": ("success rate", "%"),
+    "spl": ("SPL", "%"),
+    "ne_m": ("navigation error", "m"),
+    "cr": ("collisions", "%"),
+}
+
+
+def write_report(store: ResultStore, summary: Mapping[str, Any], title: str) -> Path:
+    """Write the page beside the results; raises OSError."""
+    path = store.directory / REPORT
+    results = sorted(store.results, key=lambda result: result.id)
+    write_whole(path, page.document(title, "\n".join(part for part in _parts(store, results, summary, title) if part)))
+    return path
+
+
+def _parts(
+    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], title: str
+) -> list[str]:  # fmt: skip
+    conditions = Conditions.of_json(store.config["conditions"])
+    logs = {result.id: _log(store.directory, result.id) for result in results}
+    asked = len(store.config["episodes"])
+    parts = [
+        f"<h1>{page.text_html(title)}</h1>",
+        f'<p class="quiet">{page.text_html(conditions.describe())}; suite “{page.text_html(store.config["suite"])}”, '
+        f"{len(results)} of {asked} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
+        "over tasks and their episodes. Paths and collisions are the simulator's own, not the robot's odometry.</p>",
+        _untrained(store.config),
+        page.tiles(_headline(summary)),
+        _failed(store),
+    ]
+    if not results:
+        return parts
+    delays = np.array([d for log in logs.values() if log for d in log["columns"]["delay_s"] if d is not None], float)
+    return [
+        *parts,
+        "<h2>Success and collisions</h2>",
+        page.figure(
+            report_figures.rates(results), "Bars of success and collision rate",
+            "Below each name how many episodes it stands for.", wide=True,
+        ),
+        _group_tables(summary),
+        *_distributions(results, delays),
+        "<h2>Where the robot went</h2>",
+        *_maps(results, logs),
+        _endings(store.directory, results),
+        _texts(results, logs),
+        "<h2>Episodes</h2>",
+        _episode_table(store.directory, results),
+        "<h2>What this was run with</h2>",
+        page.table(
+            ("what", "value"),
+            [(page.text_html(key), page.text_html(str(value))) for key, value in _facts(store.config, conditions)],
+        ),
+    ]  # fmt: skip
+
+
+def _distributions(results: Sequence[EpisodeResult], delays: NDArray[np.float64]) -> list[str]:
+    words = ("Distance to the goal against time used", "One point an episode.")
+    if not len(delays):
+        return [page.figure(report_figures.error_and_time(results, width_in=11.0), *words, wide=True)]
+    caption = "How old the semantic state was in every period that drove by one."
+    return [
+        '<div class="pair">',
+        page.figure(report_figures.error_and_time(results, width_in=5.4), *words),
+        page.figure(delay_histogram(delays), "Histogram of the delay", caption),
+        "</div>",
+    ]
+
+
+def _hits(result: EpisodeResult) -> str:
+    """What was hit, the first few."""
+    more = len(result.collisions) - SHOWN_HITS
+    shown = [*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])]
+    return page.text_html(", ".join(shown))
+
+
+def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
+    try:
+        return read_log(directory / EPISODES / f"{episode_id}.json")
+    except (OSError, ValueError):
+        return None  # the results stand without it; the map says how many paths it shows
+
+
+def _untrained(config: Mapping[str, Any]) -> str:
+    if config.get("trained", True):
+        return ""
+    return (
+        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed): the robot walks where random '
+        "numbers send it. What this run shows is that the benchmark works, not how good a policy is.</p>"
+    )
+
+
+def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    tiles = []
+    for name, (words, unit) in _HEADLINE.items():
+        value, interval = summary[name], summary[f"{name}_ci95"]
+        shown = "none" if value is None else f"{value:.1f} {unit}"
+        span = "" if interval is None else f", 95 %: {interval[0]:.1f} to {interval[1]:.1f}"
+        tiles.append((shown, words + span))
+    return [*tiles, (str(summary["episodes"]), "episodes")]
+
+
+def _failed(store: ResultStore) -> str:
+    if not store.failed:
+        return ""
+    rows = [(page.text_html(run.id), str(run.attempts), page.text_html(run.why)) for run in store.failed]
+    return (
+        '<p class="notice"><b>Some episodes have no result</b>: their process ended before it, as often as it was '
+        "tried. They are in no rate above; <code>--resume</code> tries them again.</p>"
+        + page.table(("episode", "attempts", "why"), rows, numeric=frozenset({1}))
+    )
+
+
+def _group_tables(summary: Mapping[str, Any]) -> str:
+    rows = []
+    for group in ("by_scene", "by_crowd", "by_robot"):
+        for key, means in summary[group].items():
+            cells = [_with_interval(means, name) for name in METRICS]
+            rows.append((f"{group.removeprefix('by_')}: {page.text_html(key)}", str(means["episodes"]), *cells))
+    head = ("group", "episodes", "SR %", "SPL %", "NE m", "CR %")
+    return page.table(head, rows, numeric=frozenset({1, 2, 3, 4, 5}))
+
+
+def _with_interval(means: Mapping[str, Any], name: str) -> str:
+    interval = means[f"{name}_ci95"]
+    span = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
+    return f"{means[name]:.1f}{span}"
+
+
+def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[str]:
+    parts = []
+    for name, members in grouped_by(results, "scene"):
+        shown = [(result, log) for result in members if (log := logs[result.id]) is not None]
+        try:
+            scene = load_scene(name)
+        except SceneError:
+            parts.append(f"<p>Scene {page.text_html(name)} is not on this machine: no map.</p>")
+            continue
+        ended, logged = [result for result, _ in shown], [log for _, log in shown]
+        goals = [log["goal_xy"] for log in logged]
+        picture = report_figures.scene_map(scene, ended, [_path(log) for log in logged], goals)
+        caption = (
+            f"{name}: {len(shown)} of {len(members)} episodes. Blue: start; green ring: goal. Paths: green reached "
+            "without a collision, orange reached with one, red not reached."
+        )
+        parts.append(page.figure(picture, f"Map of {name} with the paths", caption, wide=True))
+    return parts
+
+
+def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
+    columns = log["columns"]
+    return np.column_stack([np.array(columns["x_m"], float), np.array(columns["y_m"], float)])
+
+
+def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
+    """The last picture of some videos, of episodes that were not reached or collided first."""
+    cards: list[str] = []
+    for result in sorted(results, key=lambda result: (result.success, not result.collided)):
+        path = directory / VIDEOS / f"{result.id}.mp4"
+        picture = last_picture(path, _CARD_PX) if len(cards) < SHOWN_ENDINGS and path.is_file() else None
+        if picture is None:
+            continue
+        name = page.text_html(result.id)
+        hit = f", collided with {_hits(result)}" if result.collided else ""
+        cards.append(
+            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last picture of {name}">'
+            f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
+            f"{result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}</div></figure>"
+        )
+    return f'<h2>How episodes ended</h2><div class="sheet">{"".join(cards)}</div>' if cards else ""
+
+
+def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> str:
+    cards = []
+    for result in results:
+        log = logs[result.id]
+        if log is None or not log["generations"]:
+            continue
+        said = log["generations"][len(log["generations"]) // 2]
+        text = page.text_html(str(said.get("text", ""))) or "(empty)"
+        released_s = said["released_s"] - said["anchor_s"]
+        cards.append(
+            f'<figure><div class="meta">{page.text_html(result.id)} · generation {said["generation"]} · seen at '
+            f'{said["anchor_s"]:.1f} s · Δt {released_s:.1f} s at release</div><pre class="vlm">{text}</pre></figure>'
+        )
+    if not cards:
+        return ""
+    step = max(1, len(cards) // SHOWN_TEXTS)
+    shown = "".join(cards[::step][:SHOWN_TEXTS])
+    return f'<h2>What the VLM said</h2><div class="sheet">{shown}</div>'
+
+
+def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> str:
+    rows = []
+    for r in results:
+        mark = (
+            '<span class="pass">reached</span>' if r.success else f'<span class="fail">{page.text_html(r.end)}</span>'
+        )
+        video = directory / VIDEOS / f"{r.id}.mp4"
+        name = page.text_html(r.id)
+        link = f'<a href="{VIDEOS}/{name}.mp4">{name}</a>' if video.is_file() else name
+        delay = "" if r.delay_s is None else f"{r.delay_s['mean']:.1f}"
+        numbers = (f"{r.ne_m:.1f}", f"{r.spl:.0f}", f"{r.path_m:.1f}", f"{r.shortest_m:.1f}", f"{r.time_s:.0f}", delay)
+        rows.append((link, r.scene, r.robot, str(r.people), mark, _hits(r), *numbers))
+    head = (
+        "episode", "scene", "robot", "people", "end", "collided with", "NE m", "SPL %", "path m", "shortest m",
+        "time s", "mean Δt s",
+    )  # fmt: skip
+    return page.table(head, rows, numeric=frozenset({3, *range(6, 12)}))
+
+
+def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str, object]]:
+    latency = conditions.latency
+    facts: list[tuple[str, object]] = [("conditions", conditions.describe())]
+    if latency is not None:
+        count = len(latency.generation_s)
+        facts.append(("latency", f"{latency.name}, mean {latency.mean_s:.2f} s of {count} ({latency.source})"))
+    facts += [(f"version of {name}", value) for name, value in config["versions"].items()]
+    return [*facts, ("suite, SHA-256 of its episodes", config["suite_sha256"])]

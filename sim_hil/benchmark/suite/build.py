@@ -1,0 +1,226 @@
+"""Builds the DynaNav suite from its four scenes: tasks, wordings, crowds, timeouts. Fixed seeds: always the same text.
+
+Run by hand when scenes or grammar change; what it writes is committed, and a test holds the two equal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge.core.cli import command_line, write_named
+from sim_hil.benchmark.language.instruction_reading import untrue
+from sim_hil.benchmark.language.instructions import WordingError, wordings
+from sim_hil.benchmark.language.route import RouteError
+from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
+from sim_hil.benchmark.language.tasks import Task, goals, sample_task
+from sim_hil.benchmark.language.visibility import Sightlines
+from sim_hil.benchmark.suite.episode import ROBOTS, SUITES, Episode, suite_to_toml
+from sim_hil.benchmark.suite.robots import robot_grid, telling_grid
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene, load_scene
+
+NAME, VERSION = "dynanav", 2
+WORDINGS = 6
+INDOOR_CROWDS = (0, 10, 20, 40, 60)
+_DRAWS = 400
+_LEAST_LEG_M = 3.0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a task must be like: its goal's kinds (of object), length, and least number of turns."""
+
+    task: str
+    kinds: tuple[str, ...]
+    length_m: tuple[float, float]
+    turns: tuple[int, int]
+    area_kinds: tuple[str, ...] = ()
+    at_end: bool = False
+    counted: int = 0  # some turn must be this ordinal or a later one
+
+    def fits(self, scene: Scene, task: Task) -> bool:
+        """Whether a drawn task is one of these."""
+        thing = next(thing for thing in scene.objects if thing.label == task.goal_label)
+        told = task.told
+        turns = sum(step.side != "straight" or step.kind == "crossing" for step in told.steps)
+        return (
+            thing.kind in self.kinds
+            and self.length_m[0] <= told.length_m <= self.length_m[1]
+            and self.turns[0] <= turns <= self.turns[1]
+            and (not self.area_kinds or told.goal_area_kind in self.area_kinds)
+            and (not self.at_end or told.goal_at_end)
+            # Turns in quick succession can hardly be told apart, nor can what is right beside the start.
+            and all(step.before_m >= _LEAST_LEG_M for step in told.steps if step.before_kind != "room")
+            and (not self.counted or any(step.ordinal >= self.counted for step in told.steps))
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A scene's share of the suite."""
+
+    scene: str
+    seed: int
+    threshold_m: float
+    crowds: tuple[tuple[int, ...], ...]  # of each task
+    wanted: tuple[Wanted, ...]
+
+
+_INDOOR = (INDOOR_CROWDS,) * 5
+PARTS = (
+    Part("hospital", 1, 1.5, _INDOOR, (
+        Wanted("vending-machine", ("vending_machine",), (9, 18), (1, 2), ("corridor",)),
+        Wanted("hospital-bed", ("hospital_bed",), (12, 24), (1, 2), ("room",), counted=2),
+        Wanted("water-dispenser", ("water_dispenser",), (14, 26), (1, 2)),
+        Wanted("end-of-hallway", ("double_door",), (18, 34), (1, 1), ("corridor",), at_end=True),
+        Wanted("reception", ("reception_desk",), (22, 35), (2, 3), ("lobby",)),
+    )),
+    Part("office", 2, 1.5, _INDOOR, (
+        Wanted("elevator", ("elevator",), (10, 22), (1, 3), ("lobby",)),
+        Wanted("carpet", ("carpet",), (10, 22), (1, 2), ("room",)),
+        Wanted("coffee-machine", ("coffee_machine", "vending_machine"), (16, 30), (2, 3), ("room",)),
+        Wanted("exit-door", ("door",), (14, 32), (1, 2), ("corridor",), at_end=True),
+        Wanted("desk", ("desk",), (18, 35), (2, 3), ("room",), counted=2),
+    )),
+    Part("warehouse", 3, 1.5, _INDOOR, (
+        Wanted("cone", ("traffic_cone",), (10, 20), (1, 2), ("aisle",), counted=2),
+        Wanted("third-aisle", ("drum", "fire_extinguisher", "wet_floor_sign"), (12, 24), (1, 1), ("aisle",), counted=3),
+        Wanted("forklift", ("forklift",), (10, 28), (1, 3), ("yard",)),
+        Wanted("pallet-jack", ("pallet_jack",), (14, 32), (2, 3), ("aisle",)),
+        Wanted("boxes", ("box_stack",), (8, 30), (1, 2), ("aisle",)),
+    )),
+    Part("sidewalk", 4, 3.0, ((100, 150), (120, 170), (100, 180), (140, 200), (110, 160)), (
+        Wanted("fountain", ("fountain",), (30, 70), (1, 3)),
+        Wanted("umbrella", ("umbrella", "umbrella_table"), (35, 80), (1, 3)),
+        Wanted("storefront", ("storefront",), (40, 75), (1, 3)),
+        Wanted("kiosk", ("kiosk",), (30, 80), (1, 3)),
+        Wanted("far-storefront", ("storefront",), (50, 80), (2, 4)),
+    )),
+)  # fmt: skip
+
+
+def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
+    """In proportion to distance, and the more the fuller it is (paper appendix C); whole 5 s.
+
+    Enough for one who stops to think: halts of 2 s and 0.5 s of driving in turn make 0.146 m/s at the Go2's limits.
+    """
+    driving_s = 30.0 + shortest_m / 0.2 if outdoor else 20.0 + shortest_m / 0.12
+    return 5.0 * round((driving_s + 0.5 * people) / 5.0)
+
+
+def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) -> list[Episode]:
+    """One scene's episodes; raises ValueError when a task that is wanted is not found."""
+    scene = load_scene(part.scene)
+    grids = {robot: robot_grid(scene, robot) for robot in ROBOTS}
+    episodes: list[Episode] = []
+    for index, (wanted, task) in enumerate(_tasks(part, scene)):
+        name = f"{part.scene}-{wanted.task}"
+        progress(f"{name}: {task.told.length_m:.1f} m, {len(task.told.steps)} steps")
+        texts = tuple(_wordings(task, part.seed * 1000 + index))
+        lengths = {robot: round(grids[robot].distance_m(task.start[:2], task.goal), 3) for robot in ROBOTS}
+        for number, people in enumerate(part.crowds[index]):
+            # Each task has both robots, and over a scene's tasks each crowd has both.
+            robot = ROBOTS[(number + index) % 2]
+            episodes.append(
+                Episode(
+                    id=f"{name}-{people}-{robot}",
+                    task=name,
+                    scene=part.scene,
+                    robot=robot,
+                    people=people,
+                    seed=part.seed * 10000 + index * 100 + number,
+                    start=task.start,
+                    goal_xy=task.goal,
+                    instructions=texts,
+                    timeout_s=timeout_s(lengths[robot], people, part.scene == "sidewalk"),
+                    threshold_m=part.threshold_m,
+                    shortest_m=lengths[robot],
+                    landmarks=named_landmarks(texts, task.told),
+                    goal_landmark=task.goal_label,
+                )
+            )
+    return episodes
+
+
+def build(progress: Callable[[str], None] = lambda line: None) -> str:
+    """The suite's text; raises ValueError when a task that is wanted is not found."""
+    return suite_to_toml(NAME, VERSION, [episode for part in PARTS for episode in build_part(part, progress)])
+
+
+def _wordings(task: Task, seed: int) -> list[str]:
+    return wordings(task.told, WORDINGS, seed, held_out=True)
+
+
+def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
+    """For each, the first drawn task that is what is wanted and sound; no goal comes twice."""
+    rng = np.random.default_rng((part.seed, 17))
+    grid = telling_grid(scene)
+    lines = Sightlines(scene)
+    found: list[tuple[Wanted, Task]] = []
+    for index, wanted in enumerate(part.wanted):
+        used = {task.goal_label for _, task in found}
+        things = [thing for thing in goals(scene) if thing.kind in wanted.kinds and thing.label not in used]
+        task = None
+        for _ in range(_DRAWS):
+            try:
+                drawn = sample_task(scene, grid, rng, things=things, length_m=wanted.length_m)
+            except RouteError:
+                continue
+            if wanted.fits(scene, drawn) and _sound(part, scene, grid, lines, drawn, part.seed * 1000 + index):
+                task = drawn
+                break
+        if task is None:
+            raise ValueError(f"{part.scene}: no task found for {wanted.task}")
+        found.append((wanted, task))
+    return found
+
+
+def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Task, seed: int) -> bool:
+    """Whether what the validator asks of an episode holds of a task."""
+    try:
+        texts = _wordings(task, seed)
+    except WordingError:
+        return False
+    if any(untrue(text, task.told) for text in texts):
+        return False
+    if worst_leak(grid, task.goal, part.threshold_m) > 0 or wrong_bends(task.told, task.path):
+        return False
+    return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.told))
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(line + "\n")
+
+
+@command_line("build_suite")
+def main(argv: list[str] | None = None) -> int:
+    """Write the suite; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sim_hil.benchmark.suite.build", description="Build the DynaNav suite from its scenes.",
+        epilog="example: python -m sim_hil.benchmark.suite.build --out sim_hil/benchmark/suite/suites/dynanav.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=SUITES / f"{NAME}.toml", metavar="FILE")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if the file says otherwise")
+    args = parser.parse_args(argv)
+    try:
+        text = build(_say)
+        if args.check:
+            same = args.out.read_text(encoding="utf-8") == text
+            _say(f"{args.out} {'is' if same else 'is not'} what would be built")
+            return 0 if same else 1
+        write_named(args.out, text)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,264 @@
+"""A benchmark suite as data: tasks (where to go, in words) and their episodes (robot, crowd, seed, timeout).
+
+A suite is a TOML file. Episodes of one task share start, goal and instructions and differ in crowd density, robot and
+timeout (paper appendix C: "share the same semantic objective but differ in crowd density, robot platform and timeout").
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees, hypot, isfinite, radians
+from pathlib import Path
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SUITES = Path(__file__).with_name("suites")
+ROBOTS = ("go2", "carter")
+FORMAT = 1  # of the file; a suite's own version says which data it holds
+MIN_WORDINGS = 4
+MAX_PEOPLE = 200
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+
+
+class SuiteError(ValueError):
+    """A suite that cannot be used; one line: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One run of the benchmark: go from `start` (x m, y m, theta rad) to `goal_xy` (m) as the instruction says.
+
+    `landmarks` are labels of the scene's objects that the instructions name; `goal_landmark` is the one by the goal.
+    `shortest_m` is the length of the shortest feasible path for this robot (paper equation 9).
+    """
+
+    id: str
+    task: str
+    scene: str
+    robot: str
+    people: int
+    seed: int
+    start: Vec3
+    goal_xy: Vec2
+    instructions: tuple[str, ...]
+    timeout_s: float
+    threshold_m: float
+    shortest_m: float
+    landmarks: tuple[str, ...]
+    goal_landmark: str
+
+    def __post_init__(self) -> None:
+        what = f"episode {self.id!r}"
+        if not self.id or any(not (char.isalnum() or char in "-_.") for char in self.id):
+            raise SuiteError(f"{what}: an id is made of letters, digits, '-', '_' and '.'")
+        if self.robot not in ROBOTS:
+            raise SuiteError(f"{what}: unknown robot {self.robot!r}, expected one of {', '.join(ROBOTS)}")
+        if not 0 <= self.people <= MAX_PEOPLE:
+            raise SuiteError(f"{what}: people must be within 0..{MAX_PEOPLE}, found {self.people}")
+        if self.seed < 0:
+            raise SuiteError(f"{what}: seed must be 0 or more, found {self.seed}")
+        numbers = (*self.start, *self.goal_xy, self.timeout_s, self.threshold_m, self.shortest_m)
+        if not all(isfinite(number) for number in numbers):
+            raise SuiteError(f"{what}: every number must be finite")
+        if min(self.timeout_s, self.threshold_m, self.shortest_m) <= 0:
+            raise SuiteError(f"{what}: timeout_s, threshold_m and shortest_m must be positive")
+        straight_m = hypot(self.goal_xy[0] - self.start[0], self.goal_xy[1] - self.start[1])
+        if straight_m <= self.threshold_m:
+            raise SuiteError(f"{what}: the start lies within the threshold of the goal")
+        if not self.instructions or any(not text.strip() for text in self.instructions):
+            raise SuiteError(f"{what}: expected instructions, none of them empty")
+        if len(set(self.instructions)) != len(self.instructions):
+            raise SuiteError(f"{what}: an instruction is there twice")
+        if self.goal_landmark not in self.landmarks:
+            raise SuiteError(f"{what}: goal_landmark {self.goal_landmark!r} is not among its landmarks")
+
+
+class _Table:
+    """A TOML table that insists on every key being known and of the right type."""
+
+    def __init__(self, what: str, table: object) -> None:
+        if not isinstance(table, Mapping):
+            raise SuiteError(f"{what}: expected a table, found {type(table).__name__}")
+        self._what, self._rest = what, dict(table)
+
+    def take(self, key: str) -> Any:
+        if key not in self._rest:
+            raise SuiteError(f"{self._what}: key {key!r} is missing")
+        return self._rest.pop(key)
+
+    def text(self, key: str) -> str:
+        value = self.take(key)
+        if not isinstance(value, str):
+            raise SuiteError(f"{self._what}: {key} must be text, found {value!r}")
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        value = self.take(key)
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise SuiteError(f"{self._what}: {key} must be an array of texts, found {value!r}")
+        return tuple(value)
+
+    def whole(self, key: str) -> int:
+        value = self.take(key)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise SuiteError(f"{self._what}: {key} must be a whole number, found {value!r}")
+        return value
+
+    def number(self, key: str) -> float:
+        return _number(f"{self._what}: {key}", self.take(key))
+
+    def vector(self, key: str, length: int) -> tuple[float, ...]:
+        value = self.take(key)
+        if not isinstance(value, list) or len(value) != length:
+            raise SuiteError(f"{self._what}: {key} must be {length} numbers, found {value!r}")
+        return tuple(_number(f"{self._what}: {key}", item) for item in value)
+
+    def tables(self, key: str) -> list[object]:
+        value = self.take(key)
+        if not isinstance(value, list) or not value:
+            raise SuiteError(f"{self._what}: {key} must be an array of tables")
+        return value
+
+    def done(self) -> None:
+        if self._rest:
+            raise SuiteError(f"{self._what}: unknown key {sorted(self._rest)[0]!r}")
+
+
+def _number(what: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise SuiteError(f"{what} must be a finite number, found {value!r}")
+    return float(value)
+
+
+def _task(raw: object, index: int) -> list[Episode]:
+    table = _Table(f"tasks[{index}]", raw)
+    task, scene = table.text("task"), table.text("scene")
+    x, y, heading_deg = table.vector("start_deg", 3)
+    goal_x, goal_y = table.vector("goal_xy", 2)
+    threshold_m = table.number("threshold_m")
+    landmarks, goal_landmark = table.texts("landmarks"), table.text("goal_landmark")
+    instructions = table.texts("instructions")
+    if len(instructions) < MIN_WORDINGS:
+        raise SuiteError(f"task {task!r}: expected {MIN_WORDINGS} wordings or more, found {len(instructions)}")
+    episodes = []
+    for number, item in enumerate(table.tables("episodes")):
+        row = _Table(f"task {task!r}, episodes[{number}]", item)
+        episodes.append(
+            Episode(
+                id=row.text("id"),
+                task=task,
+                scene=scene,
+                robot=row.text("robot"),
+                people=row.whole("people"),
+                seed=row.whole("seed"),
+                start=(x, y, radians(heading_deg)),
+                goal_xy=(goal_x, goal_y),
+                instructions=instructions,
+                timeout_s=row.number("timeout_s"),
+                threshold_m=threshold_m,
+                shortest_m=row.number("shortest_m"),
+                landmarks=landmarks,
+                goal_landmark=goal_landmark,
+            )
+        )
+        row.done()
+    table.done()
+    return episodes
+
+
+def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
+    """Episodes of a suite's TOML text, in the file's order; `source` names it in errors. Raises SuiteError."""
+    try:
+        table = _Table("suite", tomllib.loads(text))
+        if (found := table.whole("format")) != FORMAT:
+            raise SuiteError(f"format {FORMAT} expected, found {found}")
+        table.text("name")
+        table.whole("version")
+        episodes = [episode for i, raw in enumerate(table.tables("tasks")) for episode in _task(raw, i)]
+        table.done()
+    except tomllib.TOMLDecodeError as error:
+        raise SuiteError(f"{source}: not valid TOML: {error}") from error
+    except SuiteError as error:
+        raise SuiteError(f"{source}: {error}") from error
+    return tuple(episodes)
+
+
+def suite_names() -> list[str]:
+    """Names that load_suite knows."""
+    return sorted(path.stem for path in SUITES.glob("*.toml"))
+
+
+def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
+    """Episodes of a shipped suite, or of a TOML file; ids are unique. Raises SuiteError."""
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        if str(name_or_path) not in suite_names():
+            known = ", ".join(suite_names())
+            raise SuiteError(f"unknown suite {str(name_or_path)!r}, expected one of {known}, or a .toml file")
+        path = SUITES / f"{name_or_path}.toml"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SuiteError(f"{path}: cannot be read: {error}") from error
+    episodes = parse_suite(text, path.name)
+    ids = [episode.id for episode in episodes]
+    if twice := sorted({name for name in ids if ids.count(name) > 1}):
+        raise SuiteError(f"{path.name}: episode id {twice[0]!r} is there twice")
+    return episodes
+
+
+def _text(value: str) -> str:
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def _array(values: Sequence[str]) -> str:
+    return "[" + ", ".join(values) + "]"
+
+
+def suite_to_toml(name: str, version: int, episodes: Sequence[Episode]) -> str:
+    """The suite as TOML that parse_suite reads back; episodes of one task must follow each other."""
+    lines = [
+        "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.",
+        f"format = {FORMAT}",
+        f"name = {_text(name)}",
+        f"version = {version}",
+    ]
+    last = ""
+    for episode in episodes:
+        if episode.task != last:
+            last = episode.task
+            x, y, theta = episode.start
+            heading_deg = round(degrees(theta), 6)
+            lines += [
+                "",
+                "[[tasks]]",
+                f"task = {_text(episode.task)}",
+                f"scene = {_text(episode.scene)}",
+                f"start_deg = [{x!r}, {y!r}, {heading_deg!r}]",
+                f"goal_xy = [{episode.goal_xy[0]!r}, {episode.goal_xy[1]!r}]",
+                f"threshold_m = {episode.threshold_m!r}",
+                f"goal_landmark = {_text(episode.goal_landmark)}",
+                f"landmarks = {_array([_text(label) for label in episode.landmarks])}",
+                "instructions = [",
+                *(f"  {_text(text)}," for text in episode.instructions),
+                "]",
+            ]
+        lines += [
+            "[[tasks.episodes]]",
+            f"id = {_text(episode.id)}",
+            f"robot = {_text(episode.robot)}",
+            f"people = {episode.people}",
+            f"seed = {episode.seed}",
+            f"timeout_s = {episode.timeout_s!r}",
+            f"shortest_m = {episode.shortest_m!r}",
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,185 @@
+"""`python -m sim_hil.benchmark.suite.validate`: is every episode of a suite feasible, and is every word of it true?
+
+Everything is computed anew from scene, start and goal; what the suite's file says counts for nothing. The rules by
+which a way is told (route.tell) are the builder's own: a mistake in them is found by neither, but by tests and by eye.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from edge.core.cli import check_result_target, command_line, write_result
+from sim_hil.benchmark.language.instruction_reading import untrue
+from sim_hil.benchmark.language.instructions import is_held_out
+from sim_hil.benchmark.language.route import RouteError, tell
+from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
+from sim_hil.benchmark.language.tasks import outline_gap_m
+from sim_hil.benchmark.language.visibility import Sightlines
+from sim_hil.benchmark.suite.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
+from sim_hil.benchmark.suite.robots import TELLING_CLEARANCE_M, robot_grid, telling_grid
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene, SceneError, SceneObject, Vec2, load_scene
+
+# An episode must be feasible at these mean speeds. Indoors that is below what the Go2 comes to when it halts for 2 s of
+# thought before each 0.5 s of driving (0.146 m/s), and leaves it some detours.
+INDOOR_SPEED_MPS, OUTDOOR_SPEED_MPS = 0.12, 0.2
+LENGTH_TOLERANCE_M = 0.02
+MAX_GOAL_GAP_M = 1.6  # from the landmark's outline to the goal
+
+_EXAMPLES = """examples:
+  python -m sim_hil.benchmark.suite.validate
+  python -m sim_hil.benchmark.suite.validate --suite my_suite.toml --json -
+exit codes: 0 all sound, 1 something is wrong, 2 the suite or a scene cannot be read"""
+
+
+@dataclass
+class _Place:
+    """One scene with what is worked out on it, as it is needed."""
+
+    scene: Scene
+    grids: dict[str, NavGrid] = field(default_factory=dict)
+    lengths: dict[tuple[str, Vec2, Vec2], float] = field(default_factory=dict)
+
+    def grid(self, robot: str) -> NavGrid:
+        if robot not in self.grids:
+            self.grids[robot] = robot_grid(self.scene, robot)
+        return self.grids[robot]
+
+    @cached_property
+    def telling(self) -> NavGrid:
+        return telling_grid(self.scene)
+
+    @cached_property
+    def lines(self) -> Sightlines:
+        return Sightlines(self.scene)
+
+    @property
+    def outdoor(self) -> bool:
+        return any(area.kind == "sidewalk" for area in self.scene.areas)
+
+    def thing(self, label: str) -> SceneObject | None:
+        return next((thing for thing in self.scene.objects if thing.label == label), None)
+
+
+class Validator:
+    """Checks episodes one by one; scenes are loaded once. Raises SceneError for a scene that cannot be read."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, _Place] = {}
+        self._tasks: dict[tuple[object, ...], list[str]] = {}
+
+    def problems(self, episode: Episode) -> list[str]:
+        """What is wrong with an episode, one line each."""
+        if episode.scene not in self._places:
+            self._places[episode.scene] = _Place(load_scene(episode.scene))
+        place = self._places[episode.scene]
+        found = _feasible(episode, place)
+        # What does not hang on robot and crowd is checked once for all episodes of a task.
+        key = (episode.scene, episode.start, episode.goal_xy, episode.instructions, episode.landmarks,
+               episode.goal_landmark, episode.threshold_m)  # fmt: skip
+        if key not in self._tasks:
+            self._tasks[key] = _truthful(episode, place)
+        return found + self._tasks[key]
+
+
+def _feasible(episode: Episode, place: _Place) -> list[str]:
+    grid = place.grid(episode.robot)
+    found = []
+    if not grid.is_free(*episode.start[:2]):
+        found.append(f"the start is not free for a {episode.robot}")
+    if not grid.is_free(*episode.goal_xy):
+        found.append(f"the goal is not free for a {episode.robot}")
+    key = (episode.robot, episode.start[:2], episode.goal_xy)
+    if key not in place.lengths:
+        place.lengths[key] = grid.distance_m(episode.start[:2], episode.goal_xy)
+    length = place.lengths[key]
+    if length == float("inf"):
+        return [*found, "the goal cannot be reached"]
+    if abs(length - episode.shortest_m) > LENGTH_TOLERANCE_M:
+        found.append(f"shortest_m is {episode.shortest_m:.3f}, the shortest feasible path has {length:.3f}")
+    speed = OUTDOOR_SPEED_MPS if place.outdoor else INDOOR_SPEED_MPS
+    if episode.timeout_s < length / speed:
+        found.append(f"timeout_s is {episode.timeout_s:.0f}, at {speed} m/s it takes {length / speed:.0f}")
+    return found
+
+
+def _truthful(episode: Episode, place: _Place) -> list[str]:
+    scene, grid = place.scene, place.telling
+    goal = place.thing(episode.goal_landmark)
+    if goal is None or not goal.landmark:
+        return [f"goal_landmark {episode.goal_landmark!r} is no landmark of the scene"]
+    found = []
+    gap = outline_gap_m(goal, episode.goal_xy)
+    if gap > MAX_GOAL_GAP_M:
+        found.append(f"the goal is {gap:.1f} m away from the {goal.landmark}")
+    if (leak := worst_leak(grid, episode.goal_xy, episode.threshold_m)) > 0:
+        found.append(f"within the threshold there is a spot {leak:.1f} m too far round: the goal counts through a wall")
+    path = grid.path(episode.start[:2], episode.goal_xy)
+    if path is None:
+        return [*found, f"no way for a robot of radius {TELLING_CLEARANCE_M} m"]
+    try:
+        told = tell(scene, grid, path, goal)
+    except RouteError as error:
+        return [*found, f"the way cannot be told: {error}"]
+    found += wrong_bends(told, path)
+    for text in episode.instructions:
+        found += [f"{text!r}: {problem}" for problem in untrue(text, told)]
+        if not is_held_out(text):
+            found.append(f"{text!r}: this sentence pattern belongs to training")
+    if not found:
+        named = set(named_landmarks(episode.instructions, told))
+        if named != set(episode.landmarks):
+            found.append(f"landmarks are {sorted(episode.landmarks)}, the instructions name {sorted(named)}")
+    return found + named_too_small(scene, place.lines, path, episode.landmarks)
+
+
+def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
+    """Problems by episode id, only of those that have any."""
+    validator = Validator()
+    found = {episode.id: validator.problems(episode) for episode in episodes}
+    return {name: lines for name, lines in found.items() if lines}
+
+
+@command_line("validate")
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sim_hil.benchmark.suite.validate",
+        description="Check that a suite's episodes are feasible and true.",
+        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument(
+        "--suite", default="dynanav", metavar="S", help=f"{', '.join(suite_names())}, or a .toml file"
+    )  # fmt: skip
+    parser.add_argument("--json", metavar="FILE|-", help="the result as JSON")
+    args = parser.parse_args(argv)
+    try:
+        check_result_target(args.json)
+        episodes = load_suite(args.suite)
+        wrong = validate(episodes)
+    except (SuiteError, SceneError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    result = {
+        "suite": args.suite,
+        "episodes": len(episodes),
+        "tasks": len({episode.task for episode in episodes}),
+        "wordings": sum(len(t) for t in {episode.instructions for episode in episodes}),
+        "robots": {robot: sum(episode.robot == robot for episode in episodes) for robot in ROBOTS},
+        "wrong": len(wrong),
+        "problems": wrong,
+    }
+    write_result(args.json, result)
+    for name, lines in wrong.items():
+        for line in lines:
+            sys.stderr.write(f"{name}: {line}\n")
+    sys.stderr.write(f"{len(episodes)} episodes, {len(wrong)} of them wrong\n")
+    return 1 if wrong or not episodes else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

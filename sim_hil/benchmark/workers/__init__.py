@@ -1,0 +1,1 @@
+"""Runs episodes: jobs, worker processes, a Ray cluster, virtual and real time."""

@@ -1,0 +1,179 @@
+"""A benchmark run as the command asks for it: its episodes, its directory, its backend, its result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from edge.core.stats import percentiles
+from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
+from sim_hil.benchmark.policies.select import check_artifacts, open_policy
+from sim_hil.benchmark.results.episode_log import read_log
+from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.results.store import EPISODES, ResultStore
+from sim_hil.benchmark.results.summary import summarise
+from sim_hil.benchmark.suite.episode import Episode
+from sim_hil.benchmark.workers.code_version import code_sha256
+from sim_hil.benchmark.workers.jobs import Backend, RunWatcher, run_all
+from sim_hil.benchmark.workers.run_episode import RUNNERS
+from sim_hil.benchmark.workers.task import EpisodeTask
+
+SCHEMA = 1
+_PACKAGES = (
+    "tic-vla-edge",
+    "numpy",
+    "pybullet",
+    "panda3d",
+    "scipy",
+    "onnxruntime",
+    "opencv-python-headless",
+)
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """What is to be run; `trained` is what the manifest says, True for a policy without one."""
+
+    suite: str
+    episodes: tuple[Episode, ...]
+    conditions: Conditions
+    manifest_sha256: str
+    trained: bool
+
+    @staticmethod
+    def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions) -> BenchRun:
+        """Check everything that can be known before the first episode; an external policy is asked who it is.
+
+        Raises ArtifactError, ConditionsError, ExternalError.
+        """
+        if conditions.clock not in RUNNERS:
+            raise ConditionsError(
+                f"--clock {conditions.clock}: not in this version; expected {', '.join(sorted(RUNNERS))}"
+            )
+        artifacts = check_artifacts(conditions)
+        sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
+        run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
+        run.tasks(Path())
+        if conditions.policy.kind == "external":
+            open_policy(conditions).close()
+        return run
+
+    def config(self) -> dict[str, Any]:
+        """What a resumed run must have in common with this one."""
+        return {
+            "schema": SCHEMA,
+            "suite": self.suite,
+            "suite_sha256": _sha256([asdict(episode) for episode in self.episodes]),
+            "episodes": [episode.id for episode in self.episodes],
+            "conditions": self.conditions.as_json(),
+            "manifest_sha256": self.manifest_sha256,
+            "trained": self.trained,
+            "versions": versions(),
+        }
+
+    def tasks(self, folder: Path, video: str = "none") -> list[EpisodeTask]:
+        """One task an episode, the longest first, so that none is left alone at the end. Raises ConditionsError."""
+        tasks = [
+            EpisodeTask(episode, self.conditions, folder, video, self.manifest_sha256) for episode in self.episodes
+        ]
+        return sorted(tasks, key=lambda task: -expected_cost(task.episode))
+
+    def run(
+        self, store: ResultStore, backend: Backend, video: str, stopped: Callable[[], bool], watcher: RunWatcher
+    ) -> bool:
+        """Run what has no result yet; False when it was interrupted. Raises RefusedRunError, OSError."""
+        tasks = self.tasks(store.directory, video)
+        return run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
+
+
+def expected_cost(episode: Episode) -> float:
+    """Something that grows as the time that an episode takes to simulate."""
+    return episode.timeout_s * (20 + episode.people)
+
+
+def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode]:
+    """Episodes whose id matches a pattern, all without patterns. Raises ConditionsError for one that none matches."""
+    for pattern in patterns:
+        if not any(fnmatchcase(episode.id, pattern) for episode in episodes):
+            some = ", ".join(episode.id for episode in episodes[:3])
+            raise ConditionsError(
+                f"--episodes {pattern!r}: expected a pattern of ids such as {some}, ...; none matches"
+            )
+    wanted = patterns or ("*",)
+    return [episode for episode in episodes if any(fnmatchcase(episode.id, pattern) for pattern in wanted)]
+
+
+def versions() -> dict[str, str]:
+    """What results may depend on beside the conditions."""
+    found = {"python": platform.python_version(), "machine": platform.machine(), "system": sys.platform}
+    found["code"] = code_sha256()
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_ns: int) -> dict[str, Any]:
+    """What `--json` writes (design section 9)."""
+    results = sorted(store.results, key=lambda result: result.id)
+    wall_s = (time.monotonic_ns() - started_ns) / 1e9
+    return {
+        "summary": {
+            **summarise(results),
+            "asked": len(run.episodes),
+            "failed_runs": len(store.failed),
+            "finished": finished,
+        },
+        "episodes": [result.as_json() for result in results],
+        "failed_runs": [asdict(failed) for failed in store.failed],
+        "latency": latency_result(store.directory, run.conditions, results),
+        "conditions": run.conditions.as_json(),
+        "suite": run.suite,
+        "suite_sha256": run.config()["suite_sha256"],
+        "manifest_sha256": run.manifest_sha256,
+        "trained": run.trained,
+        "versions": store.config["versions"],
+        "code_changed": store.config["versions"]["code"] != code_sha256(),
+        "wall_s": round(wall_s, 1),
+        "simulated_s": round(sum(result.time_s for result in results), 1),
+        "tagged": "measured",
+    }
+
+
+def latency_result(directory: Path, conditions: Conditions, results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Delays of all periods of all episodes, and what they were drawn from."""
+    delays: list[float] = []
+    for result in results:
+        if result.delay_s is not None:
+            try:
+                columns: Mapping[str, Any] = read_log(directory / EPISODES / f"{result.id}.json")["columns"]
+            except (OSError, ValueError):
+                continue  # its log was removed: the others still tell
+            delays += [delay for delay in columns["delay_s"] if delay is not None]
+    profile = conditions.latency
+    return {
+        "delay_s": {
+            "mean": round(sum(delays) / len(delays), 4) if delays else None,
+            **percentiles(delays, "p50", "p99", "max"),
+        },
+        "periods": len(delays),
+        "profile": None if profile is None else profile.name,
+        "profile_mean_s": None if profile is None else round(profile.mean_s, 4),
+        "profile_source": None if profile is None else profile.source,
+        "profile_tagged": None if profile is None else profile.tagged,
+    }
+
+
+def _sha256(content: object) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

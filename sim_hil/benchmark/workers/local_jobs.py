@@ -1,0 +1,80 @@
+"""Episodes in processes of this machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from sim_hil.benchmark.conditions.conditions import ConditionsError
+from sim_hil.benchmark.results.record import EpisodeResult, ResultError
+from sim_hil.benchmark.results.store import EPISODES
+from sim_hil.benchmark.workers.jobs import Ended
+from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.benchmark.workers.worker_pool import Workers
+from sim_hil.benchmark.workers.worker_process import Message
+
+ATTEMPTS = 2
+"""An episode whose process died is run once more."""
+WORKER: Sequence[str] = (sys.executable, "-m", "sim_hil.benchmark.workers.worker")
+
+
+class LocalJobs:
+    """Up to `jobs` episodes at a time."""
+
+    attempts = ATTEMPTS
+
+    def __init__(self, jobs: int, worker: Sequence[str] = WORKER) -> None:
+        if jobs < 1:
+            raise ConditionsError(f"--jobs: expected 1 or more, found {jobs}")
+        self._workers = Workers(worker, jobs)
+        self._times_s: dict[str, float] = {}
+        self._said: dict[str, Ended] = {}
+
+    def free(self) -> int:
+        """Processes that may still be started."""
+        return self._workers.free()
+
+    def pids(self) -> dict[str, int]:
+        """Process id of every episode that runs."""
+        return self._workers.pids()
+
+    def start(self, task: EpisodeTask) -> None:
+        """Start a worker; raises OSError when there can be no process."""
+        name = task.episode.id
+        self._workers.start(name, task.as_json(), task.folder / EPISODES / f"{name}.log")
+        self._times_s[name] = 0.0
+
+    def wait(self, timeout_s: float) -> Sequence[Ended]:
+        """Attempts whose process has ended."""
+        ended: list[Ended] = []
+        for told in self._workers.wait(timeout_s):
+            if told.message is not None:
+                self._understand(told.key, told.message)
+                continue
+            del self._times_s[told.key]
+            why = f"its process gave no result: {told.why or 'ended with exit code 0'}"
+            ended.append(self._said.pop(told.key) if told.key in self._said else Ended(told.key, why=why))
+        return ended
+
+    def times_s(self) -> dict[str, float]:
+        """Episode time of what runs."""
+        return dict(self._times_s)
+
+    def close(self) -> None:
+        """End all workers."""
+        self._workers.close()
+        self._times_s.clear()
+
+    def _understand(self, name: str, content: Message) -> None:
+        """What a worker has said; what makes no sense is as good as nothing."""
+        try:
+            if "result" in content:
+                self._said[name] = Ended(name, result=EpisodeResult.of_json(content["result"]))
+            elif "refused" in content:
+                self._said[name] = Ended(name, why=str(content["refused"]), refused_code=int(content["code"]))
+            elif "failed" in content:
+                self._said[name] = Ended(name, why=str(content["failed"]))
+            else:
+                self._times_s[name] = float(content["time_s"])
+        except (ValueError, KeyError, TypeError, ResultError):
+            return

@@ -1,0 +1,266 @@
+"""One episode of the benchmark in real time: edge-hil, edge-bridge and edge-run drive it, ground truth judges it.
+
+The record is that of lockstep, the path summed over 30 Hz poses like there. What differs: delays are this machine's
+own, and nothing is the same twice.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import numpy as np
+
+from edge.core.geometry import SE2
+from edge.flightlog.reader import RecordingError, read_messages
+from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
+from sim_hil.benchmark.conditions.variants import artifact_directory
+from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success
+from sim_hil.benchmark.env.outcome import measure
+from sim_hil.benchmark.results.episode_log import EpisodeLog
+from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.suite.episode import Episode
+from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.realtime.stack import Stack, StackOptions, free_domain
+from sim_hil.realtime.truth import TruePose, TruthTail, read_lines
+
+ROBOT: Final = "go2"
+"""The only robot that edge-bridge drives."""
+ARM_TIMEOUT_S: Final = 90.0
+POLL_S: Final = 0.05
+FOLDER: Final = "realtime"
+
+Tell = Callable[[float], None]
+
+
+def check_realtime(conditions: Conditions, *, jobs: int, cluster: bool, video: str) -> None:
+    """Raises ConditionsError for what does not go with this clock."""
+    wrong = (
+        (conditions.policy.kind != "artifacts", "--policy artifacts:DIR, which edge-run drives by"),
+        (conditions.latency is not None, "no --latency: it is this machine's own"),
+        (conditions.camera != "auto", "no --camera: it is the simulated robot's own"),
+        (jobs != 1 or cluster, "--jobs 1 and no --cluster: episodes side by side would slow each other down"),
+        (video != "none", "no --video: the flight logs below realtime/ hold the pictures"),
+    )
+    for fails, expected in wrong:
+        if fails:
+            raise ConditionsError(f"--clock realtime: expected {expected}")
+
+
+def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
+    """Episodes that can be run, and the ids of those that are left out: edge-bridge drives a go2 only."""
+    return (
+        [episode for episode in episodes if episode.robot == ROBOT],
+        [episode.id for episode in episodes if episode.robot != ROBOT],
+    )
+
+
+@dataclass
+class _Drive:
+    """What was seen while the episode was driven."""
+
+    poses: list[TruePose] = field(default_factory=list)
+    end: str = "stopped"
+    collisions: set[str] = field(default_factory=set)
+    first_collision_s: float | None = None
+    time_s: float = 0.0
+
+
+def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+    """Run one episode. Raises StepError when a process of the stack fails, ConditionsError for another robot."""
+    started_ns = time.monotonic_ns()
+    episode, conditions = task.episode, task.conditions
+    if episode.robot != ROBOT:
+        raise ConditionsError(f"episode {episode.id}: expected the robot {ROBOT} in real time, found {episode.robot}")
+    folder = task.folder / FOLDER / episode.id
+    shutil.rmtree(folder, ignore_errors=True)  # of an attempt before
+    folder.mkdir(parents=True)
+    options = StackOptions(
+        folder=folder,
+        artifacts=artifact_directory(Path(conditions.policy.where), conditions.variant),
+        scene=episode.scene,
+        start=episode.start,
+        people=episode.people,
+        seed=episode.seed,
+        domain=free_domain(),
+        mode=conditions.mode or "async",
+        odometry_noise=conditions.drift,
+        stays=conditions.stays,
+        pose_hz=FRAME_HZ,
+    )
+    with _asked_to_end(), Stack(options) as stack:
+        drive = _run(stack, task, tell)
+        stack.end_runner()
+        stack.end_bridge()
+        stack.end_robot()
+    fell = bool(_json(stack.result("edge-hil")).get("fell", False))
+    if fell and drive.end != "reached":
+        drive.end = "fell"
+    outcome = measure(
+        episode,
+        np.array([(pose.x_m, pose.y_m, pose.theta_rad) for pose in drive.poses], float),
+        end=drive.end,
+        time_s=drive.time_s,
+        collisions=tuple(sorted(drive.collisions)),
+        first_collision_s=drive.first_collision_s,
+        fell=fell,
+    )
+    log, generations = _log(stack, drive.poses)
+    log.write(task.log_path, generations, _last_people(stack.trace), episode.goal_xy)
+    stopped_by = next(iter(_json(stack.result("edge-run-1")).get("faults", [])), "") if drive.end == "stopped" else ""
+    return EpisodeResult(
+        id=episode.id,
+        task=episode.task,
+        scene=episode.scene,
+        people=episode.people,
+        robot=episode.robot,
+        seed=episode.seed,
+        wording=conditions.wording,
+        instruction=task.instruction,
+        success=outcome.success,
+        ne_m=outcome.ne_m,
+        spl=100 * outcome.spl,
+        collided=outcome.collided,
+        collisions=outcome.collisions,
+        first_collision_s=outcome.first_collision_s,
+        fell=outcome.fell,
+        end=outcome.end,
+        path_m=outcome.path_m,
+        shortest_m=outcome.shortest_m,
+        time_s=outcome.time_s,
+        timeout_s=episode.timeout_s,
+        trajectory_sha256=outcome.trajectory_sha256,
+        delay_s=log.delay_summary(),
+        generations=len(generations),
+        stopped_by=str(stopped_by),
+        clock=conditions.clock,
+        wall_s=round((time.monotonic_ns() - started_ns) / 1e9, 3),
+        attempts=task.attempt,
+        host=platform.node(),
+    )
+
+
+@contextmanager
+def _asked_to_end() -> Iterator[None]:
+    """Let SIGTERM, by which a worker is ended, unwind the stack: the runner first, then the rest."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def unwind(number: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, unwind)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
+    """Start everything and follow the robot until the episode is over; the clock starts when the robot is armed."""
+    stack.start_robot(lambda: None)
+    stack.start_bridge(lambda: None)
+    runner = stack.start_runner(task.instruction)
+    deadline_ns = time.monotonic_ns() + round(ARM_TIMEOUT_S * 1e9)
+    while not stack.armed():
+        stack.check()
+        if not runner.running:
+            raise runner.failure(f"refused to drive, exit code {runner.process.returncode}")
+        if time.monotonic_ns() > deadline_ns:
+            raise runner.failure(f"not armed within {ARM_TIMEOUT_S:g} s")
+        time.sleep(POLL_S)
+    tail, drive = TruthTail(stack.trace), _Drive()
+    before = tail.update()
+    drive.poses = before[-1:]
+    while not drive.poses:
+        time.sleep(POLL_S)
+        drive.poses = tail.update()[:1]
+    while runner.running:
+        stack.check()
+        for pose in tail.update():
+            if _over(drive, pose, task.episode):
+                return drive
+        tell(drive.time_s)
+        time.sleep(POLL_S)
+    return drive
+
+
+def _over(drive: _Drive, pose: TruePose, episode: Episode) -> bool:
+    drive.poses.append(pose)
+    drive.time_s = (pose.t_ns - drive.poses[0].t_ns) / 1e9
+    if pose.touching and drive.first_collision_s is None:
+        drive.first_collision_s = drive.time_s
+    drive.collisions.update(pose.touching)
+    if is_success((pose.x_m, pose.y_m), episode.goal_xy, episode.threshold_m):
+        drive.end = "reached"
+    elif drive.time_s >= episode.timeout_s:
+        drive.end = "timeout"
+    else:
+        return False
+    return True
+
+
+def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapping[str, Any]]]:
+    """One row per tick and the generations, from the flight log, within the episode."""
+    log = EpisodeLog()
+    generations: list[Mapping[str, Any]] = []
+    at = np.array([pose.t_ns for pose in poses], np.int64)
+    columns = [np.array([getattr(pose, name) for pose in poses]) for name in ("x_m", "y_m", "theta_rad")]
+    columns[2] = np.unwrap(columns[2])
+    T_odom_start: SE2 | None = None
+    try:
+        for topic, _, record in read_messages(stack.flight_log(1)):
+            if topic == "/semantic" and record["ready_ns"] <= at[-1]:
+                generations.append(_generation(record, int(at[0])))
+            elif topic == "/tick" and record["pose"] is not None and at[0] <= record["now_ns"] <= at[-1]:
+                T_odom_base = SE2(*record["pose"])
+                T_odom_start = T_odom_start or T_odom_base
+                truth = SE2(*(float(np.interp(record["now_ns"], at, column)) for column in columns))
+                moved = T_odom_start.inverse() @ T_odom_base
+                time_s = (record["now_ns"] - int(at[0])) / 1e9
+                log.add(time_s, truth, moved, tuple(record["command"]), record["delay_s"])
+    except (OSError, RecordingError):
+        pass  # the runner ended before its first record; the rows that there are stay
+    return log, generations
+
+
+def _generation(record: Mapping[str, Any], begin_ns: int) -> dict[str, Any]:
+    """One generation as lockstep logs it, times since the episode's begin."""
+    times = {
+        "started_s": record["started_ns"],
+        "anchor_s": record["anchor_ns"],
+        "released_s": record["ready_ns"],
+    }
+    return {
+        "generation": record["generation"],
+        **{name: round((stamp_ns - begin_ns) / 1e9, 4) for name, stamp_ns in times.items()},
+        "text": record["text"],
+        "waypoints": record["waypoints"],
+    }
+
+
+def _last_people(trace: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+    last: list[list[float]] = []
+    for line in read_lines(trace):
+        if line.get("kind") == "people":
+            last = line["poses"]
+    return np.array(last, float).reshape(-1, 3)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,114 @@
+"""One episode from beginning to end: a fresh world, a policy, a record. The clocks differ only in who moves time on."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from sim_hil.benchmark.conditions.conditions import ConditionsError
+from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
+from sim_hil.benchmark.policies.select import camera_for, open_policy
+from sim_hil.benchmark.results.episode_log import EpisodeLog
+from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.workers.task import EpisodeTask
+
+if TYPE_CHECKING:
+    from sim_hil.benchmark.results.video import EpisodeVideo
+
+Tell = Callable[[float], None]
+"""Told the episode's time, s, now and then."""
+
+
+def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+    """Virtual time: the world waits for the policy in every control period, so the same task gives the same bytes."""
+    started_ns = time.monotonic_ns()
+    episode, log = task.episode, EpisodeLog()
+    with ExitStack() as cleanup:
+        policy = open_policy(task.conditions, task.manifest_sha256)
+        cleanup.callback(policy.close)
+        options = WorldOptions(camera=camera_for(task.conditions, policy), drift=task.conditions.drift)
+        world = EpisodeWorld(episode, options)
+        cleanup.callback(world.close)
+        video = None if task.video == "none" else _video(task)
+        if video is not None:
+            cleanup.callback(video.discard)
+        policy.reset(episode, task.instruction, world if policy.privileged else None, episode.seed)
+        while not world.done:
+            observation = world.observe()
+            command = policy.act(observation)
+            notes = policy.notes()
+            delay_s = notes.get("delay_s")
+            log.add(
+                observation.time_s,
+                world.pose(),
+                observation.T_odom_base,
+                command,
+                delay_s if isinstance(delay_s, float) else None,
+            )
+            if video is not None:
+                video.add(world, observation, command, notes)
+            world.step(command)
+            tell(observation.time_s)
+        outcome, notes = world.outcome(), policy.notes()
+        generations = getattr(policy, "generations", lambda: None)()
+        log.write(task.log_path, generations or [], world.people(), episode.goal_xy)
+        if video is not None and (task.video == "all" or not outcome.success or outcome.collided):
+            video.keep()
+        wall_s = (time.monotonic_ns() - started_ns) / 1e9
+        return EpisodeResult(
+            id=episode.id,
+            task=episode.task,
+            scene=episode.scene,
+            people=episode.people,
+            robot=episode.robot,
+            seed=episode.seed,
+            wording=task.conditions.wording,
+            instruction=task.instruction,
+            success=outcome.success,
+            ne_m=outcome.ne_m,
+            spl=100 * outcome.spl,
+            collided=outcome.collided,
+            collisions=outcome.collisions,
+            first_collision_s=outcome.first_collision_s,
+            fell=outcome.fell,
+            end=outcome.end,
+            path_m=outcome.path_m,
+            shortest_m=outcome.shortest_m,
+            time_s=outcome.time_s,
+            timeout_s=episode.timeout_s,
+            trajectory_sha256=outcome.trajectory_sha256,
+            delay_s=log.delay_summary(),
+            generations=None if generations is None else len(generations),
+            stopped_by=str(notes.get("stopped_by", "")),
+            clock=task.conditions.clock,
+            wall_s=round(wall_s, 3),
+            attempts=task.attempt,
+            host=platform.node(),
+        )
+
+
+def _video(task: EpisodeTask) -> EpisodeVideo:
+    from sim_hil.benchmark.results.video import EpisodeVideo  # here: fonts and drawing are only needed for this
+
+    return EpisodeVideo(task.video_path, task.episode, task.instruction)
+
+
+def _realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+    from sim_hil.benchmark.workers.realtime_episode import run_realtime  # here: it needs nothing of what lockstep does
+
+    return run_realtime(task, tell)
+
+
+RUNNERS: Mapping[str, Callable[[EpisodeTask, Tell], EpisodeResult]] = {"lockstep": run_lockstep, "realtime": _realtime}
+"""Who runs an episode on which clock; all give the same record."""
+
+
+def run_episode(task: EpisodeTask, tell: Tell = lambda _: None) -> EpisodeResult:
+    """Run one episode on its clock. Raises ConditionsError, ArtifactError, ExternalError, SceneError or OSError."""
+    runner = RUNNERS.get(task.conditions.clock)
+    if runner is None:
+        raise ConditionsError(f"--clock {task.conditions.clock}: not in this version; expected {', '.join(RUNNERS)}")
+    return runner(task, tell)

@@ -1,0 +1,59 @@
+"""The process of one episode: a task in, progress and one result out, both as lines of JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from edge.artifacts.files import ArtifactError
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
+from edge.reasoning.prompt import InstructionError
+from firmware_bridge.core.config import ConfigError
+from sim_hil.benchmark.conditions.conditions import ConditionsError
+from sim_hil.benchmark.policies.external_protocol import ExternalError
+from sim_hil.benchmark.suite.episode import SuiteError
+from sim_hil.benchmark.workers.run_episode import run_episode
+from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.benchmark.workers.worker_process import line_to_parent
+from sim_hil.scene.scene import SceneError
+
+TELL_EVERY_NS = 500_000_000
+
+_BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionError)
+
+
+def refusal_of(error: Exception) -> tuple[str, int] | None:
+    """The one line and exit code of an error that trying again cannot mend; None for any other."""
+    if isinstance(error, ArtifactError):
+        return str(error), EXIT_REFUSED
+    if isinstance(error, _BAD_INPUT):
+        return str(error), EXIT_BAD_INPUT
+    return None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Read one task from standard input and run it; exit code 0 once the result or a refusal has been told."""
+    with line_to_parent("python -m sim_hil.benchmark.workers.worker", argv) as tell:
+        told_ns = time.monotonic_ns()
+
+        def tell_time(time_s: float) -> None:
+            nonlocal told_ns
+            if time.monotonic_ns() - told_ns > TELL_EVERY_NS:
+                told_ns = time.monotonic_ns()
+                tell({"time_s": time_s})
+
+        try:
+            task = EpisodeTask.of_json(json.loads(sys.stdin.read()))
+            tell({"result": run_episode(task, tell_time).as_json()})
+        except (ArtifactError, *_BAD_INPUT) as error:
+            line, code = refusal_of(error) or (str(error), EXIT_BAD_INPUT)
+            tell({"refused": line, "code": code})
+        except ExternalError as error:
+            # A policy server that is gone or misbehaves: this run has failed, another attempt may not.
+            tell({"failed": str(error)})
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

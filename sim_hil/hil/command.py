@@ -1,0 +1,251 @@
+"""`edge-hil`: the simulated robot on the other end of a real protocol, in real time. Its command line."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import pybullet
+
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    OutputError,
+    check_result_target,
+    command_line,
+    write_result,
+)
+from firmware_bridge.core.config import ConfigError
+from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
+from sim_hil.hil.display import check_display
+from sim_hil.hil.loop import POSE_HZ, STEPS_PER_S, HilLoop
+from sim_hil.hil.trace import TraceWriter
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions
+from sim_hil.protocols.registry import FLAGS, check_combination, check_flags, open_front_end, protocols, robots
+from sim_hil.robots.odometry_noise import LEVELS
+from sim_hil.scene.scene import Scene, SceneError, load_scene, scene_names
+from sim_hil.simulation.physics import Simulation
+
+# What the world can do to a run: the camera process dies, the window is closed, a disk is full. Anything else is a bug
+# and keeps its traceback.
+_RUN_FAILURES: Final = (RuntimeError, ValueError, OSError, pybullet.error, *DDS_ERRORS)
+
+EPILOG: Final = """examples:
+  edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --seed 1
+  edge-hil --robot go2 --scene my_scene.toml --protocol unitree --start 2.5,-1,90
+  edge-hil --robot carter --scene warehouse --protocol can --link serial:carter.can
+  edge-hil --robot carter --scene warehouse --protocol can --link serial:carter.can,camera=8091,drop=0.05,corrupt=0.01
+  edge-hil --robot carter --scene office --protocol can --link socketcan:can0
+  edge-hil --robot carter --scene office --protocol mavlink --link udp:127.0.0.1:14580,to=127.0.0.1:14550
+  edge-hil --robot carter --scene office --protocol mavlink --link udp:0.0.0.0:14580,camera=8091,system=2
+  edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
+  edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
+--link of can: INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...]
+  INTERFACE  serial (a serial line; a path that does not exist becomes the client's end of a pty),
+             socketcan (a real bus), udp_multicast (between processes of this machine: udp_multicast:239.74.163.2)
+  FAULT      drop, corrupt, duplicate, delay: probability per frame; delay_s (0.05); bus_off_every_s (0: never) and
+             bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that talks without end
+  default    serial:RUNTIME/carter-can in the user's runtime directory; the ready line names it
+--link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE]
+  to         is called without having been heard; key: the file of a signing key, then only signed packets are obeyed
+  default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
+camera: the TCP port that pictures are served at over HTTP, 8090 if not given
+
+with --faults, one JSON object a datagram switches a fault on or off, such as {"fault": "camera-stop", "on": true}; the
+answer says when it took effect, and an unknown name is answered with all that there are
+exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
+is written all the same, or trace or result could not be written; 2 bad arguments"""
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """A list that receives the number of every SIGINT and SIGTERM until the end of the block."""
+    received: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def parse_size(text: str) -> tuple[int, int] | None:
+    """`WxH` in pixels, None for `none`; raises argparse.ArgumentTypeError."""
+    if text == "none":
+        return None
+    width, times, height = text.partition("x")
+    if not (times and width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected WxH such as 320x180, or none, found {text!r}")
+    if not (32 <= int(width) <= 1920 and 32 <= int(height) <= 1080):
+        raise argparse.ArgumentTypeError(f"expected 32x32 to 1920x1080, found {text}")
+    return int(width), int(height)
+
+
+def parse_start(text: str) -> tuple[float, float, float]:
+    """`X,Y,DEG` as (x_m, y_m, theta_rad); raises argparse.ArgumentTypeError."""
+    try:
+        x_m, y_m, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected X,Y,DEG such as 1.5,-2,90, found {text!r}") from None
+    if not all(map(math.isfinite, (x_m, y_m, degrees))):
+        raise argparse.ArgumentTypeError(f"expected finite X,Y,DEG, found {text!r}")
+    return x_m, y_m, math.radians(degrees)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="edge-hil",
+        description="A simulated robot that answers its maker's protocol, in real time.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--robot", required=True, choices=robots(), help="which robot")
+    parser.add_argument(
+        "--scene", required=True, metavar="NAME|FILE", help=f"a scene file, or one of: {', '.join(scene_names())}"
+    )
+    parser.add_argument("--protocol", required=True, choices=protocols(), help="what it speaks")
+    parser.add_argument(
+        "--start", type=parse_start, metavar="X,Y,DEG", help="where it starts, m and degrees (default: the scene's)"
+    )
+    parser.add_argument("--people", type=int, default=0, metavar="N", help="walking people (default 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of people and odometry noise (default 0)")
+    parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
+    parser.add_argument("--domain", type=int, metavar="N", help="unitree: DDS domain (default 0)")
+    parser.add_argument("--interface", metavar="NAME", help="unitree: network interface (default lo)")
+    parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: where it is reached; forms and defaults below")
+    parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="default 320x180")
+    parser.add_argument(
+        "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
+    )
+    parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults at this local datagram socket")
+    parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
+    parser.add_argument(
+        "--pose-hz", type=int, default=POSE_HZ, metavar="N", help=f"poses a second in the trace (default {POSE_HZ})"
+    )
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    parser.add_argument("--gui", action="store_true", help="show the physics in a window")
+    return parser
+
+
+@command_line("edge-hil")
+def main(argv: list[str] | None = None) -> int:
+    """Command line; see EPILOG for the exit codes."""
+    args = _parser().parse_args(argv)
+    with stop_signals() as stop:
+        try:
+            _check(args)
+            loop, where = _open(args)
+        except (ConfigError, SceneError, DdsError, FrontEndError, ValueError, OSError) as error:
+            return _complain(error, EXIT_BAD_INPUT)
+        try:
+            trace = None if args.trace is None else TraceWriter(args.trace)
+        except OSError as error:
+            loop.close()
+            return _complain(f"--trace {args.trace}: expected a file to write, {error.strerror}", EXIT_BAD_INPUT)
+        try:
+            code = _run(loop, trace, stop, args, where)
+        finally:
+            written = _write_results(loop, trace, args)
+        return code or written
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse bad arguments before anything is started or overwritten; raises ValueError or OSError with one line."""
+    check_combination(args.robot, args.protocol)
+    check_flags(args.protocol, [flag for flag in FLAGS if getattr(args, flag.removeprefix("--")) is not None])
+    if args.gui:
+        check_display(os.environ.get("DISPLAY"))
+    if args.duration is not None and not 0 < args.duration < math.inf:
+        raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
+    for flag, value in (("--people", args.people), ("--seed", args.seed)):
+        if value < 0:
+            raise ConfigError(f"{flag}: expected 0 or more, found {value}")
+    if not 1 <= args.pose_hz <= STEPS_PER_S:
+        raise ConfigError(f"--pose-hz: expected 1..{STEPS_PER_S}, found {args.pose_hz}")
+    check_result_target(args.json)
+
+
+def _open(args: argparse.Namespace) -> tuple[HilLoop, str]:
+    """The loop, and where its robot can be reached."""
+    scene = _scene(args)
+    options = FrontEndOptions(
+        robot=args.robot,
+        scene_source=args.scene,
+        scene=scene,
+        people=args.people,
+        seed=args.seed,
+        camera_size=args.camera,
+        odometry_noise=args.odometry_noise,
+        faults=args.faults,
+        link=args.link,
+        domain=0 if args.domain is None else args.domain,
+        interface="lo" if args.interface is None else args.interface,
+    )
+    simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui, robot=args.robot)
+    try:
+        front_end = open_front_end(args.protocol, simulation, options)
+    except BaseException:
+        simulation.close()
+        raise
+    return HilLoop(simulation, front_end, options, pose_hz=args.pose_hz), front_end.where()
+
+
+def _scene(args: argparse.Namespace) -> Scene:
+    scene = load_scene(args.scene)
+    if args.start is None:
+        return scene
+    (x_m, y_m, _), (x0, y0), (x1, y1) = args.start, scene.floor_min_m, scene.floor_max_m
+    if not (x0 < x_m < x1 and y0 < y_m < y1):
+        raise SceneError(f"--start: expected a place on the floor, {x0:g}..{x1:g}, {y0:g}..{y1:g} m, found {x_m},{y_m}")
+    return replace(scene, start=args.start)
+
+
+def _run(loop: HilLoop, trace: TraceWriter | None, stop: list[int], args: argparse.Namespace, where: str) -> int:
+    try:
+        try:
+            if loop.start(trace, stop):
+                sys.stderr.write(f"edge-hil: ready, {where}\n")
+                sys.stderr.flush()
+                loop.run(stop, args.duration)
+        finally:
+            loop.close()
+    except _RUN_FAILURES as error:
+        return _complain(f"the run has failed: {error}", EXIT_CHECK_FAILED)
+    return EXIT_DONE
+
+
+def _write_results(loop: HilLoop, trace: TraceWriter | None, args: argparse.Namespace) -> int:
+    code, summary = EXIT_DONE, loop.summary()
+    if trace is not None:
+        trace.close(time.monotonic_ns(), **summary)
+        if trace.error is not None:
+            code = _complain(f"trace {args.trace} is incomplete: {trace.error}", EXIT_CHECK_FAILED)
+    try:
+        write_result(args.json, summary)
+    except OutputError as error:
+        code = _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
+    return code
+
+
+def _complain(what: object, code: int) -> int:
+    sys.stderr.write(f"edge-hil: {what}\n")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

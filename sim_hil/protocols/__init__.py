@@ -1,0 +1,1 @@
+"""Front ends of `edge-hil`, one for each protocol, and what they share: interface, camera stream, fault socket."""

@@ -1,0 +1,325 @@
+"""The camera of a robot whose protocol carries no pictures: MJPEG over HTTP, from a process of its own.
+
+Any browser, ffmpeg or OpenCV can look at it; it listens on the loopback only.
+  GET /stream.mjpg   multipart/x-mixed-replace, a JPEG a part, no faster than the camera's rate
+  GET /frame.jpg     the next picture
+Every picture comes with "X-Capture-Ns", time.monotonic_ns of the pose that it shows. Nothing is rendered while nobody
+looks. `CameraStream` is the parent's handle: the pose goes to the process through shared memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Final, TextIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.protocols.snapshot import SnapshotReader, SnapshotWriter, TornSnapshotError
+from sim_hil.scene.scene import load_scene
+from sim_hil.simulation.camera import CameraWorld
+from sim_hil.simulation.sensor_noise import SensorNoise
+
+JPEG_QUALITY: Final = 85
+RATE_HZ: Final = 15.0
+_BOUNDARY: Final = "frame"
+_IDLE_S: Final = 0.05
+_FRAME_TIMEOUT_S: Final = 5.0
+_SEND_TIMEOUT_S: Final = 5.0
+_START_TIMEOUT_S: Final = 60.0
+_END_S: Final = 3.0
+
+
+class CameraStreamError(RuntimeError):
+    """The camera process did not start, or has died."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One JPEG, its running number, and time.monotonic_ns of the pose that it shows."""
+
+    number: int
+    captured_ns: int
+    jpeg: bytes
+
+
+class Shutter:
+    """Between those who look and the one thread that renders: it is asked for a picture only while somebody waits."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting = 0
+        self._picture: Picture | None = None
+
+    def next_after(self, number: int, timeout_s: float) -> Picture | None:
+        """Wait for a picture newer than `number` (0: any that is made from now on); None after `timeout_s`."""
+        with self._changed:
+            self._waiting += 1
+            try:
+                self._changed.wait_for(lambda: self._picture is not None and self._picture.number > number, timeout_s)
+            finally:
+                self._waiting -= 1
+            picture = self._picture
+            return picture if picture is not None and picture.number > number else None
+
+    @property
+    def newest(self) -> int:
+        """Number of the newest picture, 0 before the first."""
+        with self._changed:
+            return 0 if self._picture is None else self._picture.number
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody waits."""
+        return self._waiting > 0
+
+    def show(self, captured_ns: int, jpeg: bytes) -> None:
+        """Hand everybody who waits a picture."""
+        with self._changed:
+            number = 1 if self._picture is None else self._picture.number + 1
+            self._picture = Picture(number, captured_ns, jpeg)
+            self._changed.notify_all()
+
+
+def listen(port: int) -> socket.socket:
+    """A listening socket on the loopback; `port` 0: any free one. Raises OSError with one clear line."""
+    try:
+        return socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        raise OSError(f"camera: port {port}: expected a free one, {error.strerror}; choose another") from error
+
+
+class CameraServer(ThreadingHTTPServer):
+    """HTTP on a socket that listens already, and is the server's from now on."""
+
+    daemon_threads = True
+
+    def __init__(self, listening: socket.socket, shutter: Shutter) -> None:
+        self.shutter = shutter
+        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: CameraServer
+    timeout = _SEND_TIMEOUT_S  # a client that stops reading is let go
+
+    def do_GET(self) -> None:
+        """One picture or a stream of them."""
+        if self.path == "/frame.jpg":
+            with contextlib.suppress(OSError):
+                self._frame()
+        elif self.path == "/stream.mjpg":
+            with contextlib.suppress(OSError):  # the client has gone, or stopped reading
+                self._stream()
+        else:
+            self.send_error(404, "expected /stream.mjpg or /frame.jpg")
+
+    def _frame(self) -> None:
+        shutter = self.server.shutter
+        picture = shutter.next_after(shutter.newest, _FRAME_TIMEOUT_S)
+        if picture is None:
+            self.send_error(503, "no picture")
+            return
+        self.send_response(200)
+        self._describe(picture)
+        self.wfile.write(picture.jpeg)
+
+    def _describe(self, picture: Picture) -> None:
+        self.send_header("Content-Type", "image/jpeg")
+        self.send_header("Content-Length", str(len(picture.jpeg)))
+        self.send_header("X-Capture-Ns", str(picture.captured_ns))
+        self.end_headers()
+
+    def _stream(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        number = self.server.shutter.newest
+        while True:
+            picture = self.server.shutter.next_after(number, _FRAME_TIMEOUT_S)
+            if picture is None:
+                continue
+            number = picture.number
+            head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n"
+            head += f"X-Capture-Ns: {picture.captured_ns}\r\n\r\n"
+            self.wfile.write(head.encode("ascii") + picture.jpeg + b"\r\n")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are no news."""
+
+
+class CameraStream:
+    """Starts the camera process, hands it the pose, counts its pictures. It ends when this object or process does."""
+
+    def __init__(
+        self,
+        scene: str,
+        *,
+        robot: str,
+        people: int,
+        seed: int,
+        size: tuple[int, int],
+        port: int,
+        state_length: int,
+    ) -> None:
+        """`scene`: what load_scene takes; `size`: (width, height), pixels; `port`: of the loopback, 0 for any free one;
+        `state_length`: of a render state. Raises OSError when the port is taken.
+        """
+        # Listening here: whoever starts us learns at once that a port is taken, and which one it is.
+        with listen(port) as listening:
+            self.port = int(listening.getsockname()[1])
+            self._pose = SnapshotWriter(state_length)
+            command = [sys.executable, "-m", "sim_hil.protocols.camera_stream", "--scene", scene, "--robot", robot]
+            command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
+            command += ["--listen-fd", str(listening.fileno()), "--pose-fd", str(self._pose.fd)]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=(self._pose.fd, listening.fileno()),
+            )
+        assert self._process.stdout is not None
+        os.set_blocking(self._process.stdout.fileno(), False)
+        self._partial = b""
+        self.pictures = 0
+
+    @property
+    def url(self) -> str:
+        """Where it can be seen."""
+        return f"http://127.0.0.1:{self.port}/stream.mjpg"
+
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """Make this the state that the next picture shows; takes microseconds."""
+        self._pose.write(render_state)
+
+    def wait_ready(self, stop: Sequence[int]) -> bool:
+        """Wait until it can be looked at; False when something appears in `stop` first. Raises CameraStreamError."""
+        deadline_ns = time.monotonic_ns() + int(_START_TIMEOUT_S * 1e9)
+        while not self.poll():
+            if stop:
+                return False
+            if time.monotonic_ns() > deadline_ns:
+                raise CameraStreamError(f"the camera process was not ready within {_START_TIMEOUT_S:g} s")
+            time.sleep(0.02)
+        return True
+
+    def poll(self) -> bool:
+        """Take in what the process has said; whether that it is ready was among it. Raises CameraStreamError."""
+        assert self._process.stdout is not None
+        ready = False
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                chunk = os.read(self._process.stdout.fileno(), 65536)
+                if not chunk:
+                    raise CameraStreamError("the camera process has died; see its output above")
+                *lines, self._partial = (self._partial + chunk).split(b"\n")
+                for line in lines:
+                    event = json.loads(line)
+                    self.pictures += event["event"] == "picture"
+                    ready = ready or event["event"] == "ready"
+        return ready
+
+    def close(self) -> None:
+        """End the process; killed if it does not end by itself. May be called twice."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        if self._process.stdout.closed:
+            return
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._pose.close()
+
+
+def _event_pipe() -> TextIO:
+    """The pipe to the parent, for us alone: what a library prints to stdout goes to stderr from now on."""
+    pipe = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return pipe
+
+
+def _parent_lives() -> bool:
+    return not select.select([sys.stdin], [], [], 0)[0]
+
+
+def _tell(pipe: TextIO, **event: object) -> None:
+    pipe.write(json.dumps(event) + "\n")
+    pipe.flush()
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a camera frame as JPEG")
+    return data.tobytes()
+
+
+def _render_while_parent_lives(
+    world: CameraWorld, poses: SnapshotReader, shutter: Shutter, size: tuple[int, int], noise: SensorNoise, pipe: TextIO
+) -> None:
+    period_ns, next_ns = round(1e9 / RATE_HZ), time.monotonic_ns()
+    while _parent_lives():
+        left_s = (next_ns - time.monotonic_ns()) / 1e9
+        if not shutter.wanted or left_s > 0:
+            time.sleep(min(_IDLE_S, max(left_s, 0.002)))
+            continue
+        next_ns = max(next_ns + period_ns, time.monotonic_ns())
+        captured_ns = time.monotonic_ns()
+        try:
+            state = poses.read()
+        except TornSnapshotError as error:
+            # The physics is held up or has gone; the next look finds out which.
+            sys.stderr.write(f"edge-hil camera: a picture was left out: {error}\n")
+            continue
+        if state is not None:
+            shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
+            _tell(pipe, event="picture")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the camera process; ends when stdin does."""
+    parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
+    parser.add_argument("--scene", required=True)
+    parser.add_argument("--robot", required=True)
+    for name in ("people", "seed", "width", "height", "listen-fd", "pose-fd"):
+        parser.add_argument(f"--{name}", type=int, required=True)
+    args = parser.parse_args(argv)
+    # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    pipe, shutter, size = _event_pipe(), Shutter(), (args.width, args.height)
+    server = CameraServer(socket.socket(fileno=args.listen_fd), shutter)
+    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
+    poses = SnapshotReader(args.pose_fd, world.state_size)
+    noise = SensorNoise(args.width, args.height, args.seed)
+    threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()
+    # BrokenPipeError: the parent died between two looks at stdin.
+    with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
+        _tell(pipe, event="ready")
+        _render_while_parent_lives(world, poses, shutter, size, noise, pipe)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

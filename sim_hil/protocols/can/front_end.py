@@ -1,0 +1,327 @@
+"""CAN as a front end of `edge-hil`: the Carter's node on a bus of python-can, its camera beside it over HTTP.
+
+--link INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...], for example
+  serial:carter-can            a serial line; a path that does not exist becomes the client's end of a pty
+  socketcan:can0,camera=8091   a real bus, the camera on another port
+  serial:carter-can,drop=0.05,corrupt=0.01    a bus on which frames get lost and broken; see
+  sim_hil/protocols/can/shim.py
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.client_link import check_is_ours
+from firmware_bridge.core.config import ConfigError, runtime_dir
+from sim_hil.protocols.camera_stream import CameraStream
+from sim_hil.protocols.can import frames
+from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, open_bus
+from sim_hil.protocols.can.e2e import Frame
+from sim_hil.protocols.can.frames import Received
+from sim_hil.protocols.can.node import CanNode
+from sim_hil.protocols.can.pty_line import PtyLine
+from sim_hil.protocols.can.shim import FaultPlan, FaultShim
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.robots.carter.body import Carter
+from sim_hil.robots.carter.sensors import CarterSensors, Sensors
+from sim_hil.simulation.physics import Simulation
+
+if TYPE_CHECKING:
+    from sim_hil.protocols.can.faults import CanFaults
+
+CAMERA_PORT: Final = 8090
+_EVENT_S: Final = 0.1
+_SHOWN: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
+
+
+@dataclass(frozen=True)
+class LinkOptions:
+    """What `--link` says."""
+
+    address: BusAddress
+    camera_port: int = CAMERA_PORT
+    faults: FaultPlan = field(default_factory=FaultPlan)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.camera_port <= 65535:
+            raise ValueError(f"camera: expected a port of 0..65535, found {self.camera_port}")
+
+    @staticmethod
+    def parse(text: str | None) -> LinkOptions:
+        """From the command line; None: a pty in the user's runtime directory. Raises FrontEndError."""
+        if text is None:
+            text = f"serial:{_own_folder() / 'carter-can'}"
+        where, *settings = text.split(",")
+        try:
+            given: dict[str, Any] = {}
+            camera = [setting for setting in settings if setting.startswith("camera=")]
+            faults = [setting for setting in settings if not setting.startswith("camera=")]
+            if camera:
+                given["camera_port"] = _port(camera[-1].removeprefix("camera="))
+            if faults:
+                given["faults"] = FaultPlan.parse(",".join(faults))
+            return LinkOptions(BusAddress.parse(where), **given)
+        except ValueError as error:
+            raise FrontEndError(f"--link {text}: {error}") from error
+
+
+def _own_folder() -> Path:
+    """The user's runtime directory, made if there is none, and nobody else's: under /tmp anybody could have made it."""
+    folder = runtime_dir()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        check_is_ours(folder, "--link")
+    except OSError as error:
+        raise FrontEndError(f"{folder}: cannot be used: {error.strerror}; give another --link") from error
+    except ConfigError as error:
+        raise FrontEndError(str(error)) from error
+    return folder
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdecimal()):
+        raise ValueError(f"camera: expected a port of 0..65535, found {text!r}")
+    return int(text)
+
+
+class CommandLog:
+    """What has been commanded over the bus, for the result: what was heard, not what was meant."""
+
+    def __init__(self) -> None:
+        self._commands = 0
+        self._last_move: tuple[float, float, float] | None = None
+        self._last_command: str | None = None
+        self._at_zero = True
+
+    def note(self, received: Received) -> None:
+        """Count one frame that was obeyed."""
+        self._last_command = received.name
+        if received.name == "VelocityCommand":
+            self._commands += 1
+            self._last_move = (received.signals["Vx"], 0.0, received.signals["Wz"])
+            self._at_zero = not any(self._last_move)
+        elif (received.name, received.signals["Request"]) in (
+            ("EstopControl", frames.ESTOP_STOP),
+            ("ModeCommand", frames.MODE_DISARM),
+        ):
+            self._at_zero = True
+
+    def summary(self) -> dict[str, object]:
+        """The `wire` part of the result, without `malformed`."""
+        return {
+            "commands": self._commands,
+            "last_move": None if self._last_move is None else list(self._last_move),
+            "last_command": self._last_command,
+            "last_command_zero": self._at_zero,
+        }
+
+
+class CanFrontEnd:
+    """A simulated Carter answering on CAN."""
+
+    def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
+        """Raises FrontEndError, BusError or OSError when bus or camera cannot be had."""
+        self._options, self._address = options, link.address
+        self._node = CanNode(robot)
+        self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
+        self._faulty = link.faults != FaultPlan() or options.faults is not None
+        self._faults: CanFaults | None = None
+        self._inwards = FaultShim(link.faults, options.seed, 0)
+        self._outwards = FaultShim(link.faults, options.seed, 1)
+        self._log = CommandLog()
+        self._heard: list[Heard] = []
+        self._last_event: tuple[tuple[str, float], float] | None = None
+        self._now_s = 0.0
+        self._states = 0
+        self._line: PtyLine | None = None
+        self._link: BusLink | None = None
+        self._camera: CameraStream | None = None
+        try:
+            if options.faults is not None:
+                self._faults = _faults(options.faults, link.faults)
+            self._link = BusLink(open_bus(self._plugged_in(link.address)))
+            if options.camera_size is not None:
+                self._camera = CameraStream(
+                    options.scene_source,
+                    robot=options.robot,
+                    people=options.people,
+                    seed=options.seed,
+                    size=options.camera_size,
+                    port=link.camera_port,
+                    state_length=state_length,
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    def _plugged_in(self, address: BusAddress) -> BusAddress:
+        """The bus to open: for a serial path that does not exist, our end of a pty whose other end it becomes."""
+        path = Path(address.channel)
+        if address.interface != "serial":
+            return address
+        if path.is_symlink() and not path.exists():
+            path.unlink()  # left behind by a run that was killed: its pty has gone
+        if path.is_symlink() and str(path.resolve()).startswith("/dev/pts/"):
+            raise FrontEndError(
+                f"--link {address}: expected a free path, found the line of another run; end that, or remove the link"
+            )
+        if path.exists():
+            return address
+        try:
+            self._line = PtyLine(path)
+        except OSError as error:
+            raise FrontEndError(f"--link {address}: expected a path for a pty, {error.strerror}") from error
+        return BusAddress("serial", self._line.near)
+
+    def where(self) -> str:
+        """Bus and camera."""
+        camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
+        return f"CAN {self._address}, {camera}"
+
+    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
+        """Wait for the camera. Raises CameraStreamError."""
+        if self._camera is None:
+            return True
+        self._camera.show(render_state)
+        return self._camera.wait_ready(stop)
+
+    def wait(self, left_ns: int) -> None:
+        """Until a frame arrives."""
+        assert self._link is not None
+        self._link.wait(left_ns)
+
+    def serve(self) -> list[Heard]:
+        """Obey what has arrived. Raises BusError when the bus has gone."""
+        assert self._link is not None
+        for received_ns, frame in self._link.receive():
+            if self._faulty:
+                self._inwards.put(frame, self._now_s)
+            else:
+                self._hear(frame, received_ns)
+        self._hear_late()
+        if self._camera is not None:
+            self._camera.poll()
+        heard, self._heard = self._heard, []
+        return heard
+
+    def _hear_late(self) -> None:
+        if self._faulty:
+            for frame in self._inwards.take(self._now_s):
+                self._hear(frame, time.monotonic_ns())
+
+    def _hear(self, frame: Frame, received_ns: int) -> None:
+        received = self._node.receive(frame, self._now_s)
+        if received is None or received.name not in _SHOWN:
+            return
+        stop = received.name == "EstopControl" and received.signals.get("Request") == frames.ESTOP_STOP
+        if (received.good or stop) and not self._again(received):
+            self._log.note(received)
+            content = " ".join(f"{key}={received.signals[key]:g}" for key in _SHOWN[received.name])
+            self._heard.append(Heard(received_ns, "can", frame.identifier, received.name, content))
+
+    def _again(self, received: Received) -> bool:
+        """Whether this is one more frame of an event that is sent three times."""
+        if received.name == "VelocityCommand":
+            return False
+        event, last = (received.name, received.signals["Request"]), self._last_event
+        self._last_event = (event, self._now_s)
+        return last is not None and last[0] == event and self._now_s - last[1] < _EVENT_S
+
+    def publish(self, step: int, stamp_s: float) -> None:
+        """Let the node's clock go on, and send what is due."""
+        assert self._link is not None
+        self._now_s = stamp_s
+        self._heed_faults()
+        self._hear_late()
+        self._node.step(stamp_s)
+        due = self._node.due(stamp_s, self._read)
+        if self._faulty:
+            for frame in due:
+                self._outwards.put(frame, stamp_s)
+            # The bus's own error frames are seen by each node for itself.
+            due = [frame for frame in self._outwards.take(stamp_s) if not frame.error]
+        for frame in due:
+            self._states += frame.identifier == _MOTION_ID
+            self._link.send(frame)
+
+    def _heed_faults(self) -> None:
+        if self._faults is None:
+            return
+        self._faults.poll()
+        self._node.button = self._faults.button
+        for shim in (self._inwards, self._outwards):
+            shim.plan, shim.held_off = self._faults.plan, self._faults.bus_off
+
+    @property
+    def pending(self) -> int:
+        """Frames that wait for the bus."""
+        return 0 if self._link is None else self._link.pending
+
+    def _read(self) -> Sensors:
+        return self._sensors.read(self._now_s)
+
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """Hand the camera process what it renders from now on."""
+        if self._camera is not None:
+            self._camera.show(render_state)
+
+    def close(self) -> None:
+        """End the camera process, leave the bus, remove the pty and the faults' socket."""
+        if self._faults is not None:
+            self._faults.close()
+        if self._camera is not None:
+            self._camera.close()
+        if self._link is not None:
+            self._link.close()
+        if self._line is not None:
+            self._line.close()
+
+    def summary(self) -> dict[str, object]:
+        """What was heard and sent."""
+        counts, link = self._node.counts, self._link
+        line_errors, sent, unsent = (0, 0, 0) if link is None else (link.line_errors, link.sent, link.unsent)
+        can = {
+            "wrong_crc": counts.wrong_crc,
+            "wrong_length": counts.wrong_length,
+            "wrong_counter": counts.wrong_counter,
+            "lost": counts.lost,
+            "unknown": counts.unknown,
+            "bus_offs": counts.bus_offs,
+            "error_frames": counts.error_frames,
+            "line_errors": line_errors,
+            "sent": sent,
+            "unsent": unsent,
+        }
+        return {
+            "wire": {**self._log.summary(), "malformed": counts.malformed + line_errors, "can": can},
+            "video_frames": 0 if self._camera is None else self._camera.pictures,
+            "states": self._states,
+        }
+
+
+def _faults(path: Path, plan: FaultPlan) -> CanFaults:
+    # Imported here: without --faults nobody can press anything from outside.
+    from sim_hil.protocols.can.faults import CanFaults
+
+    return CanFaults(path, plan)
+
+
+_MOTION_ID: Final = frames.database().get_message_by_name("OdometryMotion").frame_id
+
+
+def open_front_end(simulation: Simulation, options: FrontEndOptions) -> CanFrontEnd:
+    """The front end of `--protocol can`. Raises FrontEndError or OSError."""
+    robot = simulation.robot
+    if not isinstance(robot, Carter):
+        raise FrontEndError(f"--protocol can: expected the Carter, found a {type(robot).__name__}")
+    try:
+        return CanFrontEnd(robot, options, LinkOptions.parse(options.link), len(simulation.render_state()))
+    except BusError as error:
+        raise FrontEndError(str(error)) from error

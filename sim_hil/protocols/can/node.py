@@ -1,0 +1,274 @@
+"""The base's CAN node: what it obeys, when it stops by itself, what it reports. Pure: no clock, no bus.
+
+States: idle -> armed -> idle, and emergency stop from anywhere, latched until it is reset. Every time is the robot's
+own clock, s. The limits are those of a wheeled robot's firmware that has no driver to fall back on: 100 ms without a
+good velocity command stop the base (openpilot's body: 100 ms), 500 ms without the controller's heartbeat disarm it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from edge.core.geometry import wrap_angle
+from sim_hil.protocols.can import frames
+from sim_hil.protocols.can.e2e import Frame, Verdict
+from sim_hil.protocols.can.frames import Decoder, Encoder, Received
+from sim_hil.robots.carter.sensors import Sensors
+
+COMMAND_TIMEOUT_S: Final = 0.100
+HEARTBEAT_TIMEOUT_S: Final = 0.500
+# A node may come back 128 x 11 recessive bits after it went off (ISO 11898-1: 2.8 ms at 500 kbit/s); ours waits longer,
+# as Linux does with "restart-ms 100".
+BUS_OFF_RECOVERY_S: Final = 0.100
+BATTERY_LOW_PERCENT: Final = 10.0
+# Error classes of the kernel's error frames (linux/can/error.h).
+ERROR_BUS_OFF: Final = 0x040
+ERROR_RESTARTED: Final = 0x100
+_TICK_S: Final = 1e-6  # a sum of steps is not exact
+_LEVELS: Final = ("CommandTimeout", "HeartbeatLost", "BatteryLow", "DriveOverload")
+_SIDES: Final = ("Front", "Rear", "Left", "Right")
+
+
+class Base(Protocol):
+    """What the node asks of the robot."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether a velocity would be obeyed."""
+        ...
+
+    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
+        """Take a velocity."""
+        ...
+
+    def stand(self) -> None:
+        """Power the drive."""
+        ...
+
+    def rest(self) -> None:
+        """Brake, without power afterwards."""
+        ...
+
+    def press_estop(self) -> None:
+        """Brake hard."""
+        ...
+
+    def release_estop(self) -> None:
+        """Let the drive be powered again."""
+        ...
+
+
+@dataclass
+class Counts:
+    """What was received and not obeyed, and how often the bus was off."""
+
+    wrong_crc: int = 0
+    wrong_length: int = 0
+    wrong_counter: int = 0
+    lost: int = 0
+    unknown: int = 0
+    bus_offs: int = 0
+    error_frames: int = 0
+
+    @property
+    def malformed(self) -> int:
+        """Frames that no correct sender makes; one for somebody else on the bus is none of them."""
+        return self.wrong_crc + self.wrong_length
+
+
+class CanNode:
+    """One base on one bus: `receive` every frame, then `step` and `due` after every physics step."""
+
+    def __init__(self, base: Base) -> None:
+        self._base = base
+        self._decoder = Decoder("Controller")
+        self._encoder = Encoder()
+        self.counts = Counts()
+        self.button = False
+        self.state = frames.STATE_IDLE
+        self._source = frames.SOURCE_NONE
+        self._command_s: float | None = None
+        self._heartbeat_s: float | None = None
+        self._bus_off_until_s: float | None = None
+        self._periods = frames.periods_s("Base")
+        self._next_s = dict.fromkeys(self._periods, 0.0)
+        self._told: dict[str, dict[str, float]] = {}
+        self._low_battery = False
+
+    @property
+    def bus_off(self) -> bool:
+        """Whether it takes no part in the bus now."""
+        return self._bus_off_until_s is not None
+
+    def receive(self, frame: Frame, now_s: float) -> Received | None:
+        """Obey a frame if it may be obeyed; None for an error frame and for one that is not for the base."""
+        if frame.error:
+            self._bus_error(frame.identifier, now_s)
+            return None
+        if self.bus_off:
+            return None
+        received = self._decoder.decode(frame)
+        if received is None:
+            self.counts.unknown += 1
+            return None
+        self._count(received)
+        if received.name == "EstopControl":
+            self._estop_control(received)
+        elif received.good:
+            self._obey(received, now_s)
+        return received
+
+    def _count(self, received: Received) -> None:
+        counts = self.counts
+        counts.lost += received.newly_lost
+        counts.wrong_crc += received.verdict is Verdict.WRONG_CRC
+        counts.wrong_length += received.verdict is Verdict.WRONG_LENGTH
+        counts.wrong_counter += received.verdict in (Verdict.REPEATED, Verdict.OUT_OF_ORDER)
+
+    def _estop_control(self, received: Received) -> None:
+        request = received.signals.get("Request", frames.ESTOP_NONE)
+        # To stop, a frame need not be new, only whole: a repeated stop does no harm.
+        if request == frames.ESTOP_STOP:
+            self._stop(frames.SOURCE_BUS)
+        elif request == frames.ESTOP_RESET and received.good and not self.button:
+            self._reset()
+
+    def _obey(self, received: Received, now_s: float) -> None:
+        if received.name == "ControllerHeartbeat":
+            self._heartbeat_s = now_s
+        elif received.name == "VelocityCommand":
+            self._command_s = now_s
+            if self.state == frames.STATE_ARMED:
+                self._base.command(received.signals["Vx"], 0.0, received.signals["Wz"])
+        elif received.name == "ModeCommand" and received.signals["Request"] == frames.MODE_DISARM:
+            self._disarm()
+        elif received.name == "ModeCommand" and received.signals["Request"] == frames.MODE_ARM:
+            self._arm(now_s)
+
+    def _arm(self, now_s: float) -> None:
+        if self.state == frames.STATE_IDLE and self._heartbeat_alive(now_s) and not self._low_battery:
+            self.state = frames.STATE_ARMED
+            self._command_s = now_s  # the first command has as long as every other
+            self._base.stand()
+
+    def _disarm(self) -> None:
+        if self.state == frames.STATE_ARMED:
+            self.state = frames.STATE_IDLE
+            self._base.rest()
+
+    def _stop(self, source: int) -> None:
+        if self.state != frames.STATE_ESTOP:
+            self.state, self._source = frames.STATE_ESTOP, source
+            self._base.press_estop()
+
+    def _reset(self) -> None:
+        if self.state == frames.STATE_ESTOP:
+            self.state, self._source = frames.STATE_IDLE, frames.SOURCE_NONE
+            self._base.release_estop()
+
+    def _bus_error(self, classes: int, now_s: float) -> None:
+        self.counts.error_frames += 1
+        if classes & ERROR_RESTARTED:
+            self._bus_off_until_s = None
+        elif classes & ERROR_BUS_OFF and not self.bus_off:
+            self.counts.bus_offs += 1
+            self._bus_off_until_s = now_s + BUS_OFF_RECOVERY_S
+            self._heartbeat_s = None
+            self._decoder.forget_all()
+            self._disarm()
+
+    def _heartbeat_alive(self, now_s: float) -> bool:
+        return self._heartbeat_s is not None and now_s - self._heartbeat_s <= HEARTBEAT_TIMEOUT_S
+
+    def _timed_out(self, now_s: float) -> bool:
+        return self._command_s is None or now_s - self._command_s > COMMAND_TIMEOUT_S + _TICK_S
+
+    def step(self, now_s: float) -> None:
+        """Stop when nobody has commanded in time; come back to the bus; heed the red button."""
+        if self._bus_off_until_s is not None and now_s >= self._bus_off_until_s:
+            self._bus_off_until_s = None
+        if self.button:
+            self._stop(frames.SOURCE_BUTTON)
+        if self._heartbeat_s is not None and not self._heartbeat_alive(now_s):
+            self._heartbeat_s = None
+            self._decoder.forget("ControllerHeartbeat")
+            self._disarm()
+        if self._command_s is not None and self._timed_out(now_s):
+            self._command_s = None
+            self._decoder.forget("VelocityCommand")
+            if self.state == frames.STATE_ARMED:
+                self._base.command(0.0, 0.0, 0.0)
+
+    def due(self, now_s: float, read: Callable[[], Sensors]) -> list[Frame]:
+        """The frames to be sent now; `read` is called when there is one. Nothing while the bus is off."""
+        if self.bus_off:
+            return []
+        names = [name for name, at_s in self._next_s.items() if now_s >= at_s]
+        changed = self._state_has_changed()
+        if not names and not changed:
+            return []
+        sensors = read()
+        self._low_battery = sensors.charge_percent <= BATTERY_LOW_PERCENT
+        made = []
+        for name in names:
+            # From the last date on, so that the rate is kept; not after a standstill, which would bring a burst.
+            self._next_s[name] = max(self._next_s[name] + self._periods[name], now_s)
+            made.append(self._make(name, now_s, sensors))
+        for name in ("EstopState", "Faults"):
+            if name not in names and self._told.get(name) != self._levels(name, sensors, now_s):
+                made.append(self._make(name, now_s, sensors))
+        return made
+
+    def _state_has_changed(self) -> bool:
+        """Whether the emergency stop's state differs from what was told; fault bits are looked at on every report."""
+        return self._told.get("EstopState") != self._estop_signals()
+
+    def _estop_signals(self) -> dict[str, float]:
+        latched = self.state == frames.STATE_ESTOP
+        return {"Latched": float(latched), "Button": float(self.button), "Source": float(self._source)}
+
+    def _levels(self, name: str, sensors: Sensors, now_s: float) -> dict[str, float]:
+        """The part of a report whose change is told at once."""
+        if name == "EstopState":
+            return self._estop_signals()
+        late = self.state == frames.STATE_ARMED and self._timed_out(now_s)
+        levels = (late, not self._heartbeat_alive(now_s), self._low_battery, sensors.overload)
+        return {
+            **{key: float(value) for key, value in zip(_LEVELS, levels, strict=True)},
+            **{f"Bumper{side}": float(hit) for side, hit in zip(_SIDES, sensors.bumpers, strict=True)},
+        }
+
+    def _make(self, name: str, now_s: float, sensors: Sensors) -> Frame:
+        if name in ("EstopState", "Faults"):
+            self._told[name] = self._levels(name, sensors, now_s)
+        return self._encoder.encode(name, **self._signals(name, now_s, sensors))
+
+    def _signals(self, name: str, now_s: float, sensors: Sensors) -> dict[str, float]:
+        left_right = {
+            "WheelSpeeds": sensors.wheel_radps,
+            "WheelTorques": sensors.wheel_nm,
+            "WheelCounts": tuple(count % frames.COUNTS_MODULUS for count in sensors.wheel_counts),
+        }
+        vectors = {"ImuGyro": sensors.gyro_radps, "ImuAccel": sensors.accel_mps2}
+        if name in left_right:
+            return dict(zip(("Left", "Right"), left_right[name], strict=True))
+        if name in vectors:
+            return dict(zip(("X", "Y", "Z"), vectors[name], strict=True))
+        if name == "OdometryPosition":
+            return {"X": sensors.T_odom_base.x_m, "Y": sensors.T_odom_base.y_m}
+        if name == "OdometryMotion":
+            heading = wrap_angle(sensors.T_odom_base.theta_rad)
+            return {"Heading": heading, "Vx": sensors.v_mps, "Wz": sensors.w_radps}
+        if name == "Battery":
+            return {"Charge": sensors.charge_percent, "Voltage": sensors.voltage_v, "Current": sensors.current_a}
+        if name == "BaseHeartbeat":
+            return {"State": self.state, "Version": frames.PROTOCOL_VERSION, "Uptime": frames.uptime_s(now_s)}
+        if name == "EstopState":
+            return self._estop_signals()
+        counts = self.counts
+        told = (counts.wrong_crc + counts.wrong_length, counts.wrong_counter, counts.lost, counts.unknown)
+        keys = ("CrcErrors", "CounterErrors", "LostFrames", "UnknownFrames")
+        modulo = {key: float(count % 256) for key, count in zip(keys, told, strict=True)}
+        return {**self._levels("Faults", sensors, now_s), **modulo, "BusOffs": float(counts.bus_offs % 256)}

@@ -1,0 +1,1 @@
+"""The Carter as a MAVLink rover on UDP."""

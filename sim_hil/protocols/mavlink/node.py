@@ -1,0 +1,272 @@
+"""The rover's MAVLink component: what every message does and what is answered, and the reports that are due. No wire.
+
+Everything that it sends goes to everybody who listens, as on one radio: an acknowledgement names whom it is for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final
+
+from pymavlink.dialects.v20 import common
+
+from sim_hil.protocols.mavlink import commands, parameters, telemetry
+from sim_hil.protocols.mavlink.commands import Command
+from sim_hil.protocols.mavlink.estimator import TiltFilter
+from sim_hil.protocols.mavlink.modes import custom_mode_of
+from sim_hil.protocols.mavlink.parameters import Parameters
+from sim_hil.protocols.mavlink.setpoints import SetpointError, Sticks, manual_sticks, override_sticks, read_setpoint
+from sim_hil.protocols.mavlink.vehicle import Base, Health, Station, Vehicle
+from sim_hil.protocols.mavlink.wire import Counts, Message
+from sim_hil.robots.carter.sensors import Sensors
+
+COMPONENT: Final = common.MAV_COMP_ID_AUTOPILOT1
+READ_S: Final = 1 / telemetry.MAX_HZ
+_TEXT_BYTES: Final = 50
+_FTP_NAK: Final = 129
+_FTP_FILE_NOT_FOUND: Final = 10
+_MAX_WAITING_PARAMETERS: Final = 2 * len(parameters.NAMES)
+_PARAMETERS_A_STEP: Final = 2  # a list is no burst
+
+
+class MavlinkNode:
+    """One rover on one link: `receive` every message, then `step` and `due` after every physics step."""
+
+    def __init__(
+        self, base: Base, read: Callable[[], Sensors], counts: Counts, parameter_values: Parameters | None = None
+    ) -> None:
+        """`read` gives the sensors' reading of now; `counts` are the reader's."""
+        self.parameters = parameter_values or Parameters()
+        self.vehicle = Vehicle(base, self.parameters)
+        self.schedule = telemetry.Schedule()
+        self.counts = counts
+        self._read = read
+        self._tilt = TiltFilter()
+        self._sensors: Sensors | None = None
+        self._now_s = self._stamp_s = 0.0
+        self._next_read_s = 0.0
+        self._outbox: list[Message] = []
+        self._after_ack: list[Message] = []
+        self._waiting: list[str] = []
+        self._told_state: tuple[object, ...] | None = None
+        self._complained: set[str] = set()
+
+    @property
+    def system(self) -> int:
+        """Its MAVLink number."""
+        return int(self.parameters["MAV_SYS_ID"])
+
+    def send_after_ack(self, message: Message) -> None:
+        """Send what a command asks for, behind its acknowledgement."""
+        self._after_ack.append(message)
+
+    def picture(self) -> telemetry.Picture:
+        """What reports are made of, as of the latest reading."""
+        if self._sensors is None:
+            self._look(self._now_s)
+        assert self._sensors is not None
+        return telemetry.Picture(
+            self._stamp_s,
+            self._sensors,
+            self._tilt.roll_rad,
+            self._tilt.pitch_rad,
+            self.vehicle,
+            self.counts.malformed,
+            self.parameters["BAT_LOW_THR"],
+        )
+
+    def receive(self, message: Message, station: Station, now_s: float) -> bool:
+        """Obey and answer one message; whether it asked for something that has to do with moving."""
+        handler = HANDLERS.get(message.get_msgId())
+        if handler is None:
+            return False
+        target = getattr(message, "target_system", getattr(message, "target", 0))
+        if target not in (0, self.system) or getattr(message, "target_component", 0) not in (0, COMPONENT):
+            self.counts.not_for_us += 1
+            return False
+        self._now_s = now_s
+        try:
+            return handler(self, message, station, now_s)
+        except SetpointError as error:
+            self.counts.unusable += 1
+            if str(error) not in self._complained and len(self._complained) < 20:
+                self._complained.add(str(error))  # once: it comes with 20 Hz
+                self.vehicle.say(common.MAV_SEVERITY_WARNING, str(error))
+            return False
+
+    def step(self, now_s: float) -> None:
+        """Let time pass."""
+        self._now_s = now_s
+        if now_s >= self._next_read_s:
+            self._next_read_s = max(self._next_read_s + READ_S, now_s)
+            self._look(now_s)
+            self.vehicle.forget_silent(now_s)
+        self.vehicle.step(now_s)
+
+    def _look(self, now_s: float) -> None:
+        sensors = self._sensors = self._read()
+        self._stamp_s = now_s
+        self._tilt.step(now_s, sensors.gyro_radps, sensors.accel_mps2)
+        tilt = max(abs(self._tilt.roll_rad), abs(self._tilt.pitch_rad))
+        self.vehicle.health = Health(sensors.charge_percent / 100, tilt, -sensors.T_odom_base.theta_rad)
+
+    def due(self, now_s: float) -> list[Message]:
+        """Answers, lines of text and reports to be sent now; a heartbeat at once when its content has changed."""
+        made = self.answers()
+        numbers = self.schedule.due(now_s)
+        state = (self.vehicle.armed, self.vehicle.mode, self.vehicle.estop)
+        if state != self._told_state:
+            self._told_state = state
+            numbers.append(common.MAVLINK_MSG_ID_HEARTBEAT)
+        made += [telemetry.STREAMS[number].make(self.picture()) for number in dict.fromkeys(numbers)]
+        for name in self._waiting[:_PARAMETERS_A_STEP]:
+            made.append(self.parameters.message(name))
+        del self._waiting[:_PARAMETERS_A_STEP]
+        return made
+
+    def answers(self) -> list[Message]:
+        """What is to be said at once: acknowledgements and lines of text."""
+        made, self._outbox = self._outbox, []
+        for severity, text in self.vehicle.take_texts():
+            made.append(common.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES]))
+        return made
+
+    def answer(self, message: Message) -> None:
+        """Send it as soon as possible."""
+        self._outbox.append(message)
+
+    # Handlers
+
+    def _heartbeat(self, message: Message, station: Station, now_s: float) -> bool:
+        self.vehicle.heartbeat(station, now_s)  # whatever it says that it is: not only ground stations drive
+        return False
+
+    def _command(self, message: Message, station: Station, now_s: float) -> bool:
+        command = Command.of(message)
+        result = commands.obey(self, station, command, now_s)
+        self.answer(
+            common.MAVLink_command_ack_message(
+                command.number, result, 255, 0, message.get_srcSystem(), message.get_srcComponent()
+            )
+        )
+        self._outbox += self._after_ack
+        self._after_ack = []
+        return command.number in _MOVING
+
+    def _set_mode(self, message: Message, station: Station, now_s: float) -> bool:
+        mode = None
+        if message.base_mode & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            mode = custom_mode_of(message.custom_mode)
+        self.vehicle.set_mode(station, mode, now_s)
+        return True
+
+    def _setpoint(self, message: Message, station: Station, now_s: float) -> bool:
+        return self.vehicle.setpoint(station, read_setpoint(message), now_s)
+
+    def _manual(self, message: Message, station: Station, now_s: float) -> bool:
+        return self.vehicle.sticks(station, manual_sticks(message), now_s)
+
+    def _override(self, message: Message, station: Station, now_s: float) -> bool:
+        sticks: Sticks | None = override_sticks(message)
+        return self.vehicle.sticks(station, sticks, now_s)
+
+    def _parameter_list(self, message: Message, station: Station, now_s: float) -> bool:
+        self._wait(parameters.NAMES)
+        return False
+
+    def _parameter_read(self, message: Message, station: Station, now_s: float) -> bool:
+        index = message.param_index
+        if index == -1 and message.param_id in parameters.TABLE:
+            self._wait((message.param_id,))
+        elif 0 <= index < len(parameters.NAMES):
+            self._wait((parameters.NAMES[index],))
+        return False
+
+    def _parameter_set(self, message: Message, station: Station, now_s: float) -> bool:
+        name: str | None = message.param_id
+        if self.vehicle.may_change(station, now_s):
+            name = self.parameters.set(message)
+        if name in parameters.TABLE:
+            self._wait((str(name),))
+        return False
+
+    def _wait(self, names: tuple[str, ...]) -> None:
+        """Send these parameters in the next steps; whoever asks without end does not fill the memory."""
+        self._waiting = (self._waiting + list(names))[:_MAX_WAITING_PARAMETERS]
+
+    def _mission_list(self, message: Message, station: Station, now_s: float) -> bool:
+        self.answer(
+            common.MAVLink_mission_count_message(
+                message.get_srcSystem(), message.get_srcComponent(), 0, message.mission_type
+            )
+        )
+        return False
+
+    def _mission_clear(self, message: Message, station: Station, now_s: float) -> bool:
+        return self._mission_answer(message, common.MAV_MISSION_ACCEPTED)  # there is none
+
+    def _mission_upload(self, message: Message, station: Station, now_s: float) -> bool:
+        return self._mission_answer(message, common.MAV_MISSION_UNSUPPORTED)
+
+    def _mission_answer(self, message: Message, result: int) -> bool:
+        self.answer(
+            common.MAVLink_mission_ack_message(
+                message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
+            )
+        )
+        return False
+
+    def _file_transfer(self, message: Message, station: Station, now_s: float) -> bool:
+        """There are no files: a refusal at once, instead of a client that waits for its time to run out."""
+        number, session, opcode = message.payload[0] | message.payload[1] << 8, message.payload[2], message.payload[3]
+        head = ((number + 1) & 0xFFFF).to_bytes(2, "little") + bytes((session, _FTP_NAK, 1, opcode, 0, 0))
+        payload = (head + bytes(4) + bytes((_FTP_FILE_NOT_FOUND,))).ljust(251, b"\0")
+        self.answer(
+            common.MAVLink_file_transfer_protocol_message(
+                0, message.get_srcSystem(), message.get_srcComponent(), list(payload)
+            )
+        )
+        return False
+
+    def _timesync(self, message: Message, station: Station, now_s: float) -> bool:
+        if message.tc1 == 0:  # a question; anything else is an answer
+            self.answer(common.MAVLink_timesync_message(round(now_s * 1e9), message.ts1))
+        return False
+
+    def _ping(self, message: Message, station: Station, now_s: float) -> bool:
+        if message.target_system == 0:
+            self.answer(
+                common.MAVLink_ping_message(
+                    message.time_usec, message.seq, message.get_srcSystem(), message.get_srcComponent()
+                )
+            )
+        return False
+
+
+_MOVING: Final = (
+    common.MAV_CMD_COMPONENT_ARM_DISARM,
+    common.MAV_CMD_DO_SET_MODE,
+    common.MAV_CMD_DO_FLIGHTTERMINATION,
+)
+Handler = Callable[[MavlinkNode, Message, Station, float], bool]
+HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
+    {
+        common.MAVLINK_MSG_ID_HEARTBEAT: MavlinkNode._heartbeat,
+        common.MAVLINK_MSG_ID_COMMAND_LONG: MavlinkNode._command,
+        common.MAVLINK_MSG_ID_COMMAND_INT: MavlinkNode._command,
+        common.MAVLINK_MSG_ID_SET_MODE: MavlinkNode._set_mode,
+        common.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: MavlinkNode._setpoint,
+        common.MAVLINK_MSG_ID_MANUAL_CONTROL: MavlinkNode._manual,
+        common.MAVLINK_MSG_ID_RC_CHANNELS_OVERRIDE: MavlinkNode._override,
+        common.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: MavlinkNode._parameter_list,
+        common.MAVLINK_MSG_ID_PARAM_REQUEST_READ: MavlinkNode._parameter_read,
+        common.MAVLINK_MSG_ID_PARAM_SET: MavlinkNode._parameter_set,
+        common.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: MavlinkNode._mission_list,
+        common.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: MavlinkNode._mission_clear,
+        common.MAVLINK_MSG_ID_MISSION_COUNT: MavlinkNode._mission_upload,
+        common.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: MavlinkNode._file_transfer,
+        common.MAVLINK_MSG_ID_TIMESYNC: MavlinkNode._timesync,
+        common.MAVLINK_MSG_ID_PING: MavlinkNode._ping,
+    }
+)

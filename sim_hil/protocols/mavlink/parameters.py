@@ -1,0 +1,102 @@
+"""The vehicle's parameters: a small table, each with a range, sent as PX4 does (integers bytewise in the float)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite
+from types import MappingProxyType
+from typing import Final
+
+from pymavlink.dialects.v20 import common
+
+from sim_hil.protocols.mavlink.wire import Message
+
+NAME_BYTES: Final = 16
+_INT: Final = common.MAV_PARAM_TYPE_INT32
+_REAL: Final = common.MAV_PARAM_TYPE_REAL32
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a parameter may be; `integer` decides its type on the wire."""
+
+    default: float
+    low: float
+    high: float
+    integer: bool = False
+
+    @property
+    def wire_type(self) -> int:
+        """MAV_PARAM_TYPE."""
+        return int(_INT if self.integer else _REAL)
+
+
+# Names are PX4's where it has one of the same meaning.
+TABLE: Final[Mapping[str, Parameter]] = MappingProxyType(
+    {
+        "BAT_LOW_THR": Parameter(0.10, 0.0, 0.9),  # charge below which it is not armed
+        "COM_ARM_TILT": Parameter(25.0, 5.0, 60.0),  # degrees beyond which it is not armed
+        "COM_DISARM_GCS": Parameter(2.0, 0.0, 60.0),  # s after the loss of the station
+        "COM_DL_LOSS_T": Parameter(3.5, 1.5, 60.0),  # s without the station's heartbeat: three are missed
+        "COM_OF_LOSS_T": Parameter(0.5, 0.1, 1.0),  # s without a setpoint; the drive itself waits for 1 s
+        "MAV_GCS_SYSID": Parameter(0, 0, 255, integer=True),  # the only station that may drive; 0: the first
+        "MAV_SYS_ID": Parameter(1, 1, 255, integer=True),
+        "RO_MAN_SPEED": Parameter(0.6, 0.1, 1.5),  # m/s at full stick
+        "RO_MAN_YAW_RATE": Parameter(60.0, 10.0, 115.0),  # degrees/s at full stick
+        "RO_SPEED_LIM": Parameter(1.5, 0.1, 1.5),  # m/s
+        "RO_YAW_RATE_LIM": Parameter(115.0, 10.0, 115.0),  # degrees/s
+    }
+)
+NAMES: Final = tuple(TABLE)
+_READ_ONLY: Final = ("MAV_SYS_ID",)  # a station has learned it; given on the command line
+
+
+class Parameters:
+    """The values of one vehicle."""
+
+    def __init__(self, **given: float) -> None:
+        """`given`: other values than the defaults. Raises ValueError."""
+        self._values = {name: parameter.default for name, parameter in TABLE.items()}
+        for name, value in given.items():
+            if name not in TABLE or not _fits(TABLE[name], value):
+                raise ValueError(f"parameter {name}: expected a known name and a value in its range, found {value}")
+            self._values[name] = float(value)
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def set(self, message: Message) -> str | None:
+        """Obey a PARAM_SET; the name, also when the value is refused, None for an unknown one."""
+        name = message.param_id
+        if name not in TABLE:
+            return None
+        value = decode_value(message.param_value, message.param_type)
+        parameter = TABLE[name]
+        if message.param_type == parameter.wire_type and name not in _READ_ONLY and _fits(parameter, value):
+            self._values[name] = value
+        return str(name)
+
+    def message(self, name: str) -> Message:
+        """A PARAM_VALUE."""
+        parameter, value = TABLE[name], self._values[name]
+        wire = _from_int(round(value)) if parameter.integer else value
+        return common.MAVLink_param_value_message(
+            name.encode("ascii"), wire, parameter.wire_type, len(NAMES), NAMES.index(name)
+        )
+
+
+def _fits(parameter: Parameter, value: float) -> bool:
+    return isfinite(value) and parameter.low <= value <= parameter.high
+
+
+def _from_int(value: int) -> float:
+    return float(struct.unpack("<f", struct.pack("<i", value))[0])
+
+
+def decode_value(value: float, wire_type: int) -> float:
+    """The number that a PARAM_SET or PARAM_VALUE carries."""
+    if wire_type == _INT:
+        return float(struct.unpack("<i", struct.pack("<f", value))[0])
+    return value

@@ -1,0 +1,307 @@
+"""The rover: who may drive it, in which mode, what it obeys, when it stops by itself. Pure: no clock, no wire.
+
+Every time is the robot's own clock, s. One station is in control: the first that asks for something that moves the
+base; it stays so until it disarms the base or falls silent. Everybody may watch, and everybody may stop it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import degrees, radians
+from typing import Final, NamedTuple, Protocol
+
+from pymavlink.dialects.v20 import common
+
+from sim_hil.protocols.mavlink.modes import Mode
+from sim_hil.protocols.mavlink.parameters import Parameters
+from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
+
+_COMMAND_S: Final = 0.02  # a setpoint in the local frame is turned into the base's own again and again
+_STOP: Final = (0.0, 0.0, 0.0)
+_SEVERITY_STOPPED: Final = common.MAV_SEVERITY_CRITICAL
+_SEVERITY_REFUSED: Final = common.MAV_SEVERITY_WARNING
+_SEVERITY_NEWS: Final = common.MAV_SEVERITY_INFO
+ACCEPTED: Final[int] = common.MAV_RESULT_ACCEPTED
+REJECTED: Final[int] = common.MAV_RESULT_TEMPORARILY_REJECTED
+DENIED: Final[int] = common.MAV_RESULT_DENIED
+FAILED: Final[int] = common.MAV_RESULT_FAILED
+_MAX_TEXTS: Final = 20
+
+
+class Base(Protocol):
+    """What the vehicle asks of the robot."""
+
+    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
+        """Take a velocity."""
+        ...
+
+    def stand(self) -> None:
+        """Power the drive."""
+        ...
+
+    def rest(self) -> None:
+        """Brake, without power afterwards."""
+        ...
+
+    def press_estop(self) -> None:
+        """Brake hard."""
+        ...
+
+    def release_estop(self) -> None:
+        """Let the drive be powered again."""
+        ...
+
+
+class Station(NamedTuple):
+    """Who sends: MAVLink's number alone does not tell two ground stations with the same one apart."""
+
+    system: int
+    address: tuple[str, int]
+
+
+class Text(NamedTuple):
+    """One line for the operator; `severity` is MAV_SEVERITY."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Health:
+    """What arming depends on: charge 0 to 1, tilt of the base, rad, and its yaw in the local frame, rad."""
+
+    charge: float = 1.0
+    tilt_rad: float = 0.0
+    yaw_rad: float = 0.0
+
+
+class Vehicle:
+    """One rover; `step` after every physics step."""
+
+    def __init__(self, base: Base, parameters: Parameters) -> None:
+        self._base = base
+        self._parameters = parameters
+        self.armed = False
+        self.mode = Mode.HOLD
+        self.estop = False
+        self.button = False
+        self.health = Health()
+        self.controller: Station | None = None
+        self.refused_setpoints = 0
+        self._heartbeats_s: dict[Station, float] = {}
+        self._controller_s = 0.0
+        self._setpoint: Setpoint | None = None
+        self._setpoint_s = -1e9
+        self._sticks: Sticks | None = None
+        self._sticks_s = -1e9
+        self._station_lost = False
+        self._next_command_s = 0.0
+        self._texts: list[Text] = []
+
+    def take_texts(self) -> list[Text]:
+        """Lines since the last call."""
+        texts, self._texts = self._texts, []
+        return texts
+
+    def say(self, severity: int, text: str) -> None:
+        """Tell the operator; a flood of lines is cut off."""
+        if len(self._texts) < _MAX_TEXTS:
+            self._texts.append(Text(severity, text))
+
+    # Who is there
+
+    def heartbeat(self, station: Station, now_s: float) -> None:
+        """A ground station lives."""
+        self._heartbeats_s[station] = now_s
+        if station == self.controller:
+            self._controller_s = now_s
+            self._station_lost = False
+
+    def forget_silent(self, now_s: float) -> None:
+        """Drop stations that have not been heard for long."""
+        loss_s = self._parameters["COM_DL_LOSS_T"]
+        self._heartbeats_s = {who: at_s for who, at_s in self._heartbeats_s.items() if now_s - at_s <= loss_s}
+
+    def take_control(self, station: Station, now_s: float) -> bool:
+        """Whether `station` is in control, which it becomes when nobody else is."""
+        only = int(self._parameters["MAV_GCS_SYSID"])
+        if only not in (0, station.system):
+            return False
+        if station == self.controller:
+            return True
+        if self.controller is not None and (self.armed or not self._silent(now_s)):
+            return False
+        self.controller = station
+        self._controller_s = self._heartbeats_s.get(station, now_s)
+        self._setpoint = self._sticks = None
+        self._station_lost = False
+        return True
+
+    def may_change(self, station: Station, now_s: float) -> bool:
+        """Whether `station` may change what the station in control relies on."""
+        return self.controller in (None, station) or (not self.armed and self._silent(now_s))
+
+    def _silent(self, now_s: float) -> bool:
+        return now_s - self._controller_s > self._parameters["COM_DL_LOSS_T"]
+
+    # What it is told
+
+    def obstacle_to_arming(self, *, forced: bool = False) -> str | None:
+        """Why it may not be armed, in words; `forced` overlooks battery and tilt, never the emergency stop."""
+        if self.button:
+            return "emergency stop button pressed"
+        if self.estop:
+            return "emergency stop: send a disarm first"
+        if forced:
+            return None
+        if self.health.charge <= self._parameters["BAT_LOW_THR"]:
+            return f"battery low ({100 * self.health.charge:.0f} %)"
+        if self.health.tilt_rad > radians(self._parameters["COM_ARM_TILT"]):
+            return f"tilted by {degrees(self.health.tilt_rad):.0f} degrees"
+        return None
+
+    def arm(self, station: Station, now_s: float, *, forced: bool = False) -> int:
+        """MAV_RESULT of the request."""
+        if not self.take_control(station, now_s):
+            return self._refuse("Arming denied: another station is in control", REJECTED)
+        if self.armed:
+            return ACCEPTED
+        obstacle = self.obstacle_to_arming(forced=forced)
+        if obstacle is not None:
+            return self._refuse(f"Arming denied: {obstacle}", FAILED)
+        self.armed = True
+        self._base.stand()
+        self.say(_SEVERITY_NEWS, "Armed")
+        return ACCEPTED
+
+    def disarm(self, station: Station, now_s: float) -> int:
+        """MAV_RESULT; also ends an emergency stop that no button holds."""
+        if not self.take_control(station, now_s):
+            return self._refuse("Disarming denied: another station is in control", REJECTED)
+        if self.button:
+            return self._refuse("Emergency stop button pressed", FAILED)
+        if self.estop:
+            self.estop = False
+            self._base.release_estop()
+            self.say(_SEVERITY_NEWS, "Emergency stop released")
+        self._disarm("Disarmed")
+        self.controller = None
+        return ACCEPTED
+
+    def emergency_stop(self, why: str) -> int:
+        """Brake hard and stay so, whoever asks."""
+        if not self.estop:
+            self.estop = True
+            self._base.press_estop()
+            self.say(common.MAV_SEVERITY_EMERGENCY, f"Emergency stop: {why}")
+        self.armed = False
+        self._leave()
+        return ACCEPTED
+
+    def set_mode(self, station: Station, mode: Mode | None, now_s: float) -> int:
+        """MAV_RESULT; None is a mode that it has not."""
+        if not self.take_control(station, now_s):
+            return self._refuse("Mode denied: another station is in control", REJECTED)
+        if mode is None:
+            return self._refuse("Mode denied: expected MANUAL, HOLD or OFFBOARD", DENIED)
+        if mode is Mode.OFFBOARD and not self._fresh(self._setpoint_s, now_s):
+            return self._refuse("Offboard denied: no setpoints", REJECTED)
+        if mode is not self.mode:
+            if mode is Mode.OFFBOARD:
+                self._sticks = None
+            elif self.armed:
+                self._base.command(*_STOP)
+            self.mode = mode
+            self.say(_SEVERITY_NEWS, f"Mode {mode.name}")
+        self._next_command_s = now_s
+        return ACCEPTED
+
+    def setpoint(self, station: Station, setpoint: Setpoint, now_s: float) -> bool:
+        """Take a velocity; whether it came from the station in control."""
+        if not self.take_control(station, now_s):
+            self.refused_setpoints += 1
+            return False
+        self._setpoint, self._setpoint_s, self._next_command_s = setpoint, now_s, now_s
+        self._drive(now_s)
+        return True
+
+    def sticks(self, station: Station, sticks: Sticks | None, now_s: float) -> bool:
+        """Take the sticks' position, None when they are let go; whether from the station in control."""
+        if not self.take_control(station, now_s):
+            self.refused_setpoints += 1
+            return False
+        self._sticks, self._sticks_s, self._next_command_s = sticks or Sticks(), now_s, now_s
+        self._drive(now_s)
+        return True
+
+    # What it does by itself
+
+    def step(self, now_s: float) -> None:
+        """Let time pass."""
+        if self.button and not self.estop:
+            self.emergency_stop("button")
+        if self.armed:
+            self._watch_station(now_s)
+        if self.armed and self.mode is Mode.OFFBOARD and not self._fresh(self._setpoint_s, now_s):
+            self._hold("Failsafe: no setpoints, holding")
+        if self.armed and self._sticks is not None and not self._fresh(self._sticks_s, now_s):
+            self._sticks = None
+            if self.mode is Mode.MANUAL:
+                self._hold("Failsafe: no sticks, holding")
+        self._drive(now_s)
+
+    def _watch_station(self, now_s: float) -> None:
+        silent_s = now_s - self._controller_s
+        loss_s = self._parameters["COM_DL_LOSS_T"]
+        if silent_s > loss_s and not self._station_lost:
+            self._station_lost = True
+            self._hold("Failsafe: ground station lost, holding")
+        if silent_s > loss_s + self._parameters["COM_DISARM_GCS"]:
+            self._disarm("Failsafe: ground station lost, disarmed", _SEVERITY_STOPPED)
+            self.controller = None
+
+    def _fresh(self, at_s: float, now_s: float) -> bool:
+        return now_s - at_s <= self._parameters["COM_OF_LOSS_T"]
+
+    def _hold(self, why: str) -> None:
+        if self.mode is not Mode.HOLD:
+            self.say(_SEVERITY_STOPPED, why)
+        self._leave()
+        self._base.command(*_STOP)
+
+    def _leave(self) -> None:
+        self.mode = Mode.HOLD
+        self._setpoint = self._sticks = None
+        self._setpoint_s = self._sticks_s = -1e9
+
+    def _disarm(self, why: str, severity: int = _SEVERITY_NEWS) -> None:
+        if self.armed:
+            self.armed = False
+            self._base.rest()
+            self.say(severity, why)
+        self._leave()
+
+    def _drive(self, now_s: float) -> None:
+        if not self.armed or now_s < self._next_command_s:
+            return
+        command = self.wanted()
+        if command is not None:
+            self._next_command_s = now_s + _COMMAND_S
+            self._base.command(command[0], 0.0, command[1])
+
+    def wanted(self) -> tuple[float, float] | None:
+        """Speed ahead, m/s, and to the left, rad/s, that is asked for in this mode; None when nothing is."""
+        if self.mode is Mode.OFFBOARD and self._setpoint is not None:
+            return self._limited(*self._setpoint.command(self.health.yaw_rad))
+        if self.mode is Mode.MANUAL and self._sticks is not None:
+            speed = self._sticks.ahead * self._parameters["RO_MAN_SPEED"]
+            return self._limited(speed, -self._sticks.right * radians(self._parameters["RO_MAN_YAW_RATE"]))
+        return None
+
+    def _limited(self, v_mps: float, w_radps: float) -> tuple[float, float]:
+        v_max, w_max = self._parameters["RO_SPEED_LIM"], radians(self._parameters["RO_YAW_RATE_LIM"])
+        return max(-v_max, min(v_max, v_mps)), max(-w_max, min(w_max, w_radps))
+
+    def _refuse(self, why: str, result: int) -> int:
+        self.say(_SEVERITY_REFUSED, why)
+        return int(result)

@@ -1,0 +1,115 @@
+"""MAVLink packets in datagrams: bytes to messages and back, everything that is wrong counted. Pure.
+
+The dialect is pymavlink's `common` in its version 2; packets of version 1 are understood and answered in version 2.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common
+
+from sim_hil.protocols.mavlink.signing import BLOCK_BYTES, EPOCH_UNIX_S, TICKS_PER_S, Verifier
+
+Message = Any
+"""One of pymavlink's message objects: fields as attributes, `get_msgId()`, `get_srcSystem()`."""
+
+_V1, _V2 = 0xFE, 0xFD
+_V1_HEADER: Final = 6
+_V2_HEADER: Final = 10
+_CRC: Final = 2
+_SIGNED_FLAG: Final = 0x01
+# Messages of other dialects are no error of their sender's.
+_UNKNOWN: Final = common.MAVLink_unknown
+
+
+@dataclass
+class Counts:
+    """What was received and not obeyed."""
+
+    broken: int = 0  # no packet, cut off, wrong checksum
+    unsigned: int = 0  # signature missing, wrong or old, while a key is set
+    unknown: int = 0  # messages of other dialects
+    not_for_us: int = 0
+    unusable: int = 0  # whole, but with values that no correct sender sends
+
+    @property
+    def malformed(self) -> int:
+        """What no correct sender makes."""
+        return self.broken + self.unsigned + self.unusable
+
+
+def _length(data: bytes, at: int) -> int:
+    """Length of the packet that begins at `at`; 0 when there is none."""
+    left = len(data) - at
+    if left > 3 and data[at] == _V2 and not data[at + 2] & ~_SIGNED_FLAG:
+        signed = BLOCK_BYTES if data[at + 2] & _SIGNED_FLAG else 0
+        length = _V2_HEADER + data[at + 1] + _CRC + signed
+    elif left > 1 and data[at] == _V1:
+        length = _V1_HEADER + data[at + 1] + _CRC
+    else:
+        return 0
+    return length if length <= left else 0
+
+
+class Reader:
+    """Reads datagrams."""
+
+    def __init__(self, verifier: Verifier | None = None) -> None:
+        """`verifier`: only signed packets that it accepts are let through."""
+        self.counts = Counts()
+        self._verifier = verifier
+        self._parser = common.MAVLink(None)
+
+    def read(self, data: bytes) -> list[Message]:
+        """Messages of one datagram; after something that is no packet the rest of it is left out."""
+        return [message for packet in self._packets(data) if (message := self._decode(packet)) is not None]
+
+    def _packets(self, data: bytes) -> Iterator[bytes]:
+        at = 0
+        while at < len(data):
+            length = _length(data, at)
+            if length == 0:
+                self.counts.broken += 1
+                return
+            yield data[at : at + length]
+            at += length
+
+    def _decode(self, packet: bytes) -> Message | None:
+        try:
+            message = self._parser.decode(bytearray(packet))
+        except common.MAVError:
+            self.counts.broken += 1
+            return None
+        if self._verifier is not None and not (packet[0] == _V2 and self._verifier.accepts(packet)):
+            self.counts.unsigned += 1
+            return None
+        if isinstance(message, _UNKNOWN):
+            self.counts.unknown += 1
+            return None
+        return message
+
+
+class Writer:
+    """Makes the packets of one sender, numbered one after the other, signed when it has a key."""
+
+    def __init__(self, system: int, component: int, key: bytes | None = None, now_ticks: int = 0) -> None:
+        self._packer = common.MAVLink(None, srcSystem=system, srcComponent=component)
+        if key is not None:
+            self._packer.signing.secret_key = key
+            self._packer.signing.sign_outgoing = True
+            self._packer.signing.timestamp = now_ticks
+
+    def pack(self, message: Message) -> bytes:
+        """The message's bytes."""
+        data = bytes(message.pack(self._packer))
+        self._packer.seq = (self._packer.seq + 1) % 256
+        return data
+
+
+def now_ticks() -> int:
+    """Now as a signature's timestamp: the one place where the protocol asks for the time of day."""
+    return (time.time_ns() - EPOCH_UNIX_S * 1_000_000_000) * TICKS_PER_S // 1_000_000_000

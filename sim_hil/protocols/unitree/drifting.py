@@ -1,0 +1,71 @@
+"""The odometry frame of a Go2 whose legs slip: the pose it reports drifts away from where it is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from edge.core.geometry import SE2
+from sim_hil.protocols.unitree.state import OdometryFrame, turned_quaternion
+from sim_hil.robots.go2.body import RobotTruth
+from sim_hil.robots.odometry_noise import OdometryNoise
+
+
+class DriftingOdometry(OdometryFrame):
+    """`OdometryFrame` seen through an `OdometryNoise`; the gyroscope and all else that is no odometry stay true."""
+
+    def __init__(self, start: tuple[float, float, float], noise: OdometryNoise) -> None:
+        """`start`: T_world_odom as (x_m, y_m, theta_rad); the noise starts at the origin."""
+        super().__init__(start)
+        self._noise = noise
+        self._true: SE2 | None = None
+        self._true_s = 0.0
+        self._correction = SE2(0.0, 0.0, 0.0)  # reported pose = correction @ true pose
+        self._error = (0.0, 0.0, 0.0)  # of the body velocity, m/s, m/s, rad/s
+
+    def update(self, truth: RobotTruth) -> None:
+        """Let the report drift by what the robot has moved since the last update."""
+        x, y, _ = super().position(truth.position_m)
+        now = SE2(x, y, super().rpy(truth.rpy_rad)[2])
+        before, self._true = self._true, now
+        elapsed_s, self._true_s = truth.time_s - self._true_s, truth.time_s
+        if before is None:
+            self._correction = self._noise.pose @ now.inverse()
+            return
+        if elapsed_s <= 0:
+            return
+        moved = before.inverse() @ now
+        report = self._noise.step(moved, elapsed_s)
+        self._correction = report.T_odom_base @ now.inverse()
+        true_mps = (moved.x_m / elapsed_s, moved.y_m / elapsed_s, moved.theta_rad / elapsed_s)
+        vx, vy, wz = (a - b for a, b in zip((report.vx_mps, report.vy_mps, report.wz_radps), true_mps, strict=True))
+        self._error = (vx, vy, wz)
+
+    def position(self, position_m: Any) -> list[float]:
+        """A world position [3] as reported."""
+        x, y, z = super().position(position_m)
+        moved = self._correction @ SE2(x, y, 0.0)
+        return [moved.x_m, moved.y_m, z]
+
+    def rpy(self, rpy_rad: Any) -> list[float]:
+        """Roll, pitch and yaw [3] as reported."""
+        roll, pitch, yaw = super().rpy(rpy_rad)
+        turned = yaw + self._correction.theta_rad
+        return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
+
+    def quaternion(self, wxyz: Any) -> list[float]:
+        """An orientation (w, x, y, z) as reported."""
+        return turned_quaternion(super().quaternion(wxyz), self._correction.theta_rad)
+
+    def velocity(self, vector: Any) -> list[float]:
+        """A world velocity [3] as reported, in the odometry frame: it fits the pose that is reported."""
+        x, y, z = super().velocity(vector)
+        c, s = math.cos(self._correction.theta_rad), math.sin(self._correction.theta_rad)
+        heading = self._noise.pose.theta_rad
+        ex, ey, _ = self._error
+        ch, sh = math.cos(heading), math.sin(heading)
+        return [c * x - s * y + ch * ex - sh * ey, s * x + c * y + sh * ex + ch * ey, z]
+
+    def yaw_speed(self, wz_radps: float) -> float:
+        """A yaw rate as reported."""
+        return wz_radps + self._error[2]

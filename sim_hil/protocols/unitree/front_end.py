@@ -1,0 +1,258 @@
+"""The Unitree protocol as a front end of `edge-hil`: services, state topics, and the camera in its own process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.core.geometry import SE2
+from firmware_bridge.core.config import DdsConfig
+from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.unitree.camera_process import CameraProcess
+from sim_hil.protocols.unitree.drifting import DriftingOdometry
+from sim_hil.protocols.unitree.remote import Remote
+from sim_hil.protocols.unitree.services.avoidance import OBSTACLES_AVOID_VERSION, ObstaclesAvoid, Pilot, RangeFinder
+from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
+from sim_hil.protocols.unitree.services.idl_command import LowCmd_
+from sim_hil.protocols.unitree.services.leases import Lease
+from sim_hil.protocols.unitree.services.low_level import LOW_COMMAND_TOPIC
+from sim_hil.protocols.unitree.services.service import Answer, LeaseServer, Received, ServiceServer
+from sim_hil.protocols.unitree.services.sport import CommandLog, api_name
+from sim_hil.protocols.unitree.services.sport_service import UNLEASED, SportService
+from sim_hil.protocols.unitree.services.switching import MotionSwitcher, RobotState
+from sim_hil.protocols.unitree.services.vui import VUI_SERVICE, Vui
+from sim_hil.protocols.unitree.state import OdometryFrame, StatePublishers
+from sim_hil.robots.go2.body import Go2, RobotTruth
+from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
+from sim_hil.simulation.physics import Simulation
+
+if TYPE_CHECKING:
+    from sim_hil.protocols.unitree.fault_injector import FaultInjector
+
+
+PILOT_HZ: Final = 20  # how often the surroundings are looked at
+
+
+class UnitreeFrontEnd:
+    """A simulated Go2 answering its maker's protocol. Raises DdsError, OSError or ValueError when it cannot."""
+
+    def __init__(self, simulation: Simulation, options: FrontEndOptions, dds: DdsConfig) -> None:
+        if not isinstance(simulation.robot, Go2):
+            raise FrontEndError(f"unitree: expected a Go2, found a {type(simulation.robot).__name__}")
+        self._simulation = simulation
+        self._robot = simulation.robot
+        self._dds = dds
+        self._faults: FaultInjector | None = None
+        self._closed = False
+        self.bus = Bus(dds)
+        """The participant: DDS allows a process one in a domain."""
+        self._camera: CameraProcess | None = None
+        try:
+            self._open(simulation, options)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, simulation: Simulation, options: FrontEndOptions) -> None:
+        if options.camera_size is not None:
+            self._camera = _camera(simulation, options, options.camera_size, self._dds)
+        self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
+        self._robot.sport = self._behaviour  # type: ignore[assignment]
+        self._odometry = _odometry(options)
+        self._range_finder = RangeFinder([box for _, box in options.scene.obstacles()])
+        self._pilot = Pilot(self._behaviour.request_move, self._free_m)
+        self._steps_a_look = round(simulation.rate_hz / PILOT_HZ)
+        self._open_services()
+        remote = Remote()
+        if options.faults is not None:
+            self._faults = self._injector(options.faults, remote)
+        self._publishers = StatePublishers(
+            self.bus,
+            self._odometry,
+            simulation.rate_hz,
+            remote=remote,
+            faults=None if self._faults is None else self._faults.states,
+        )
+        self._log = CommandLog()
+        self._listened = False
+        self._video_frames = 0
+        self._video_malformed = 0
+
+    def _open_services(self) -> None:
+        lease = Lease()
+        self._sport = ServiceServer(self.bus, ids.SPORT_SERVICE, lease=lease, unleased=UNLEASED)
+        self._leases = LeaseServer(self.bus, ids.SPORT_SERVICE, lease)
+        self._sport_service = SportService(self._behaviour, self._pilot)
+        switcher = MotionSwitcher(self._behaviour, self._pilot)
+        avoid = ObstaclesAvoid(self._pilot, self._reported_pose)
+        self._others: tuple[tuple[ServiceServer, Callable[[int, str], Answer]], ...] = (
+            (ServiceServer(self.bus, ids.ROBOT_STATE_SERVICE), RobotState(switcher, avoid.switch).handle),
+            (ServiceServer(self.bus, ids.MOTION_SWITCHER_SERVICE), switcher.handle),
+            (ServiceServer(self.bus, VUI_SERVICE), Vui().handle),
+            (
+                ServiceServer(self.bus, ids.OBSTACLES_AVOID_SERVICE, version=OBSTACLES_AVOID_VERSION),
+                avoid.handle,
+            ),
+        )
+        self._servers = (self._sport, self._leases, *(server for server, _ in self._others))
+        self._low_commands = self.bus.reader(LOW_COMMAND_TOPIC, LowCmd_)
+        self._waitset = self.bus.waitset(*(server.reader for server in self._servers))
+
+    def _free_m(self, direction_rad: float) -> float:
+        (x_m, y_m, _), heading_rad = self._simulation.pose()
+        return self._range_finder.free_m(x_m, y_m, heading_rad + direction_rad, self._simulation.people())
+
+    def _reported_pose(self) -> SE2:
+        (x_m, y_m, z_m), heading_rad = self._simulation.pose()
+        x, y, _ = self._odometry.position((x_m, y_m, z_m))
+        return SE2(x, y, self._odometry.rpy((0.0, 0.0, heading_rad))[2])
+
+    def _injector(self, path: Path, remote: Remote) -> FaultInjector:
+        # Imported here: without --faults the code that makes anything go wrong is not even loaded.
+        from sim_hil.protocols.unitree.fault_injector import FaultInjector
+
+        return FaultInjector(path, remote=remote, camera=self._tell_camera)
+
+    def _tell_camera(self, line: bytes) -> None:
+        if self._camera is not None:
+            self._camera.tell(line)
+
+    def where(self) -> str:
+        """Domain and interface."""
+        return f"domain {self._dds.domain} on {self._dds.interface}"
+
+    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
+        """Wait for the camera. Raises CameraProcessError."""
+        if self._camera is None:
+            return True
+        self._camera.show(render_state)
+        return self._camera.wait_ready(stop)
+
+    def wait(self, left_ns: int) -> None:
+        """Until a request arrives."""
+        self._waitset.wait(left_ns)
+
+    def serve(self) -> list[Heard]:
+        """Answer what is waiting at every service; the camera's are told of by its process."""
+        received = self._serve_sport()
+        self._leases.serve_leases()
+        for server, handle in self._others:
+            received += server.serve(handle)
+        self._take_low_command()
+        for event in self._camera.events() if self._camera is not None else ():
+            received += self._of_camera(event)
+        for request in received:
+            self._log.note(request)
+        return [_heard(request) for request in received]
+
+    def _serve_sport(self) -> list[Received]:
+        if self._faults is None:
+            return self._sport.serve(self._sport_service.handle)
+        self._faults.poll(time.monotonic_ns())
+        self._publishers.overdue()
+        return self._faults.sport.serve(self._sport, self._sport_service.handle)
+
+    def _take_low_command(self) -> None:
+        """The newest low command; what was said while the sport controller had the joints is thrown away."""
+        if not self._behaviour.released:
+            self._listened = False
+            return
+        for command in take_each(self._low_commands):
+            if self._listened:
+                self._behaviour.low_level.take(command, self._behaviour.time_s)
+        self._listened = True
+
+    def _of_camera(self, event: dict[str, object]) -> list[Received]:
+        if event["event"] == "frame":
+            self._video_frames += 1
+        elif event["event"] == "malformed":
+            count = event["count"]
+            assert isinstance(count, int)
+            self._video_malformed += count
+        elif event["event"] == "fault" and self._faults is not None:
+            fault, effect_ns = event["fault"], event["t_ns"]
+            assert isinstance(fault, str) and isinstance(effect_ns, int)
+            self._faults.took_effect(fault, effect_ns)
+        elif event["event"] == "request":
+            t_ns, api_id, parameter = event["t_ns"], event["api_id"], event["parameter"]
+            assert isinstance(t_ns, int) and isinstance(api_id, int) and isinstance(parameter, str)
+            return [Received(t_ns, ids.VIDEO_SERVICE, api_id, parameter, 0, noreply=False)]
+        return []
+
+    def publish(self, step: int, stamp_s: float) -> None:
+        """Write the state topics that are due, and look out for obstacles."""
+        if step % self._steps_a_look == 0:
+            self._pilot.step(stamp_s, self._reported_pose)
+        due = self._publishers.due(step)
+        if due:
+            truth = self._simulation.truth()
+            assert isinstance(truth, RobotTruth)
+            self._publishers.publish(due, truth, stamp_s, self._behaviour.progress)
+
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """Hand the camera process what it renders from now on."""
+        if self._camera is not None:
+            self._camera.show(render_state)
+
+    def close(self) -> None:
+        """End the camera process, remove the faults' socket, leave the bus."""
+        if self._faults is not None:
+            self._faults.close()
+            self._faults = None
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+        if not self._closed:
+            self._closed = True
+            self.bus.close()
+
+    def summary(self) -> dict[str, object]:
+        """What was heard and sent."""
+        malformed = self._video_malformed + self._behaviour.low_level.rejected
+        malformed += sum(server.malformed for server in self._servers)
+        return {
+            "wire": {**self._log.summary(), "malformed": malformed},
+            "video_frames": self._video_frames,
+            "states": self._publishers.sport_states_sent,
+        }
+
+
+def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeFrontEnd:
+    """The front end of `--protocol unitree`. Raises FrontEndError, ConfigError, DdsError or OSError."""
+    if options.faults is not None and options.camera_size is None:
+        raise FrontEndError("--faults: expected a camera to inject them into, found --camera none; leave one out")
+    peers = ("127.0.0.1",) if options.interface == "lo" else ()
+    return UnitreeFrontEnd(simulation, options, DdsConfig(options.domain, options.interface, peers))
+
+
+def _camera(
+    simulation: Simulation, options: FrontEndOptions, size: tuple[int, int], dds: DdsConfig
+) -> CameraProcess:  # fmt: skip
+    return CameraProcess(
+        options.scene_source,
+        people=options.people,
+        seed=options.seed,
+        size=size,
+        dds=dds,
+        state_length=len(simulation.render_state()),
+        faults=options.faults is not None,
+    )
+
+
+def _odometry(options: FrontEndOptions) -> OdometryFrame:
+    start = options.scene.start
+    if options.odometry_noise == "none":
+        return OdometryFrame(start)
+    return DriftingOdometry(start, OdometryNoise(LEVELS[options.odometry_noise], options.seed))
+
+
+def _heard(request: Received) -> Heard:
+    name = api_name(request.service, request.api_id)
+    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id)

@@ -1,0 +1,131 @@
+"""The services that switch others: motion_switcher (sport controller or low level) and robot_state. Pure.
+
+Codes: the maker's motion_switcher_error.hpp (7001 parameter, 7002 busy, 7004 name) and robot_state_error.hpp; the
+client itself turns status 5 of a ServiceSwitch into 5202, service is protected.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Final
+
+from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
+from sim_hil.protocols.unitree.services.parameters import parse_flag, parse_numbers, parse_text
+from sim_hil.protocols.unitree.services.service import Answer
+from sim_hil.protocols.unitree.services.sport_service import Mover
+
+ERROR_SWITCH_PARAMETER: Final = 7001
+ERROR_SWITCH_BUSY: Final = 7002
+ERROR_SWITCH_NAME: Final = 7004
+BUSY_S: Final = 2.0  # our choice: how long the switcher takes to let go
+# The maker's modes: "normal" was the controller before firmware 1.1.6 and "mcf" is its name since, others had tricks.
+MODES: Final = ("normal", "mcf", "ai", "advanced")
+PROTECTED: Final = 5
+SPORT_MODE: Final = "sport_mode"
+OBSTACLES_AVOID: Final = "obstacles_avoid"
+_CHECK, _SELECT, _RELEASE, _SET_SILENT, _GET_SILENT = 1001, 1002, 1003, 1004, 1005
+_SERVICE_SWITCH, _REPORT_FREQ, _SERVICE_LIST = 1001, 1002, 1003
+
+
+class MotionSwitcher:
+    """Which controller has the joints: one of MODES, or none, which leaves them to low commands."""
+
+    def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
+        """`mover` is stopped when the joints are taken."""
+        self._behaviour = behaviour
+        self._mover = mover
+        self._name = MODES[0]
+        self._silent = False
+        self._released_s = -math.inf
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the sport controller has the joints."""
+        return self._name != ""
+
+    def handle(self, api_id: int, parameter: str) -> Answer:
+        """One request."""
+        if api_id == _CHECK:
+            return ids.OK, json.dumps({"form": "0", "name": self._name})
+        if api_id == _SELECT:
+            return self.select(parse_text(parameter, "name")), ""
+        if api_id == _RELEASE:
+            self.release()
+            return ids.OK, ""
+        if api_id == _SET_SILENT:
+            silent = parse_flag(parameter, "silent")
+            if silent is None:
+                return ERROR_SWITCH_PARAMETER, ""
+            self._silent = silent
+            return ids.OK, ""
+        if api_id == _GET_SILENT:
+            return ids.OK, json.dumps({"silent": self._silent})
+        return ids.ERROR_NOT_IMPLEMENTED, ""
+
+    def select(self, name: str | None) -> int:
+        """Give the joints to the controller `name`; 7002 for BUSY_S after they were taken from one."""
+        if name is None:
+            return ERROR_SWITCH_PARAMETER
+        if name not in MODES:
+            return ERROR_SWITCH_NAME
+        if self._behaviour.time_s - self._released_s < BUSY_S:
+            return ERROR_SWITCH_BUSY
+        if not self.engaged:
+            self._behaviour.engage()
+        self._name = name
+        return ids.OK
+
+    def release(self) -> None:
+        """Take the joints from their controller."""
+        if self.engaged:
+            self._mover.stop()
+            self._behaviour.release()
+            self._name, self._released_s = "", self._behaviour.time_s
+
+
+class RobotState:
+    """Which services there are; the sport controller and the avoidance can be switched off, the others are protected.
+
+    SetReportFreq is taken and changes nothing: what it reports on another topic is not among the published facts.
+    """
+
+    def __init__(self, switcher: MotionSwitcher, avoidance: Callable[[bool | None], bool]) -> None:
+        """`avoidance`: switches obstacles_avoid on or off, None leaves it; returns what it is then."""
+        self._switcher = switcher
+        self._avoidance = avoidance
+
+    def handle(self, api_id: int, parameter: str) -> Answer:
+        """One request."""
+        if api_id == _SERVICE_LIST:
+            return ids.OK, json.dumps(self._services())
+        if api_id == _SERVICE_SWITCH:
+            return self._switch(parse_text(parameter, "name"), parse_flag(parameter, "switch"))
+        if api_id == _REPORT_FREQ:
+            times = parse_numbers(parameter, "interval", "duration")
+            if times is None or min(times) < 0:
+                return ids.ERROR_PARAMETER, ""
+            return ids.OK, ""
+        return ids.ERROR_NOT_IMPLEMENTED, ""
+
+    def _services(self) -> list[dict[str, object]]:
+        on = {SPORT_MODE: self._switcher.engaged, OBSTACLES_AVOID: self._avoidance(None)}
+        switched = [{"name": name, "status": int(is_on), "protect": 0} for name, is_on in on.items()]
+        protected = ("video_hub", "robot_state", "motion_switcher")
+        return switched + [{"name": name, "status": 1, "protect": 1} for name in protected]
+
+    def _switch(self, name: str | None, on: bool | None) -> Answer:
+        known = [service["name"] for service in self._services()]
+        if name is None or on is None or name not in known:
+            return ids.ERROR_PARAMETER, ""
+        if name == OBSTACLES_AVOID:
+            return ids.OK, json.dumps({"name": name, "status": int(self._avoidance(on))})
+        if name != SPORT_MODE:
+            return ids.OK, json.dumps({"name": name, "status": PROTECTED})
+        if not on:
+            self._switcher.release()
+        elif not self._switcher.engaged and self._switcher.select(MODES[0]) != ids.OK:
+            return ids.OK, json.dumps({"name": name, "status": 0})
+        return ids.OK, json.dumps({"name": name, "status": int(self._switcher.engaged)})

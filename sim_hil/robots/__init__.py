@@ -1,0 +1,1 @@
+"""What every simulated robot has: the interface to the world, a battery, drifting odometry."""

@@ -1,0 +1,234 @@
+"""What a scene is made of: walls, objects, floor patches, people's routes and places, named areas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import atan2, cos, hypot, sin
+
+from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+from sim_hil.scene.table import SceneError
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+
+FLOOR_TEXTURES = frozenset(
+    (
+        "floor_tiles", "vinyl", "vinyl_green", "carpet_tiles", "carpet_blue", "wood", "marble", "concrete",
+        "concrete_yellow_line", "hazard_stripes", "asphalt", "asphalt_line", "paving", "paving_light", "cobbles",
+        "grass", "soil", "zebra_crossing", "kerb_stone", "tactile_paving", "metal_plate",
+    )
+)  # fmt: skip
+WALL_TEXTURES = frozenset(
+    (
+        "wall_wainscot", "wall_hospital", "wall_office", "wall_glass", "wall_warehouse", "wall_brick", "wall_concrete",
+        "wall_plaster", "railing",
+    )
+)  # fmt: skip
+CEILING_TEXTURES = frozenset(("ceiling_panels", "ceiling_steel", "ceiling_plaster"))
+TEXTURES = FLOOR_TEXTURES | WALL_TEXTURES | CEILING_TEXTURES
+AREA_KINDS = frozenset(
+    ("corridor", "room", "lobby", "aisle", "yard", "plaza", "sidewalk", "street", "crossing", "garden")
+)
+PLACE_KINDS = frozenset(("stand", "sit", "queue", "door"))
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Outline of a wall or object on the floor: polygon [(x, y), ...] in world m, for top-down pictures."""
+
+    label: str
+    kind: str
+    polygon: tuple[Vec2, ...]
+
+
+@dataclass(frozen=True)
+class Box:
+    """An upright box: centre m, direction of its length axis (unit x, y), and size along, across and up, m."""
+
+    centre_m: Vec3
+    axis: Vec2
+    size_m: Vec3
+
+    def corners(self) -> tuple[Vec2, ...]:
+        """The four floor corners, counter-clockwise."""
+        (x, y, _), (c, s) = self.centre_m, self.axis
+        a, b = self.size_m[0] / 2, self.size_m[1] / 2
+        return tuple((x + c * u - s * v, y + s * u + c * v) for u, v in ((-a, -b), (a, -b), (a, b), (-a, b)))
+
+
+@dataclass(frozen=True)
+class Wall:
+    """An upright slab whose centre line runs from `start_m` to `end_m`."""
+
+    label: str
+    start_m: Vec2
+    end_m: Vec2
+    thickness_m: float
+    height_m: float
+    texture: str
+
+    def __post_init__(self) -> None:
+        if self.start_m == self.end_m or self.thickness_m <= 0 or self.height_m <= 0:
+            raise SceneError(f"wall {self.label}: expected two different ends and positive thickness and height")
+        check_choice(f"wall {self.label}", "texture", self.texture, WALL_TEXTURES)
+
+    @property
+    def box(self) -> Box:
+        """The wall as an upright box."""
+        (x0, y0), (x1, y1) = self.start_m, self.end_m
+        length = hypot(x1 - x0, y1 - y0)
+        return Box(
+            ((x0 + x1) / 2, (y0 + y1) / 2, self.height_m / 2),
+            ((x1 - x0) / length, (y1 - y0) / length),
+            (length, self.thickness_m, self.height_m),
+        )
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """A thing: `position_m` is the middle of its underside, its front looks along `heading_rad`.
+
+    `size_m` is depth (front to back), width and height; `text` is printed on it; `landmark` is its name in words for
+    instructions ("vending machine"), empty for what no instruction speaks of.
+    """
+
+    label: str
+    kind: str
+    position_m: Vec3
+    heading_rad: float
+    size_m: Vec3
+    colour: Vec3
+    text: str
+    landmark: str = ""
+
+    def __post_init__(self) -> None:
+        check_choice(f"object {self.label}", "kind", self.kind, SOLID_KINDS | FLAT_KINDS)
+        if min(self.size_m) <= 0:
+            raise SceneError(f"object {self.label}: size_m must be positive, found {self.size_m}")
+        if not all(0 <= channel <= 1 for channel in self.colour):
+            raise SceneError(f"object {self.label}: colour must be within 0..1, found {self.colour}")
+
+    @property
+    def solid(self) -> bool:
+        """Whether it stops a robot or a person."""
+        return self.kind in SOLID_KINDS
+
+    @property
+    def box(self) -> Box:
+        """Bounding box of what is seen."""
+        x, y, z = self.position_m
+        return Box((x, y, z + self.size_m[2] / 2), (cos(self.heading_rad), sin(self.heading_rad)), self.size_m)
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """What stops a robot or a person: the boxes of the kind's parts, none for a flat kind."""
+        (x, y, z), height = self.position_m, self.size_m[2]
+        made = []
+        for part in KINDS[self.kind].parts:
+            depth, width = (min(self.size_m[:2]),) * 2 if part.turn_rad else self.size_m[:2]
+            turn = self.heading_rad + part.turn_rad
+            c, s = cos(turn), sin(turn)
+            u, v = sum(part.x) / 2 * depth, sum(part.y) / 2 * width
+            size = ((part.x[1] - part.x[0]) * depth, (part.y[1] - part.y[0]) * width, (part.z[1] - part.z[0]) * height)
+            made.append(Box((x + c * u - s * v, y + s * u + c * v, z + sum(part.z) / 2 * height), (c, s), size))
+        return tuple(made)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A patch of floor that looks different: a convex `polygon`, m; its texture runs along `heading_rad`.
+
+    Level with the floor: it changes looks, not physics. A later patch lies over an earlier one.
+    """
+
+    polygon: tuple[Vec2, ...]
+    texture: str
+    heading_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_choice("floors", "texture", self.texture, FLOOR_TEXTURES)
+        if area_m2(self.polygon) <= 1e-6 or not is_convex(self.polygon):
+            raise SceneError(f"floors: {self.texture}: expected a convex polygon, found {self.polygon}")
+
+
+@dataclass(frozen=True)
+class Area:
+    """A named part of the floor: `polygon` m, `name` in words ("aisle 3", "waiting room")."""
+
+    label: str
+    kind: str
+    polygon: tuple[Vec2, ...]
+    name: str
+
+    def __post_init__(self) -> None:
+        check_choice(f"area {self.label}", "kind", self.kind, AREA_KINDS)
+        if len(self.polygon) < 3 or area_m2(self.polygon) <= 1e-6:
+            raise SceneError(f"area {self.label}: expected a polygon of at least three corners, found {self.polygon}")
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether the point (m) lies inside, by the even-odd rule."""
+        inside = False
+        for (ax, ay), (bx, by) in _edges(self.polygon):
+            if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
+                inside = not inside
+        return inside
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where people go: `position_m` (x, y) and the way they face there; up to `capacity` at once.
+
+    stand: dwell and look; sit: on a chair or bench; queue: the first one's spot, the others behind it (against the
+    heading); door: where people enter and leave.
+    """
+
+    label: str
+    position_m: Vec2
+    heading_rad: float
+    kind: str
+    capacity: int = 1
+
+    def __post_init__(self) -> None:
+        check_choice(f"place {self.label}", "kind", self.kind, PLACE_KINDS)
+        if self.capacity < 1:
+            raise SceneError(f"place {self.label}: capacity must be 1 or more, found {self.capacity}")
+
+
+@dataclass(frozen=True)
+class Route:
+    """Way points, m, that a person walks to and fro."""
+
+    points_m: tuple[Vec2, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.points_m) < 2 or any(a == b for a, b in zip(self.points_m, self.points_m[1:], strict=False)):
+            raise SceneError("route: expected at least two different points")
+
+
+def check_choice(what: str, key: str, value: str, known: Iterable[str]) -> None:
+    """Raises SceneError unless the value is one of the known ones."""
+    if value not in known:
+        raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(known))}")
+
+
+def area_m2(polygon: tuple[Vec2, ...]) -> float:
+    """Area of a polygon, whichever way round."""
+    return abs(sum(ax * by - bx * ay for (ax, ay), (bx, by) in _edges(polygon))) / 2
+
+
+def is_convex(polygon: tuple[Vec2, ...]) -> bool:
+    """Whether a polygon of at least three corners turns one way all round, once."""
+    turned, signs = 0.0, set()
+    edges = _edges(polygon)
+    for (a, b), (_, c) in zip(edges, edges[1:] + edges[:1], strict=True):
+        ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1]
+        cross = ux * vy - uy * vx
+        turned += atan2(cross, ux * vx + uy * vy)
+        if abs(cross) > 1e-12:
+            signs.add(cross > 0)
+    return len(polygon) >= 3 and len(signs) == 1 and abs(turned) < 7.0
+
+
+def _edges(polygon: tuple[Vec2, ...]) -> list[tuple[Vec2, Vec2]]:
+    return list(zip(polygon, polygon[1:] + polygon[:1], strict=True))

@@ -1,0 +1,179 @@
+"""A scene as data: floor, walls, objects, terrain and where people go, read from a TOML file and checked."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+from sim_hil.scene.parts import (
+    CEILING_TEXTURES,
+    FLOOR_TEXTURES,
+    TEXTURES,
+    WALL_TEXTURES,
+    Area,
+    Box,
+    Floor,
+    Footprint,
+    Place,
+    Route,
+    SceneObject,
+    Vec2,
+    Vec3,
+    Wall,
+    check_choice,
+)
+from sim_hil.scene.reader import read_area, read_floor, read_object, read_place, read_route, read_terrain, read_wall
+from sim_hil.scene.table import SceneError, Table
+from sim_hil.scene.terrain import ConvexPiece, Terrain
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = [
+    "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
+    "WALL_TEXTURES", "Area", "Box", "ConvexPiece", "Floor", "Footprint", "Place", "Route", "Scene", "SceneError",
+    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names",
+]  # fmt: skip
+
+SCENES = Path(__file__).parents[1] / "scenes"
+SKY: Vec3 = (0.60, 0.76, 0.92)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world: the robot starts at `start` (x m, y m, theta rad) and is done at `goal_xy`, m."""
+
+    name: str
+    start: Vec3
+    goal_xy: Vec2
+    floor_min_m: Vec2
+    floor_max_m: Vec2
+    floor_texture: str
+    ceiling_height_m: float  # 0 = open sky
+    walls: tuple[Wall, ...]
+    objects: tuple[SceneObject, ...]
+    routes: tuple[Route, ...]
+    floors: tuple[Floor, ...] = ()
+    terrain: tuple[Terrain, ...] = ()
+    areas: tuple[Area, ...] = ()
+    places: tuple[Place, ...] = ()
+    ceiling_texture: str = "ceiling_panels"
+    sky: Vec3 = SKY
+
+    def __post_init__(self) -> None:
+        (x0, y0), (x1, y1) = self.floor_min_m, self.floor_max_m
+        if x0 >= x1 or y0 >= y1:
+            raise SceneError("floor: min_m must lie below max_m")
+        for what, (x, y) in (("start", self.start[:2]), ("goal_xy", self.goal_xy)):
+            if not (x0 <= x <= x1 and y0 <= y <= y1):
+                raise SceneError(f"{what}: ({x}, {y}) is not on the floor")
+        if not all(0 <= channel <= 1 for channel in self.sky):
+            raise SceneError(f"sky: colour must be within 0..1, found {self.sky}")
+        solids = [part.label for parts in (self.walls, self.objects, self.terrain) for part in parts]
+        for what, labels in (
+            ("walls, objects and terrain", solids),
+            ("areas", [area.label for area in self.areas]),
+            ("places", [place.label for place in self.places]),
+        ):
+            if len(labels) != len(set(labels)):
+                twice = next(label for label in labels if labels.count(label) > 1)
+                raise SceneError(f"labels of {what} must be unique, found {twice!r} twice")
+        check_choice("floor", "texture", self.floor_texture, FLOOR_TEXTURES)
+        check_choice("scene", "ceiling_texture", self.ceiling_texture, CEILING_TEXTURES)
+
+    def footprints(self) -> list[Footprint]:
+        """Outlines of all walls and objects, for a top-down picture."""
+        outlines = [Footprint(wall.label, "wall", wall.box.corners()) for wall in self.walls]
+        return outlines + [Footprint(thing.label, thing.kind, thing.box.corners()) for thing in self.objects]
+
+    def obstacles(self) -> list[tuple[str, Box]]:
+        """Label and box of everything that stops a robot or a person; an object of several boxes comes several times.
+
+        Terrain is not among them: it is walked on.
+        """
+        walls = [(wall.label, wall.box) for wall in self.walls]
+        return walls + [(thing.label, box) for thing in self.objects for box in thing.boxes]
+
+    def terrain_pieces(self) -> list[ConvexPiece]:
+        """The terrain as convex solids for a physics engine."""
+        return [terrain.piece() for terrain in self.terrain]
+
+    def ground_height_m(self, x: float, y: float) -> float:
+        """Height of what one stands on there, m: the highest terrain, or 0."""
+        heights = (terrain.height_m(x, y) for terrain in self.terrain)
+        return max((height for height in heights if height is not None), default=0.0)
+
+    def area_at(self, x: float, y: float) -> Area | None:
+        """The first named area around a point, m; None outside all."""
+        return next((area for area in self.areas if area.contains(x, y)), None)
+
+    def landmarks(self) -> list[SceneObject]:
+        """The objects that instructions may speak of."""
+        return [thing for thing in self.objects if thing.landmark]
+
+    def without(self, label: str) -> Scene:
+        """The same scene lacking one object; raises KeyError when there is none of that label."""
+        rest = tuple(thing for thing in self.objects if thing.label != label)
+        if len(rest) == len(self.objects):
+            raise KeyError(label)
+        return replace(self, objects=rest)
+
+
+def parse_scene(text: str, source: str) -> Scene:
+    """Build a scene from TOML text; `source` names it in errors. Raises SceneError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{source}: not valid TOML: {error}") from error
+    try:
+        table = Table("scene", raw)
+        floor = Table("floor", table.take("floor"))
+        scene = Scene(
+            name=table.text("name"),
+            start=table.vector("start", 3),
+            goal_xy=table.vector("goal_xy", 2),
+            floor_min_m=floor.vector("min_m", 2),
+            floor_max_m=floor.vector("max_m", 2),
+            floor_texture=floor.text("texture", "floor_tiles"),
+            ceiling_height_m=table.number("ceiling_height_m", 0.0),
+            ceiling_texture=table.text("ceiling_texture", "ceiling_panels"),
+            sky=table.vector("sky", 3, SKY),
+            walls=tuple(read_wall(item) for item in table.tables("walls")),
+            objects=tuple(read_object(item) for item in table.tables("objects")),
+            routes=tuple(read_route(item) for item in table.tables("routes")),
+            floors=tuple(read_floor(item) for item in table.tables("floors")),
+            terrain=tuple(read_terrain(item) for item in table.tables("terrain")),
+            areas=tuple(read_area(item) for item in table.tables("areas")),
+            places=tuple(read_place(item) for item in table.tables("places")),
+        )
+        floor.done()
+        table.done()
+    except SceneError as error:
+        raise SceneError(f"{source}: {error}") from error
+    return scene
+
+
+def scene_names() -> list[str]:
+    """Names that load_scene knows."""
+    return sorted(path.stem for path in SCENES.glob("*.toml"))
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Load a scene of ours by its name, or any scene by the path of its TOML file; raises SceneError."""
+    path = SCENES / f"{name_or_path}.toml"
+    if str(name_or_path) not in scene_names():
+        path = Path(name_or_path)
+        if path.suffix != ".toml":
+            raise SceneError(
+                f"unknown scene {str(name_or_path)!r}, expected one of {', '.join(scene_names())},"
+                " or the path of a scene file that ends in .toml"
+            )
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read as a scene file: {error}") from error
+    return parse_scene(text, path.name)

@@ -1,0 +1,166 @@
+"""The robot's forward camera: the scene and its people in a renderer of their own, posed from a render state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, radians, sin, tan
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.crowd.people import RENDER_FIELDS, Appearance, appearances
+from sim_hil.robots.carter import body as carter
+from sim_hil.robots.go2 import body as go2
+from sim_hil.robots.go2.body import rotation_matrix
+from sim_hil.scene.scene import Scene
+from sim_hil.simulation.person_body import PersonBody
+from sim_hil.simulation.renderer import Picture, Renderer
+from sim_hil.simulation.robot_meshes import RobotBody
+from sim_hil.world.scene_meshes import build_scene
+from sim_hil.world.wall_visibility import Sight, Visibility
+
+Array = NDArray[np.float64]
+
+# Where the Go2's front camera sits on the base, and how it looks (the real one: wide, nearly level, at the nose).
+CAMERA_POSITION_M = (0.327, 0.0, 0.043)
+CAMERA_PITCH_RAD = radians(2.0)  # downwards
+CAMERA_HFOV_RAD = radians(100.0)
+
+_PERSON_M: Final = 0.9  # anything of a person is within this of the point between the feet
+_FAR_PERSON_M: Final = 45.0  # a pixel or two high at 128 x 128: left out
+_NEAR_PERSON_M: Final = 6.0  # with all details up to here, simpler from there on
+_UPRIGHT: Final = 0.9
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A robot's camera: its place on the base, m, its pitch (downwards) and field of view across, rad.
+
+    `fields` is how many numbers of a render state are the robot's.
+    """
+
+    position_m: tuple[float, float, float]
+    pitch_rad: float
+    hfov_rad: float
+    fields: int
+
+
+MOUNTS: Final = {
+    "go2": Mount(CAMERA_POSITION_M, CAMERA_PITCH_RAD, CAMERA_HFOV_RAD, go2.RENDER_FIELDS),
+    "carter": Mount(
+        carter.CAMERA_POSITION_M, carter.CAMERA_PITCH_RAD, carter.CAMERA_HFOV_RAD, carter.RENDER_FIELDS
+    ),
+}  # fmt: skip
+
+
+class CameraWorld:
+    """Renders what the robot's camera sees. Build it in a process of its own for real time.
+
+    `looks` are the people's appearances; without them those of the seed. Raises ValueError on an unknown robot.
+    """
+
+    def __init__(
+        self, scene: Scene, *, people: int, seed: int, robot: str = "go2", looks: list[Appearance] | None = None
+    ) -> None:
+        if robot not in MOUNTS:
+            raise ValueError(f"camera: unknown robot {robot!r}, expected one of {', '.join(MOUNTS)}")
+        self._looks = appearances(people, seed, scene.name) if looks is None else looks
+        if len(self._looks) != people:
+            raise ValueError(f"camera: expected looks of {people} people, found {len(self._looks)}")
+        self._mount, self._robot_name = MOUNTS[robot], robot
+        self._robot: RobotBody | None = None
+        self._renderer = Renderer(scene.sky)
+        self._near: dict[int, PersonBody] = {}
+        self._far: dict[int, PersonBody] = {}
+        self._shown: dict[int, PersonBody] = {}
+        try:
+            pieces = build_scene(self._renderer, scene)
+            self._fixed = [handle for handle, _ in pieces]
+            self._visibility = Visibility(scene, [bounds for _, bounds in pieces])
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def state_size(self) -> int:
+        """Length of the render state this world takes."""
+        return self._mount.fields + RENDER_FIELDS * len(self._looks)
+
+    def render(self, render_state: Array, width: int, height: int, aspect: float | None = None) -> Picture:
+        """The forward camera's picture, uint8 RGB [height, width, 3]. Raises ValueError on a state of another world.
+
+        `aspect` squeezes the field of view of a picture of that shape into this one's; without it pixels are square.
+        """
+        self._check(render_state)
+        mount = self._mount
+        rotation = rotation_matrix(tuple(float(v) for v in render_state[3:7]))
+        eye = render_state[0:3] + rotation @ mount.position_m
+        forward = rotation @ (cos(mount.pitch_rad), 0.0, -sin(mount.pitch_rad))
+        if self._robot is not None:
+            self._robot.hide()
+        shape = width / height if aspect is None else aspect
+        sight = self._sight(eye, forward, rotation[:, 2], mount.hfov_rad)
+        shown = self._fixed if sight is None else [self._fixed[piece] for piece in self._visibility.pieces(sight)]
+        self._renderer.arrange(self._fixed, shown)
+        self._show_people(render_state, eye, sight)
+        return self._renderer.picture(eye, forward, rotation[:, 2], mount.hfov_rad, width, height, shape)
+
+    def look(
+        self, render_state: Array, eye_m: tuple[float, float, float], target_m: tuple[float, float, float],
+        width: int, height: int, hfov_rad: float = radians(70.0),
+    ) -> Picture:  # fmt: skip
+        """The world, robot included, from anywhere: for reports and for looking at the simulation itself."""
+        self._check(render_state)
+        if self._robot is None:
+            self._robot = RobotBody(self._renderer, self._robot_name)
+        self._robot.pose(render_state[: self._mount.fields])
+        eye = np.array(eye_m)
+        forward = np.array(target_m) - eye
+        forward /= np.linalg.norm(forward)
+        self._renderer.arrange(self._fixed, self._fixed)
+        self._show_people(render_state, eye, None)
+        # Straight down there is no up to hold on to but north.
+        up = np.array((0.0, 0.0, 1.0) if abs(forward[2]) < 0.999 else (0.0, 1.0, 0.0))
+        return self._renderer.picture(eye, forward, up, hfov_rad, width, height, width / height)
+
+    def _check(self, state: Array) -> None:
+        if state.shape != (self.state_size,):
+            raise ValueError(f"render state has shape {state.shape}, this world takes ({self.state_size},)")
+
+    def _sight(self, eye: Array, forward: Array, up: Array, hfov_rad: float) -> Sight | None:
+        """What the robot has in view; None when it lies on its side or looks steeply up or down."""
+        flat = float(np.hypot(forward[0], forward[1]))
+        if up[2] < _UPRIGHT or flat < _UPRIGHT:
+            return None
+        # A camera that is tilted sees a little further to the sides than its angle says.
+        return self._visibility.look(eye[:2], forward[:2] / flat, tan(hfov_rad / 2) / (flat * float(up[2])))
+
+    def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
+        """Pose those who may be in the picture and take all others out of it."""
+        rows = state[self._mount.fields :].reshape(len(self._looks), RENDER_FIELDS)
+        before, self._shown = self._shown, {}
+        if len(rows):
+            gaps = np.hypot(rows[:, 0] - eye[0], rows[:, 1] - eye[1])
+            seen = gaps < _FAR_PERSON_M
+            if sight is not None:
+                seen &= sight.sees(rows[:, :2] - _PERSON_M, rows[:, :2] + _PERSON_M)[0]
+            for index in np.flatnonzero(seen):
+                body = self._body(int(index), bool(gaps[index] < _NEAR_PERSON_M))
+                body.pose(rows[index])
+                self._shown[id(body)] = body
+        for key, body in before.items():
+            if key not in self._shown:
+                body.hide()
+
+    def _body(self, index: int, near: bool) -> PersonBody:
+        bodies = self._near if near else self._far
+        if index not in bodies:
+            bodies[index] = PersonBody(self._renderer, self._looks[index], 1.0 if near else 0.5)
+        return bodies[index]
+
+    def close(self) -> None:
+        """Release the renderer; may be called twice."""
+        if self._robot is not None:
+            self._robot.close()
+        self._renderer.close()

@@ -1,0 +1,1 @@
+"""One leg of a soak: tasks, faults and samples in one running stack."""

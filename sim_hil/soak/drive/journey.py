@@ -1,0 +1,97 @@
+"""The tasks of a soak: from wherever the robot is to a landmark of the scene, told in words. Seeded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import hypot
+from typing import Any, Final
+
+import numpy as np
+
+from sim_hil.benchmark.language.instructions import WordingError, wordings
+from sim_hil.benchmark.language.route import RouteError
+from sim_hil.benchmark.language.tasks import goal_before, goals, make_task, sample_task
+from sim_hil.benchmark.suite.robots import footprint_m
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene, SceneObject, Vec2, Vec3
+
+THRESHOLD_M: Final = 1.5  # paper, equation 6
+LENGTH_M: Final = (4.0, 40.0)
+LONGEST_S: Final = 60.0
+"""At full speed: a slow robot gets shorter ways, or it would be on a single one for a whole leg."""
+TRIES: Final = 24
+_SLOW: Final = 0.6  # of the speed limit: a robot among people does not drive at it all the time
+
+
+@dataclass(frozen=True)
+class SoakTask:
+    """Go to `goal_xy` (m) as told; `shortest_m` is the shortest feasible path from `start` (x m, y m, heading rad)."""
+
+    number: int
+    instruction: str
+    start: Vec3
+    goal_xy: Vec2
+    goal_label: str
+    shortest_m: float
+    timeout_s: float
+
+    def as_json(self) -> dict[str, Any]:
+        """For the events."""
+        return dict(self.__dict__)
+
+
+class Journey:
+    """Draws task after task in one scene. Raises ValueError for a scene without room or landmarks."""
+
+    def __init__(self, scene: Scene, seed: int, leg: int, speed_mps: float) -> None:
+        self.scene = scene
+        self._rng = np.random.default_rng((seed, 62, leg))
+        self._grid = NavGrid(scene, clearance_m=footprint_m("go2"))
+        self._speed_mps = speed_mps
+        self._length_m = (LENGTH_M[0], min(LENGTH_M[1], max(2 * LENGTH_M[0], LONGEST_S * speed_mps)))
+        self._count = 0
+
+    def begin(self) -> Vec3:
+        """A pose to begin a leg at, from which there is a task. Raises ValueError."""
+        for _ in range(TRIES):
+            try:
+                return sample_task(self.scene, self._grid, self._rng, length_m=self._length_m).start
+            except RouteError:
+                continue
+        raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
+
+    def next(self, at: Vec3) -> SoakTask | None:
+        """A task from here; None where there is no way to any landmark.
+
+        Where no way can be told unmistakably (a robot in a corner), a plain "Go to the ..." takes its place.
+        """
+        things = goals(self.scene)
+        order = [things[int(index)] for index in self._rng.permutation(len(things))]
+        seed = int(self._rng.integers(2**31))
+        for lengths_m in (self._length_m, LENGTH_M):
+            for thing in order:
+                try:
+                    task = make_task(self.scene, self._grid, at, thing)
+                    length_m = _length_m(task.path)
+                    if lengths_m[0] <= length_m <= lengths_m[1]:
+                        return self._task(
+                            at, task.goal, thing, length_m, wordings(task.told, 1, seed, held_out=True)[0]
+                        )
+                except (RouteError, WordingError):
+                    continue
+        for thing in order:
+            goal = goal_before(self._grid, thing)
+            path = None if goal is None else self._grid.path((at[0], at[1]), goal)
+            if goal is not None and path is not None and _length_m(tuple(path)) >= LENGTH_M[0]:
+                return self._task(at, goal, thing, _length_m(tuple(path)), f"Go to the {thing.landmark}.")
+        return None
+
+    def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str) -> SoakTask:
+        self._count += 1
+        timeout_s = 20.0 + length_m / (_SLOW * self._speed_mps)
+        return SoakTask(self._count, text, at, goal, thing.label, length_m, timeout_s)
+
+
+def _length_m(path: tuple[Vec2, ...]) -> float:
+    return sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path))

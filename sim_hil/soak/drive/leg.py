@@ -1,0 +1,305 @@
+"""One leg of a soak: one stack in one scene, tasks one after the other without a restart, faults, a sample a second.
+
+A runner that ends (a stop for good, a killed process) is counted and started again with its bridge; a robot that got
+stuck ends the leg. Everything that happens goes to the leg's folder at once, so that a killed soak loses nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import hypot
+from pathlib import Path
+from typing import Any, Final
+
+from edge.run.say import SayError, say
+from sim_hil.realtime.children import StepError
+from sim_hil.realtime.stack import COMMANDS, Stack, StackOptions
+from sim_hil.realtime.truth import TruthTail
+from sim_hil.soak.drive.injector import Injector
+from sim_hil.soak.drive.journey import Journey, SoakTask
+from sim_hil.soak.drive.json_lines import LineFile
+from sim_hil.soak.drive.processes import ProcessSampler
+from sim_hil.soak.drive.schedule import FaultMenu, FaultSchedule
+from sim_hil.soak.drive.task_run import TaskRun
+
+SAMPLE_NS: Final = 1_000_000_000
+POLL_S: Final = 0.05
+ARM_TIMEOUT_S: Final = 90.0
+TELL_AGAIN_NS: Final = 1_000_000_000
+FAULT_AFTER_NS: Final = 3_000_000_000
+"""A stop so soon after a fault's end, or after a contact, is put down to it."""
+STUCK_LIVES: Final = 3
+"""So many runners in a row that have ended within STUCK_M of each other: the robot does not get away."""
+STUCK_M: Final = 0.5
+CONTACT: Final = "contact"
+CONTACT_STOPS: Final = frozenset(("odometry-stays-frozen", "odometry-speed-mismatch", "tipped-over"))
+"""What a robot that has walked into something is stopped for."""
+SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
+
+
+class _StoppedError(Exception):
+    """Somebody asked for the end."""
+
+
+@dataclass(frozen=True)
+class LegOptions:
+    """What a leg is: its number from 1 on, its stack and how long it drives."""
+
+    number: int
+    seed: int
+    duration_s: float
+    speed_mps: float
+    stack: StackOptions
+
+
+class Leg:
+    """Runs one leg; `tell` gets a line about what is going on, a few times a second."""
+
+    def __init__(
+        self,
+        options: LegOptions,
+        journey: Journey,
+        menu: FaultMenu | None,
+        *,
+        stopped: Callable[[], bool],
+        tell: Callable[[str], None],
+        commands: Mapping[str, Sequence[str]] = COMMANDS,
+    ) -> None:
+        self._options = options
+        self._journey = journey
+        self._menu = menu
+        self._stopped = stopped
+        self._tell = tell
+        self._stack = Stack(options.stack, commands)
+        self._truth = TruthTail(self._stack.trace)
+        self._sampler = ProcessSampler()
+        self._injector: Injector | None = None
+        self._task: TaskRun | None = None
+        self._touched_ns = 0
+        self._begin_ns = 0
+        self._driven_ns: int | None = None
+        self._sampled_ns = 0
+        self._armed = False
+        self._lives: list[tuple[float, float]] = []
+        self.tasks = self.reached = self.stops = 0
+
+    def run(self) -> str:
+        """Run it and return why it ended: duration, stopped, stuck, no-task. Raises StepError, OSError, FaultError."""
+        folder = self._options.stack.folder
+        stack = asdict(self._options.stack)
+        about = {
+            **asdict(self._options),
+            "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
+        }
+        (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        with LineFile(folder / EVENTS) as self._events, LineFile(folder / SAMPLES) as self._samples, self._stack:
+            self._begin_ns = time.monotonic_ns()
+            self._note("leg_begin", scene=self._options.stack.scene, people=self._options.stack.people)
+            if self._menu is not None:
+                schedule = FaultSchedule(self._menu, self._options.seed, self._options.number)
+                self._injector = Injector(self._stack, schedule, self._note)
+            try:
+                self._stack.start_robot(self._wait)
+                why = self._lives_of_runners()
+            except _StoppedError:
+                why = "stopped"
+            self._end_task("cut")
+            if self._stack.runner is not None:
+                code = self._stack.end_runner()
+                self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
+            self._stack.end_bridge()
+            self._stack.end_robot()
+            self._note("leg_end", why=why)
+        return why
+
+    def _lives_of_runners(self) -> str:
+        while True:
+            task = self._next_task()
+            if task is None:
+                return "no-task"
+            self._stack.start_bridge(self._wait)
+            self._stack.start_runner(task.instruction)
+            self._note("life_begin", run=self._stack.runs)
+            self._await_arming()
+            if self._armed:
+                self._begin_task(task)
+            why = self._drive() if self._armed else None
+            if why is not None:
+                return why
+            if self._life_over():
+                return "stuck"
+
+    def _await_arming(self) -> None:
+        runner = self._stack.runner
+        assert runner is not None
+        deadline_ns = time.monotonic_ns() + round(ARM_TIMEOUT_S * 1e9)
+        while runner.running and not self._stack.armed():
+            if time.monotonic_ns() > deadline_ns:
+                raise runner.failure(f"not armed within {ARM_TIMEOUT_S:g} s")
+            self._wait()
+            time.sleep(POLL_S)
+        self._armed = self._stack.armed()
+        if self._armed:
+            self._driven_ns = self._driven_ns or time.monotonic_ns()
+            self._note("armed", run=self._stack.runs)
+
+    def _drive(self) -> str | None:
+        """Until the runner or the bridge ends (None) or the leg does (why)."""
+        runner, bridge = self._stack.runner, self._stack.bridge
+        assert runner is not None and bridge is not None
+        untold: SoakTask | None = None
+        tell_ns = 0
+        while runner.running and bridge.running:
+            self._wait()
+            end = self._look()
+            now_ns = time.monotonic_ns()
+            if self._injector is not None:
+                self._injector.step(now_ns)
+            if self._left_s(now_ns) <= 0:
+                return "duration"
+            if end is not None:
+                self._end_task(end)
+                untold, tell_ns = self._next_task(), now_ns
+                if untold is None:
+                    return "no-task"
+            if untold is not None and now_ns >= tell_ns:
+                if self._hand_over(untold):
+                    self._begin_task(untold)
+                    untold = None
+                tell_ns = time.monotonic_ns() + TELL_AGAIN_NS  # one that is too busy to answer drives on
+            time.sleep(POLL_S)
+        return None
+
+    def _hand_over(self, task: SoakTask) -> bool:
+        try:
+            say(self._stack.instructions, task.instruction)
+        except (SayError, OSError) as error:
+            # If it is ending: what it ended by is found by whoever looks at its process.
+            self._note("not_told", why=str(error))
+            return False
+        return True
+
+    def _life_over(self) -> bool:
+        """Count a runner that has ended by itself; True when the robot has got stuck."""
+        self._look()
+        explained = self._explanation()
+        during = None if self._injector is None else self._injector.active
+        self._end_task("stopped")
+        bridge = self._stack.bridge
+        bridge_died = bridge is not None and not bridge.running
+        code = self._stack.end_runner()  # it may take a moment longer when its bridge was killed
+        self._stack.end_bridge()
+        cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
+        if explained == CONTACT and not raised & CONTACT_STOPS:
+            explained = ""
+        about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
+        self._note("life_end", run=self._stack.runs, code=code, **about)
+        self.stops += 1
+        if self._injector is not None:
+            self._injector.clear()
+        self._armed = False
+        pose = self._truth.newest
+        assert pose is not None
+        self._lives.append((pose.x_m, pose.y_m))
+        last = self._lives[-STUCK_LIVES:]
+        return len(last) == STUCK_LIVES and all(hypot(x - last[-1][0], y - last[-1][1]) < STUCK_M for x, y in last)
+
+    def _explanation(self) -> str:
+        """What a stop is put down to: a fault that should end the run, a contact, or nothing ("")."""
+        now_ns, injector = time.monotonic_ns(), self._injector
+        newest = None if injector is None else injector.newest
+        stops = newest is not None and newest.fault.expect == "stop"
+        if injector is not None and newest is not None and stops and now_ns - injector.newest_ns < FAULT_AFTER_NS:
+            return newest.fault.name
+        return CONTACT if now_ns - self._touched_ns < FAULT_AFTER_NS else ""
+
+    def _next_task(self) -> SoakTask | None:
+        while self._truth.newest is None:
+            self._look()
+            self._wait()
+            time.sleep(POLL_S)
+        self._look()
+        pose = self._truth.newest
+        return self._journey.next((pose.x_m, pose.y_m, pose.theta_rad))
+
+    def _begin_task(self, task: SoakTask) -> None:
+        self._task = TaskRun(task, time.monotonic_ns())
+        self._note("task_begin", task=task.as_json(), run=self._stack.runs)
+
+    def _end_task(self, end: str) -> None:
+        if self._task is None:
+            return
+        outcome = self._task.outcome(end)
+        self._task = None
+        self._note("task_end", **outcome.as_json())
+        if end != "cut":
+            self.tasks += 1
+            self.reached += outcome.success
+
+    def _look(self) -> str | None:
+        """Take the new ground truth; why the task is over, if it is."""
+        end: str | None = None
+        for pose in self._truth.update():
+            if pose.touching:
+                self._touched_ns = pose.t_ns
+            if self._task is not None and end is None:
+                end = self._task.add(pose)
+        return end
+
+    def _wait(self) -> None:
+        """One turn of any wait: an end that was asked for, the health of the robot's side, a sample when it is due."""
+        if self._stopped():
+            raise _StoppedError
+        robot = self._stack.robot
+        if robot is not None and not robot.running:
+            raise StepError(f"the robot's side has ended with exit code {robot.process.returncode}, see {robot.log}")
+        now_ns = time.monotonic_ns()
+        if now_ns - self._sampled_ns >= SAMPLE_NS:
+            self._sampled_ns = max(self._sampled_ns + SAMPLE_NS, now_ns - SAMPLE_NS // 2)
+            self._sample(now_ns)
+
+    def _sample(self, now_ns: int) -> None:
+        self._look_for_sample()
+        pose = self._truth.newest
+        sample: dict[str, Any] = {
+            "t_ns": now_ns,
+            "elapsed_s": round((now_ns - self._begin_ns) / 1e9, 3),
+            "run": self._stack.runs,
+            "armed": self._armed,
+            "task": None if self._task is None else self._task.task.number,
+            "fault": None if self._injector is None else self._injector.active,
+            "pose": None if pose is None else [pose.x_m, pose.y_m, pose.theta_rad],
+            "processes": self._sampler.sample(self._stack.processes()),
+        }
+        self._samples.add(sample)
+        self._tell(
+            f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
+            f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
+            + (f" · {sample['fault']}" if sample["fault"] else "")
+        )
+
+    def _left_s(self, now_ns: int) -> float:
+        """A leg's time begins when its first runner drives: how long that takes is the machine's affair."""
+        begun_ns = now_ns if self._driven_ns is None else self._driven_ns
+        return self._options.duration_s - (now_ns - begun_ns) / 1e9
+
+    def _look_for_sample(self) -> None:
+        """While nothing is driven nobody else looks at the ground truth."""
+        if self._task is None:
+            self._look()
+
+    def _note(self, kind: str, **fields: Any) -> None:
+        self._events.add({"t_ns": time.monotonic_ns(), "kind": kind, **fields})
+
+
+def _end_of_run(result: Path) -> tuple[str, set[str]]:
+    """What the runner itself says it ended by, and all faults that it has raised; nothing when it was killed."""
+    try:
+        content = json.loads(result.read_text(encoding="utf-8"))
+        faults, raised = content["faults"], set(content["control"]["faults"])
+    except (OSError, ValueError, KeyError):
+        return "", set()
+    return (str(faults[0]) if faults else ""), raised

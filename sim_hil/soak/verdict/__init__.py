@@ -1,0 +1,1 @@
+"""What a soak has measured, and whether it stays within its budget."""

@@ -1,0 +1,74 @@
+"""Where meshes are shown and moved: the camera's renderer is one stage, PyBullet's window the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import pybullet
+
+from sim_hil.world.drawing.mesh import MeshBuilder, Surface
+from sim_hil.world.drawing.textures import palette, write_png
+
+Vec3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
+
+_AWAY: Vec3 = (0.0, 0.0, -1000.0)
+
+
+class Stage(Protocol):
+    """Shows meshes; a mesh once added is moved by its handle."""
+
+    def add(self, mesh: MeshBuilder) -> int:
+        """Show a mesh as it was built, and return its handle."""
+        ...
+
+    def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
+        """Put a mesh's origin there, turned so; shows it again when it was hidden."""
+        ...
+
+    def hide(self, handle: int) -> None:
+        """Take a mesh out of every picture until it is placed."""
+        ...
+
+
+class BulletStage:
+    """A stage in a PyBullet client: bodies without collision. Pictures pass through PNG files in `folder`."""
+
+    def __init__(self, client: int, folder: Path) -> None:
+        self._client, self._folder = client, folder
+        self._made: list[list[int]] = []
+        self._pictures = 0
+
+    def add(self, mesh: MeshBuilder) -> int:
+        """Show a mesh as it was built, and return its handle."""
+        self._made.append([self._body(surface) for surface in mesh.surfaces()])
+        return len(self._made) - 1
+
+    def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
+        """Put a mesh's origin there, turned so."""
+        for body in self._made[handle]:
+            pybullet.resetBasePositionAndOrientation(body, position_m, quaternion_xyzw, physicsClientId=self._client)
+
+    def hide(self, handle: int) -> None:
+        """Take a mesh out of sight until it is placed."""
+        self.place(handle, _AWAY, (0.0, 0.0, 0.0, 1.0))
+
+    def _body(self, surface: Surface) -> int:
+        image, uvs = surface.image, surface.uvs
+        if image is None:
+            # Its visual shapes take no colours of vertices: they become cells of one palette picture.
+            colours = sorted(set(surface.colours))
+            cell = {colour: (index + 0.5) / len(colours) for index, colour in enumerate(colours)}
+            image, uvs = palette(colours), [(cell[colour], 0.5) for colour in surface.colours]
+        path = write_png(image, self._folder / f"stage-{self._pictures}.png")
+        self._pictures += 1
+        client = self._client
+        handle = pybullet.loadTexture(str(path), physicsClientId=client)
+        shape = pybullet.createVisualShape(
+            pybullet.GEOM_MESH, vertices=surface.vertices, indices=surface.indices, uvs=uvs, normals=surface.normals,
+            physicsClientId=client,
+        )  # fmt: skip
+        body = int(pybullet.createMultiBody(0, -1, shape, physicsClientId=client))
+        pybullet.changeVisualShape(body, -1, textureUniqueId=handle, physicsClientId=client)
+        return body

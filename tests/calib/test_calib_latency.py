@@ -1,0 +1,173 @@
+"""`edge-calib latency`: generation times beside control, or out of a log, become a profile that others draw from."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.cli import main
+from calib.latency import LEAST
+from calib.latency_load import WARM, Generations, MeasureError, measure
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
+from edge.flightlog.recorder import Recorder
+from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile, times_of
+from edge.run.reasoning_loop import Mode
+from export.evaluation.calibration import load_calibration
+from sim_hil.benchmark.conditions.latency import parse_latency
+
+INSTRUCTION = "walk down the corridor"
+
+
+def semantic(started_s: float, anchor_s: float, ready_s: float) -> dict[str, int]:
+    return {"started_ns": round(started_s * 1e9), "anchor_ns": round(anchor_s * 1e9), "ready_ns": round(ready_s * 1e9)}
+
+
+@pytest.fixture
+def flight_log(tmp_path: Path) -> Path:
+    """A run of 30 generations of 1.5 s, their newest frames 0.5 s late."""
+    recorder = Recorder(tmp_path / "flight.mcap")
+    for number in range(30):
+        record = semantic(2.0 * number, 2.0 * number + 0.5, 2.0 * number + 1.5)
+        recorder.put("/semantic", record["ready_ns"], record)
+    recorder.close(5.0)
+    return tmp_path / "flight.mcap"
+
+
+def run(*arguments: object) -> int:
+    return main(["latency", *map(str, arguments)])
+
+
+def test_a_log_becomes_a_profile_that_the_benchmark_reads(flight_log: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "profile.json"
+    assert run("--log", flight_log, "--out", out, "--json", "-") == EXIT_DONE
+    profile = parse_latency(f"profile:{out}")
+    assert profile.generation_s == pytest.approx([1.5] * 30) and profile.anchor_after_s == pytest.approx([0.5] * 30)
+    assert profile.tagged == "measured"
+    told = json.loads(capsys.readouterr().out)
+    assert told["generations"] == 30 and told["mean_s"] == pytest.approx(1.5) and told["tagged"] == "measured"
+
+
+def test_a_scaled_profile_has_that_mean_and_says_that_it_is_modelled(flight_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "profile.json"
+    assert run("--log", flight_log, "--scale-to-mean", 3, "--out", out) == EXIT_DONE
+    profile = load_profile(out)
+    assert profile.mean_s == pytest.approx(3.0) and profile.tagged == "modelled"
+    assert "flight log" in profile.source and "scaled by 2 to a mean of 3 s" in profile.source
+    assert profile.anchor_after_s == pytest.approx([1.0] * 30)
+
+
+def test_scaling_keeps_the_shape() -> None:
+    profile = LatencyProfile("n", "s", (1.0, 2.0, 6.0), (0.0, 1.0, 6.0), "measured").scaled_to_mean(1.5)
+    assert profile.generation_s == pytest.approx((0.5, 1.0, 3.0))
+    assert profile.anchor_after_s == pytest.approx((0.0, 0.5, 3.0))
+
+
+@pytest.mark.parametrize("mean_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_mean_that_no_profile_has_is_refused(mean_s: float) -> None:
+    with pytest.raises(LatencyError, match="means above 0 s"):
+        LatencyProfile("n", "s", (1.0,)).scaled_to_mean(mean_s)
+
+
+def test_a_profile_says_whether_it_was_measured_or_that_nobody_knows() -> None:
+    content = {"schema": 1, "name": "n", "source": "s", "generation_s": [1.0]}
+    assert LatencyProfile.of_json(content).tagged == "modelled"
+    assert LatencyProfile.of_json({**content, "tagged": "measured"}).tagged == "measured"
+    with pytest.raises(LatencyError, match="expected tagged to be measured or modelled"):
+        LatencyProfile.of_json({**content, "tagged": "guessed"})
+
+
+def test_a_frame_older_than_its_generation_counts_into_its_time() -> None:
+    assert times_of(semantic(4.0, 3.9, 6.0)) == pytest.approx((2.1, 0.0))
+    assert times_of(semantic(1.0, 1.5, 4.0)) == pytest.approx((3.0, 0.5))
+
+
+def test_too_few_generations_make_no_profile(tmp_path: Path, capsys: Any) -> None:
+    few, out = tmp_path / "few.json", tmp_path / "profile.json"
+    few.write_text(json.dumps(LatencyProfile("n", "s", (1.0,) * (LEAST - 1)).as_json()))
+    assert run("--log", few, "--out", out) == EXIT_CHECK_FAILED
+    assert f"expected {LEAST} or more" in capsys.readouterr().err and not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--log", "nowhere.mcap", "--out", "p.json"), "nowhere.mcap"),
+        (("--artifacts", "nowhere", "--out", "p.json"), "nowhere"),
+        (("--log", "x.json", "--out", "p.toml"), "ends in .json"),
+        (("--log", "x.json", "--out", "no/where/p.json"), "there is no directory"),
+        (("--log", "x.json", "--out", "p.json", "--generations", "1"), "--generations 1"),
+        (("--log", "x.json", "--out", "p.json", "--seconds", "nan"), "--seconds nan"),
+        (("--log", "x.json", "--out", "p.json", "--instruction", ""), "instruction"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(
+    arguments: tuple[str, ...], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == EXIT_BAD_INPUT
+    told = capsys.readouterr().err
+    assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_generations_are_taken_as_a_flight_log_would_have_them() -> None:
+    found = Generations()
+    found.put("/tick", 1, {})
+    found.put("/semantic", 2, semantic(1.0, 1.5, 4.0))
+    assert found.times_s == [pytest.approx((3.0, 0.5))]
+
+
+def test_a_model_thinks_beside_ticks_and_the_first_generations_are_left_out(artifacts_dir: Path) -> None:
+    said: list[str] = []
+    measured = measure(
+        load_artifacts(artifacts_dir),
+        load_calibration("corridor-go2").clips[0],
+        instruction=INSTRUCTION,
+        mode=Mode.ASYNC,
+        generations=2,
+        seconds=60.0,
+        say=said.append,
+        stop=threading.Event(),
+    )
+    assert len(measured.times_s) >= 2 and measured.failed == 0
+    assert all(0 <= anchor_s < total_s < 60 for total_s, anchor_s in measured.times_s)
+    # Ticks went on all the while: ten a second, were it not for a busy machine.
+    assert measured.ticks >= len(measured.times_s) + WARM
+
+
+def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts_dir: Path) -> None:
+    measured = measure(
+        load_artifacts(artifacts_dir),
+        load_calibration("corridor-go2").clips[0],
+        instruction=INSTRUCTION,
+        mode=Mode.NO_REASONING,
+        generations=10_000,
+        seconds=0.5,
+        say=lambda _line: None,
+        stop=threading.Event(),
+    )
+    assert len(measured.times_s) < 10_000
+
+
+def test_a_control_thread_that_dies_ends_the_measurement(artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from calib import latency_load
+
+    def fail(_self: object) -> None:
+        raise ValueError("no picture")
+
+    monkeypatch.setattr(latency_load.Ticks, "_tick", fail)
+    with pytest.raises(MeasureError, match="no picture"):
+        measure(
+            load_artifacts(artifacts_dir),
+            load_calibration("corridor-go2").clips[0],
+            instruction=INSTRUCTION,
+            mode=Mode.ASYNC,
+            generations=2,
+            seconds=60.0,
+            say=lambda _line: None,
+            stop=threading.Event(),
+        )

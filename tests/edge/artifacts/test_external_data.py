@@ -1,0 +1,104 @@
+"""The reader of external data finds every tensor that onnx could, and takes any bytes."""
+
+from __future__ import annotations
+
+import contextlib
+
+import onnx
+import pytest
+from google.protobuf.descriptor import Descriptor
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import helper
+
+from edge.artifacts.external_data import FIELDS, TENSOR, ExternalData, ExternalDataError, external_data
+
+
+def paths_to_tensors() -> dict[str, dict[int, str]]:
+    """From onnx's own description of its messages: the fields from which a TensorProto can be reached."""
+    inside: dict[str, dict[int, str]] = {}
+    waiting: list[Descriptor] = [onnx.ModelProto.DESCRIPTOR]
+    while waiting:
+        message = waiting.pop()
+        if message.name not in inside:
+            parts = [field for field in message.fields if field.message_type is not None]
+            inside[message.name] = {field.number: field.message_type.name for field in parts}
+            waiting += [field.message_type for field in parts]
+    reaching = {TENSOR}
+    while True:
+        more = {name for name, fields in inside.items() if reaching & set(fields.values())} - reaching
+        if not more:
+            break
+        reaching |= more
+    return {
+        name: {number: kind for number, kind in inside[name].items() if kind in reaching}
+        for name in reaching - {TENSOR}
+    }
+
+
+def test_no_place_where_a_tensor_can_sit_is_overlooked() -> None:
+    assert {name: dict(fields) for name, fields in FIELDS.items()} == paths_to_tensors()
+
+
+def test_the_entries_are_where_onnx_has_them() -> None:
+    assert onnx.TensorProto.DESCRIPTOR.fields_by_name["external_data"].number == 13
+    fields = onnx.StringStringEntryProto.DESCRIPTOR.fields_by_name
+    assert (fields["key"].number, fields["value"].number) == (1, 2)
+
+
+def outside(location: str) -> onnx.TensorProto:
+    tensor = onnx.TensorProto(name=location, data_type=1, dims=[2], data_location=onnx.TensorProto.EXTERNAL)
+    for key, value in (("location", location), ("offset", "16"), ("length", "8")):
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+    return tensor
+
+
+def test_tensors_are_found_in_initializers_attributes_subgraphs_and_functions() -> None:
+    branch = helper.make_graph([helper.make_node("Constant", [], ["c"], value=outside("branch"))], "b", [], [])
+    nodes = [
+        helper.make_node("Constant", [], ["a"], value=outside("attribute")),
+        helper.make_node("If", ["a"], ["d"], then_branch=branch, else_branch=branch),
+    ]
+    graph = helper.make_graph(
+        nodes, "g", [], [], initializer=[outside("initializer"), helper.make_tensor("x", 1, [1], [1])]
+    )
+    function = helper.make_function(
+        "ours", "f", [], ["y"], [helper.make_node("Constant", [], ["y"], value=outside("function"))], []
+    )
+    model = helper.make_model(graph, functions=[function])
+    found = sorted(external_data(model.SerializeToString()), key=lambda data: data.location)
+    places = ["attribute", "branch", "branch", "function", "initializer"]
+    assert found == [ExternalData(place, 16, 8) for place in places]
+
+
+def test_a_graph_given_twice_hides_nothing() -> None:
+    """Protobuf merges a field that comes twice; so both must be read."""
+    first = onnx.ModelProto(graph=helper.make_graph([], "g", [], []))
+    second = onnx.ModelProto(graph=helper.make_graph([], "g", [], [], initializer=[outside("hidden")]))
+    merged = first.SerializeToString() + second.SerializeToString()
+    assert len(onnx.ModelProto.FromString(merged).graph.initializer) == 1
+    assert [data.location for data in external_data(merged)] == ["hidden"]
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+    try:
+        list(external_data(data))
+    except ExternalDataError as error:
+        assert "\n" not in str(error)
+
+
+@given(st.data())
+def test_a_damaged_model_is_read_or_refused(data: st.DataObject) -> None:
+    model = onnx.ModelProto(graph=helper.make_graph([], "g", [], [], initializer=[outside("w")])).SerializeToString()
+    damaged = bytearray(model)
+    damaged[data.draw(st.integers(0, len(model) - 1))] ^= data.draw(st.integers(1, 255))
+    with contextlib.suppress(ExternalDataError):
+        list(external_data(bytes(damaged)))
+
+
+@pytest.mark.parametrize("data", [b"\x0b", b"\x3a\xff\xff\xff\xff\x0f", b"\x08" + b"\xff" * 10, b"\x3a"], ids=bytes.hex)
+def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
+    with pytest.raises(ExternalDataError, match="not an ONNX model"):
+        list(external_data(data))

@@ -1,0 +1,356 @@
+"""`edge-doctor`: where every node ran, what a tick takes, whether bridge and robot answer; its exit codes and JSON."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.artifacts.files import ArtifactError, seal
+from edge.artifacts.manifest import Artifacts
+from edge.artifacts.target_facts import GIB, PlanFacts, plan_facts, target_facts
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
+from edge.core.device import CUDA
+from edge.deploy.doctor.check import Check, Level
+from edge.deploy.doctor.command import examine, main, parser
+from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
+from edge.deploy.doctor.robot import bridge, robot_link
+from edge.deploy.install import main as install
+from edge.inference.graph import CPU_PROVIDER
+from export.target.file import load_target
+from firmware_bridge.client import BridgeUnavailable
+from firmware_bridge.core.config import RobotConfig, load_robot_config
+from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.unitree.client import CameraError
+from firmware_bridge.unitree.dds import DdsError
+from tests.support.processes import GO2_SIM
+
+PLAN = PlanFacts(100.0, 60.0, 40.0, 0.2, 1100, 4 * GIB, "modelled")
+
+
+def event(name: str, provider: str, operator: str, size: int = 4096, duration_us: int = 10) -> dict[str, Any]:
+    args = {"provider": provider, "op_name": operator, "output_size": str(size)}
+    return {"cat": "Node", "name": f"{name}_kernel_time", "dur": duration_us, "args": args}
+
+
+def test_a_profile_tells_where_every_node_ran() -> None:
+    events = [
+        {"cat": "Session", "name": "session_initialization"},
+        event("a", CUDA, "MatMul", duration_us=5),
+        event("a", CUDA, "MatMul", duration_us=7),
+        event("b", CPU_PROVIDER, "Shape", size=16),
+    ]
+    assert placements(events) == [
+        Placement(CPU_PROVIDER, "Shape", 1, 16, 10),
+        Placement(CUDA, "MatMul", 1, 4096, 12),
+    ]
+
+
+@pytest.mark.parametrize("events", [[], [{"cat": "Node", "name": "a_kernel_time", "args": {}}], ["text"]])
+def test_a_profile_that_does_not_tell_is_refused(events: Sequence[Any]) -> None:
+    with pytest.raises(ValueError, match="node"):
+        placements(events)
+
+
+def judged(*places: Placement) -> Check:
+    return judge_placement("vision_encoder", CUDA, places)
+
+
+ON_CUDA = Placement(CUDA, "MatMul", 100, 1 << 20, 5000)
+
+
+def test_a_graph_that_is_all_on_its_provider_is_fine() -> None:
+    assert judged(ON_CUDA).level is Level.OK
+
+
+def test_one_node_that_fell_back_to_the_processor_fails_and_is_named() -> None:
+    check = judged(ON_CUDA, Placement(CPU_PROVIDER, "LayerNormalization", 1, 1 << 20, 1500))
+    assert check.level is Level.FAIL
+    assert "1 LayerNormalization on CPUExecutionProvider take 1.50 ms" in check.found
+
+
+def test_nodes_that_reckon_with_shapes_belong_on_the_processor() -> None:
+    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "Gather", 3, 32, 5)).level is Level.OK
+    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "MemcpyToHost", 2, 1 << 20, 50)).level is Level.OK
+
+
+def test_the_same_operator_on_real_data_does_not() -> None:
+    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "Gather", 1, 1 << 20, 900)).level is Level.FAIL
+
+
+def test_a_third_provider_is_no_harmless_place() -> None:
+    assert judged(ON_CUDA, Placement("OpenVINOExecutionProvider", "Shape", 1, 8, 1)).level is Level.FAIL
+
+
+def test_every_graph_of_real_artifacts_runs_where_its_manifest_says(artifacts: Artifacts) -> None:
+    checks = [profile_graph(artifacts, name) for name in artifacts.graphs]
+    assert [check.level for check in checks] == [Level.OK] * len(artifacts.graphs), checks
+
+
+@pytest.mark.filterwarnings("ignore:Specified provider")
+def test_a_graph_that_onnx_runtime_quietly_runs_on_the_processor_instead_fails(artifacts: Artifacts) -> None:
+    graph = artifacts.graphs["action_expert"]
+    moved = dataclasses.replace(graph, session=dataclasses.replace(graph.session, provider=CUDA))
+    check = profile_graph(
+        dataclasses.replace(artifacts, graphs={**artifacts.graphs, "action_expert": moved}), "action_expert"
+    )
+    assert check.level is Level.FAIL
+    assert "nodes on CPUExecutionProvider" in check.found
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "level"),
+    [([40.0] * 50, Level.OK), ([59.0] * 50, Level.OK), ([61.0] * 50, Level.WARN), ([40.0] * 9 + [150.0], Level.FAIL)],
+)
+def test_ticks_are_held_against_the_plan_and_the_period(times_ms: list[float], level: Level) -> None:
+    assert judge_ticks(times_ms, PLAN, 100).level is level
+
+
+def test_without_a_plan_only_the_period_counts() -> None:
+    assert judge_ticks([99.0] * 10, None, 100).level is Level.OK
+    assert judge_ticks([], None, 100).level is Level.SKIP
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotConfig:
+    return load_robot_config(GO2_SIM, socket=tmp_path_factory.mktemp("run") / "bridge.sock")
+
+
+def status(state: str, blocked_by: str = "none") -> BridgeStatus:
+    return BridgeStatus(1, state, "why", 0, 0, 0, (0.0, 0.0, 0.0), True, "none", blocked_by)
+
+
+def test_a_bridge_that_would_arm_is_fine(robot: RobotConfig) -> None:
+    assert bridge(robot, lambda _robot: status("disarmed")).level is Level.OK
+
+
+def test_a_bridge_that_would_refuse_says_why(robot: RobotConfig) -> None:
+    check = bridge(robot, lambda _robot: status("stopped", "estop"))
+    assert (check.level, "estop" in check.found) == (Level.FAIL, True)
+    assert "`edge-bridge arm` while a runner waits" in check.advice
+
+
+def test_a_bridge_that_waits_for_its_operator_is_fine_and_says_so(robot: RobotConfig) -> None:
+    check = bridge(robot, lambda _robot: status("disarmed", "operator"))
+    assert (check.level, "edge-bridge arm" in check.found) == (Level.OK, True)
+
+
+def test_a_bridge_that_is_not_there_fails(robot: RobotConfig) -> None:
+    assert bridge(robot).level is Level.FAIL
+
+
+def jpeg(value: int | None) -> bytes:
+    picture = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    ok, data = cv2.imencode(".jpg", picture if value is None else np.full_like(picture, value))
+    assert ok
+    return bytes(data)
+
+
+class FakeRobot:
+    """What `Go2Reader` gives, without a bus."""
+
+    def __init__(self, frame: bytes | Exception, *, silent: bool = False, surplus: str | None = None) -> None:
+        self._frame, self._silent, self._surplus = frame, silent, surplus
+        self.closed = False
+
+    def state(self) -> Any:
+        return None if self._silent else argparse.Namespace(mode=1, error_code=0)
+
+    def request_frame(self, timeout_s: float) -> bytes:
+        if isinstance(self._frame, Exception):
+            raise self._frame
+        return self._frame
+
+    def surplus_publishers(self) -> str | None:
+        return self._surplus
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def levels(robot: RobotConfig, fake: FakeRobot) -> list[Level]:
+    found = [check.level for check in robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)]
+    assert fake.closed
+    return found
+
+
+def test_a_robot_that_reports_and_shows_a_picture_is_fine(robot: RobotConfig) -> None:
+    assert levels(robot, FakeRobot(jpeg(None))) == [Level.OK, Level.OK]
+
+
+def test_a_second_robot_on_the_network_fails_and_is_named(robot: RobotConfig) -> None:
+    fake = FakeRobot(jpeg(None), surplus="2 publishers of rt/sportmodestate, expected 1")
+    check = robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)[0]
+    assert (check.level, "2 publishers of rt/sportmodestate" in check.found) == (Level.FAIL, True)
+    assert "two robots" in check.advice
+
+
+def test_the_camera_of_a_silent_robot_is_not_asked(robot: RobotConfig) -> None:
+    assert levels(robot, FakeRobot(jpeg(None), silent=True)) == [Level.FAIL, Level.SKIP]
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [CameraError("camera: no answer"), b"\xff\xd8 no picture", b"", jpeg(0)],
+    ids=["none", "torn", "0", "black"],
+)
+def test_a_camera_without_a_usable_picture_fails(robot: RobotConfig, frame: bytes | Exception) -> None:
+    assert levels(robot, FakeRobot(frame)) == [Level.OK, Level.FAIL]
+
+
+def test_a_bus_that_cannot_be_joined_fails(robot: RobotConfig) -> None:
+    def refuse(_robot: RobotConfig) -> FakeRobot:
+        raise DdsError("DDS: cannot join domain 0 on interface 'eth0'")
+
+    assert [check.level for check in robot_link(robot, 224, open_reader=refuse)] == [Level.FAIL, Level.SKIP]
+
+
+def run(tmp_path: Path, *words: str) -> tuple[int, dict[str, Any]]:
+    result = tmp_path / "doctor.json"
+    code = main([*words, "--json", str(result)])
+    return code, json.loads(result.read_text())
+
+
+def by_name(result: dict[str, Any]) -> dict[str, dict[str, str]]:
+    return {check["name"]: check for check in result["checks"]}
+
+
+def test_real_artifacts_on_the_machine_that_they_are_for(artifacts_dir: Path, tmp_path: Path) -> None:
+    code, result = run(
+        tmp_path, "--artifacts", str(artifacts_dir), "--target", "cpu", "--ticks", "3", "--logs", str(tmp_path)
+    )
+    checks = by_name(result)
+    assert checks["target"]["level"] == checks["provider of vision_encoder"]["level"] == "ok"
+    assert "ms of 3 ticks" in checks["tick"]["found"]
+    assert code == (EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED)
+    assert sum(result["counts"].values()) == len(result["checks"])
+
+
+def test_what_is_not_given_is_said_to_be_skipped(tmp_path: Path) -> None:
+    _, result = run(tmp_path, "--logs", str(tmp_path))
+    checks = by_name(result)
+    for name in ("artifacts", "target", "tick", "robot file"):
+        assert checks[name]["level"] == "skip"
+        assert checks[name]["found"].startswith("skipped: ")
+
+
+def test_artifacts_of_another_target_fail(artifacts_dir: Path, tmp_path: Path) -> None:
+    code, result = run(tmp_path, "--artifacts", str(artifacts_dir), "--target", "orin", "--ticks", "0")
+    assert code == EXIT_CHECK_FAILED
+    assert by_name(result)["artifacts"]["level"] == "fail"
+
+
+def test_artifacts_that_do_not_verify_fail_and_the_rest_is_still_looked_at(tmp_path: Path) -> None:
+    code, result = run(tmp_path, "--artifacts", str(tmp_path / "none"))
+    assert code == EXIT_CHECK_FAILED
+    assert by_name(result)["artifacts"]["level"] == "fail"
+    assert "clock" in by_name(result)
+
+
+def test_a_manifest_that_says_nonsense_of_its_device_is_a_failure_among_others(
+    artifacts_dir: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["provenance"]["target"]["device"]["cores"] = "two"
+    manifest["plan"]["tick_ms"] = -1
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    code, result = run(tmp_path, "--artifacts", str(copy), "--ticks", "0", "--logs", str(tmp_path))
+    checks = by_name(result)
+    assert code == EXIT_CHECK_FAILED
+    assert checks["target in the manifest"]["level"] == checks["plan in the manifest"]["level"] == "fail"
+    assert "clock" in checks
+
+
+def test_the_memory_of_a_graphics_card_is_known_from_that_of_a_machine() -> None:
+    for name, own in (("cpu", False), ("orin", False), ("rtx4060", True)):
+        facts = target_facts({"provenance": {"target": load_target(name).to_dict()}})
+        assert facts is not None
+        assert facts.own_memory is own
+
+
+def test_missing_engines_fail_with_the_command_that_builds_them(artifacts_dir: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "orin"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    target = load_target("orin", "nano")
+    for name in ("vision_encoder", "semantic_context", "action_expert"):
+        entry = manifest["graphs"][name]
+        entry["session"] = target.session(name, entry["inputs"])
+    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    args = parser().parse_args(["--artifacts", str(copy)])
+    checks = {check.name: check for check in examine(args)}
+    assert checks["engines"].level is Level.FAIL
+    assert checks["engines"].advice.startswith("edge-install engines")
+    assert checks["tick"].level is Level.SKIP
+
+
+def test_a_robot_file_that_is_wrong_fails(tmp_path: Path) -> None:
+    code, result = run(tmp_path, "--robot", str(tmp_path / "none.toml"))
+    assert (code, by_name(result)["robot file"]["level"]) == (EXIT_CHECK_FAILED, "fail")
+
+
+def test_help_has_examples_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (main, install):
+        with pytest.raises(SystemExit) as ended:
+            command(["--help"])
+        text = capsys.readouterr().out
+        assert (ended.value.code, "examples:" in text, "exit codes:" in text) == (0, True, True)
+
+
+def test_bad_arguments_are_bad_input(tmp_path: Path) -> None:
+    assert main(["--ticks", "-1"]) == EXIT_BAD_INPUT
+    assert main(["--json", str(tmp_path)]) == EXIT_BAD_INPUT
+
+
+def test_with_a_dash_standard_output_is_the_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--logs", str(tmp_path), "--json", "-"])
+    output = capsys.readouterr()
+    assert json.loads(output.out)["checks"]
+    assert "clock" in output.err
+
+
+def test_the_target_and_plan_are_read_from_the_manifest(artifacts_dir: Path) -> None:
+    manifest = json.loads((artifacts_dir / "manifest.json").read_text())
+    target, facts, plan = load_target("cpu", "nano"), target_facts(manifest), plan_facts(manifest)
+    assert facts is not None
+    assert plan is not None
+    assert (facts.name, facts.architectures, facts.cores) == ("cpu", target.arch, target.device.cores)
+    assert facts.memory_bytes - facts.available_bytes == target.device.reserved_gib * GIB
+    assert plan.memory_bytes == manifest["plan"]["memory_bytes"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"plan": []},
+        {"plan": {"period_ms": "100"}},
+        {"provenance": {"target": 7}},
+        {"provenance": {"target": {"device": {}}}},
+        {"provenance": None},
+    ],
+)
+def test_a_manifest_that_says_nonsense_of_its_device_is_refused(change: dict[str, Any]) -> None:
+    manifest = {"plan": {}, "provenance": {}, **change}
+    with pytest.raises(ArtifactError):
+        target_facts(manifest)
+        plan_facts(manifest)
+
+
+def test_a_manifest_without_target_and_plan_has_neither() -> None:
+    assert target_facts({"provenance": {}}) is None
+    assert plan_facts({"plan": {}}) is None
+
+
+def test_no_bridge_at_a_path_is_told_in_one_line(robot: RobotConfig) -> None:
+    def gone(_robot: RobotConfig) -> BridgeStatus | None:
+        raise BridgeUnavailable("no bridge listens at x (No such file); start `edge-bridge`")
+
+    assert "\n" not in bridge(robot, gone).found

@@ -1,0 +1,272 @@
+"""`edge-doctor` on machines made of files: what it finds, what it expects, what it says to do."""
+
+from __future__ import annotations
+
+import datetime
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from edge.artifacts.target_facts import GIB, PlanFacts, TargetFacts
+from edge.core.device import CUDA
+from edge.deploy.doctor.check import Check, Level, failed, skipped, table
+from edge.deploy.doctor.machine import (
+    busy_programs,
+    clocks,
+    core_numbers,
+    cpu_governor,
+    disk,
+    match,
+    memory,
+    mode_cores,
+    power_mode,
+    processor_ticks,
+    wall_clock,
+)
+from edge.inference.graph import CPU_PROVIDER
+
+ORIN = TargetFacts("orin", ("aarch64",), 8, 16 * GIB, 12 * GIB, "36.4", "40W", 25.0)
+PLAN = PlanFacts(100.0, 60.0, 40.0, 0.2, 1100, 4 * GIB, "modelled")
+CONF = """
+< POWER_MODEL ID=1 NAME=10W >
+CPU_ONLINE CORE_0 1
+CPU_ONLINE CORE_1 1
+CPU_ONLINE CORE_4 0
+GPU MAX_FREQ 612000000
+< POWER_MODEL ID=4 NAME=40W >
+CPU_ONLINE CORE_0 1
+CPU_ONLINE CORE_1 1
+CPU_ONLINE CORE_4 1
+"""
+
+
+def write(root: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root
+
+
+def mode(root: Path, wanted: str, said: str | None, online: str = "0-1,4") -> Check:
+    write(root, {"etc/nvpmodel.conf": CONF, "sys/devices/system/cpu/online": f"{online}\n"})
+    return power_mode(wanted, root, lambda: said)
+
+
+def test_the_power_mode_is_known_by_its_name(tmp_path: Path) -> None:
+    assert mode(tmp_path, "40W", "NV Power Mode: 40W\n4\n").level is Level.OK
+
+
+def test_another_power_mode_fails_with_the_command_that_sets_it(tmp_path: Path) -> None:
+    check = mode(tmp_path, "40W", "NV Power Mode: 10W\n1\n")
+    assert check.level is Level.FAIL
+    assert "sudo nvpmodel -m 4" in check.advice
+
+
+def test_a_mode_that_the_board_has_not_is_named_with_those_that_it_has(tmp_path: Path) -> None:
+    check = mode(tmp_path, "25W", "NV Power Mode: 10W\n1\n")
+    assert (check.level, "10W, 40W" in check.found) == (Level.FAIL, True)
+
+
+def test_a_mode_that_nvpmodel_reports_but_the_cores_do_not_show_fails(tmp_path: Path) -> None:
+    check = mode(tmp_path, "10W", "NV Power Mode: 10W\n1\n")
+    assert check.level is Level.FAIL
+    assert "reboot" in check.advice
+
+
+def test_an_nvpmodel_that_does_not_answer_fails(tmp_path: Path) -> None:
+    assert mode(tmp_path, "40W", None).level is Level.FAIL
+
+
+def test_without_its_configuration_this_is_no_jetson(tmp_path: Path) -> None:
+    assert power_mode("default", tmp_path, lambda: None).level is Level.SKIP
+
+
+def test_the_cores_of_a_mode_are_those_of_its_own_block() -> None:
+    assert mode_cores(CONF, "10W") == {0, 1}
+    assert mode_cores(CONF, "15W") == set()
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"), [("0-3,6", {0, 1, 2, 3, 6}), ("5", {5}), ("", set()), ("a-b", set()), ("1-99999", set())]
+)
+def test_a_list_of_cores_is_read(text: str, cores: set[int]) -> None:
+    assert core_numbers(text) == cores
+
+
+@pytest.mark.parametrize(
+    ("governors", "level"),
+    [(["performance"], Level.OK), (["performance", "schedutil"], Level.WARN), ([], Level.SKIP)],
+)
+def test_a_governor_that_follows_the_load_is_told(tmp_path: Path, governors: list[str], level: Level) -> None:
+    cpu = "sys/devices/system/cpu"
+    write(tmp_path, {f"{cpu}/cpu{n}/cpufreq/scaling_governor": f"{name}\n" for n, name in enumerate(governors)})
+    assert cpu_governor(tmp_path).level is level
+
+
+def devfreq(root: Path, low: int, high: int) -> Path:
+    gpu = "sys/class/devfreq/17000000.gpu"
+    steps = "306000000 408000000 1173000000"
+    files = {"min_freq": str(low), "max_freq": str(high), "cur_freq": str(low), "available_frequencies": steps}
+    return write(root, {f"{gpu}/{name}": f"{text}\n" for name, text in files.items()})
+
+
+def test_a_graphics_clock_that_may_fall_is_told(tmp_path: Path) -> None:
+    check = clocks(devfreq(tmp_path, 306_000_000, 408_000_000))
+    assert check.level is Level.WARN
+    assert "jetson_clocks" in check.advice
+    assert "of 1173" in check.found
+
+
+def test_a_graphics_clock_that_stays_is_fine(tmp_path: Path) -> None:
+    assert clocks(devfreq(tmp_path, 408_000_000, 408_000_000)).level is Level.OK
+
+
+def test_a_clock_of_something_else_is_not_taken_for_the_graphics_processor(tmp_path: Path) -> None:
+    write(tmp_path, {f"sys/class/devfreq/15340000.vic/{key}_freq": "1\n" for key in ("min", "max", "cur")})
+    assert clocks(tmp_path).level is Level.SKIP
+
+
+def jetson(root: Path, revision: str = "4.3") -> Path:
+    return write(root, {"etc/nv_tegra_release": f"# R36 (release), REVISION: {revision}, GCID: 1\n"})
+
+
+def test_the_device_that_the_artifacts_were_made_for_is_fine(tmp_path: Path) -> None:
+    assert match(ORIN, [CUDA], "aarch64", [CUDA, CPU_PROVIDER], jetson(tmp_path)).level is Level.OK
+
+
+def test_another_processor_fails(tmp_path: Path) -> None:
+    check = match(ORIN, [CUDA], "x86_64", [CUDA], jetson(tmp_path))
+    assert (check.level, "export for this machine" in check.advice) == (Level.FAIL, True)
+
+
+def test_an_older_jetpack_fails_by_its_number_and_not_its_spelling(tmp_path: Path) -> None:
+    assert match(ORIN, [CUDA], "aarch64", [CUDA], jetson(tmp_path, "3.0")).level is Level.FAIL
+    assert match(ORIN, [CUDA], "aarch64", [CUDA], jetson(tmp_path, "10.0")).level is Level.OK
+
+
+def test_a_provider_that_this_onnx_runtime_lacks_fails(tmp_path: Path) -> None:
+    check = match(ORIN, [CUDA], "aarch64", [CPU_PROVIDER], jetson(tmp_path))
+    assert (check.level, check.expected) == (Level.FAIL, CUDA)
+
+
+def sized(root: Path, cores: int, gib: float, module: str = "") -> Path:
+    files = {
+        "sys/devices/system/cpu/present": f"0-{cores - 1}\n",
+        "proc/meminfo": f"MemTotal: {round(gib * 1024 * 1024)} kB\n",
+    }
+    return write(root, {**files, **({"proc/device-tree/compatible": f"{module}\0nvidia,tegra234\0"} if module else {})})
+
+
+@pytest.mark.parametrize(
+    ("cores", "gib", "module", "level"),
+    [
+        (8, 15.3, "nvidia,p3767-0000", Level.OK),
+        (6, 7.4, "nvidia,p3767-0001", Level.FAIL),
+        (6, 15.3, "", Level.FAIL),
+        (8, 7.4, "", Level.FAIL),
+        (12, 61.4, "nvidia,p3701-0005", Level.WARN),
+        (8, 15.3, "nvidia,p9999-0000", Level.OK),
+    ],
+)
+def test_cores_and_memory_are_held_against_the_target(
+    tmp_path: Path, cores: int, gib: float, module: str, level: Level
+) -> None:
+    check = match(ORIN, [CUDA], "aarch64", [CUDA], sized(jetson(tmp_path), cores, gib, module))
+    assert check.level is level
+    assert f"{cores} cores" in check.found
+
+
+def test_an_ordinary_machine_may_have_more_than_its_target_and_a_cards_memory_is_not_the_machines(
+    tmp_path: Path,
+) -> None:
+    card = replace(ORIN, architectures=("x86_64",), min_l4t=None, own_memory=True)
+    assert match(card, [CUDA], "x86_64", [CUDA], sized(tmp_path, 24, 4)).level is Level.OK
+
+
+def test_a_plan_for_a_cards_own_memory_is_not_held_against_the_machines(tmp_path: Path) -> None:
+    write(tmp_path, {"proc/meminfo": "MemAvailable:   1048576 kB\n"})
+    check = memory(PLAN, tmp_path, own_memory=True)
+    assert (check.level, "1.00 GiB" in check.found) == (Level.SKIP, True)
+
+
+@pytest.mark.parametrize(("gib", "level"), [(3.9, Level.FAIL), (4.1, Level.WARN), (8.0, Level.OK)])
+def test_free_memory_is_held_against_the_plan(tmp_path: Path, gib: float, level: Level) -> None:
+    write(tmp_path, {"proc/meminfo": f"MemTotal: 16000000 kB\nMemAvailable:   {round(gib * 1024 * 1024)} kB\n"})
+    assert memory(PLAN, tmp_path).level is level
+
+
+def test_without_a_plan_memory_is_not_judged(tmp_path: Path) -> None:
+    assert memory(None, tmp_path).level is Level.SKIP
+
+
+@pytest.mark.parametrize(("free", "level"), [(7, Level.OK), (6, Level.FAIL), (0, Level.FAIL)])
+def test_below_seven_percent_of_free_disk_nothing_starts(tmp_path: Path, free: int, level: Level) -> None:
+    assert disk(tmp_path, lambda _folder: (free * GIB, 100 * GIB)).level is level
+
+
+def test_a_folder_that_cannot_be_asked_fails(tmp_path: Path) -> None:
+    def refuse(_folder: Path) -> tuple[int, int]:
+        raise FileNotFoundError(2, "No such file or directory")
+
+    assert disk(tmp_path, refuse).level is Level.FAIL
+
+
+UTC = datetime.timezone.utc
+MADE = datetime.datetime(2026, 11, 21, tzinfo=UTC)
+
+
+def clock_check(root: Path, year: int, source: str = "arch_sys_counter") -> Check:
+    write(root, {"sys/devices/system/clocksource/clocksource0/current_clocksource": f"{source}\n"})
+    return wall_clock(datetime.datetime(year, 1, 1, tzinfo=UTC), MADE, root)
+
+
+def test_a_wall_clock_before_the_artifacts_is_told_and_harmless(tmp_path: Path) -> None:
+    assert clock_check(tmp_path, 1970).level is Level.WARN
+    assert clock_check(tmp_path, 2027).level is Level.OK
+
+
+def test_a_coarse_monotonic_clock_is_told(tmp_path: Path) -> None:
+    assert clock_check(tmp_path, 2027, "jiffies").level is Level.WARN
+
+
+def process(proc: Path, pid: int, name: str, ticks: int) -> None:
+    write(proc, {f"{pid}/stat": f"{pid} ({name}) S 1 1 1 0 -1 4194560 1 0 0 0 {ticks} 0 0 0 20 0 1 0 1 1 1\n"})
+
+
+def test_processor_time_is_read_whatever_a_program_is_called(tmp_path: Path) -> None:
+    process(tmp_path, 7, "a) S 9 (b", 50)
+    write(tmp_path, {"8/stat": "nonsense", "self/stat": "1 (x) S"})
+    assert processor_ticks(tmp_path) == {7: ("a) S 9 (b", 50)}
+
+
+def test_who_else_computes_is_named_and_oneself_is_not() -> None:
+    before = {1: ("robot-ui", 0), 2: ("edge-doctor", 0), 3: ("reused", 0)}
+    after = {1: ("robot-ui", 70), 2: ("edge-doctor", 100), 3: ("another", 90), 4: ("new", 99)}
+    check = busy_programs(before, after, 100, own=2)
+    assert check.level is Level.WARN
+    assert check.found == "0.70 cores used by others: robot-ui (pid 1) 0.70"
+
+
+def test_a_quiet_machine_is_fine() -> None:
+    assert busy_programs({1: ("a", 0)}, {1: ("a", 10)}, 100, own=2).level is Level.OK
+
+
+def test_a_check_that_warns_has_to_say_what_to_do() -> None:
+    with pytest.raises(ValueError, match="what to do"):
+        Check("x", Level.FAIL, "found", "expected")
+
+
+def test_only_failures_fail() -> None:
+    told = Check("x", Level.WARN, "found", "expected", "advice")
+    assert not failed([told, skipped("y", "not here")])
+    assert failed([told, Check("z", Level.FAIL, "found", "expected", "advice")])
+
+
+def test_what_a_check_found_is_shown_as_it_is() -> None:
+    text = io.StringIO()
+    Console(width=100, file=text).print(table([Check("x", Level.FAIL, "[red]found[/]", "expected", "rm [a]")]))
+    assert "[red]found[/]" in text.getvalue()
+    assert "rm [a]" in text.getvalue()

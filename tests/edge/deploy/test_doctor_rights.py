@@ -1,0 +1,250 @@
+"""`edge-doctor` on what a user may do and read: priority, memory, devices, the socket's folder, meter, temperatures."""
+
+from __future__ import annotations
+
+import grp
+import os
+import resource
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from edge.core.device import CUDA
+from edge.deploy.doctor.check import Check, Level
+from edge.deploy.doctor.rights import device_access, locked_memory, power_meter, real_time, socket_folder, temperatures
+from edge.deploy.doctor.user import Whom, user_named
+from edge.inference.graph import CPU_PROVIDER
+from edge.power.meters.meter import MeterError, PowerSample
+from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
+from tests.edge.deploy.test_doctor_machine import write
+
+ME = Whom("somebody", 1000, frozenset({1000}), other=False)
+
+
+def test_real_time_that_is_refused_is_told() -> None:
+    assert real_time(50, ME, lambda _priority: []).level is Level.OK
+    assert real_time(50, ME, lambda _priority: ["refused"]).level is Level.WARN
+    assert real_time(0, ME, lambda _priority: ["refused"]).level is Level.SKIP
+
+
+def test_memory_may_be_locked_without_a_limit_or_by_root() -> None:
+    assert locked_memory(resource.RLIM_INFINITY, ME).level is Level.OK
+    assert locked_memory(65536, replace(ME, uid=0)).level is Level.OK
+    assert locked_memory(65536, ME).level is Level.WARN
+
+
+def test_device_nodes_must_be_there_and_open(tmp_path: Path) -> None:
+    other = replace(ME, uid=4242, other=True)
+    assert device_access([CPU_PROVIDER], tmp_path, other).level is Level.OK
+    assert device_access([CUDA], tmp_path, other).level is Level.FAIL
+    node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
+    node.chmod(0o666)
+    assert device_access([CUDA], tmp_path, other).level is Level.OK
+    node.chmod(0o600)
+    closed = device_access([CUDA], tmp_path, other)
+    assert (closed.level, "usermod" in closed.advice, other.name in closed.found) == (Level.FAIL, True, True)
+
+
+def chgrp_to_a_group_of_no_power(node: Path) -> None:
+    """Root's own group never counts as a device's group; tests may run as root."""
+    if os.geteuid() == 0:
+        os.chown(node, -1, max(entry.gr_gid for entry in grp.getgrall()))
+
+
+def test_a_device_that_its_group_may_only_read_is_open_to_that_group(tmp_path: Path) -> None:
+    node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
+    node.chmod(0o440)  # as on the Orin of NVIDIA/NemoClaw #4231
+    chgrp_to_a_group_of_no_power(node)
+    member = Whom("service", 4242, frozenset({node.stat().st_gid}), other=True)
+    assert device_access([CUDA], tmp_path, member).level is Level.OK
+    assert device_access([CUDA], tmp_path, replace(member, groups=frozenset())).level is Level.WARN
+
+
+def test_a_device_that_the_units_groups_open_only_warns_for_the_services_user(tmp_path: Path) -> None:
+    node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
+    node.chmod(0o660)
+    chgrp_to_a_group_of_no_power(node)
+    service = Whom("service", 4242, frozenset({4242}), other=True)
+    assert device_access([CUDA], tmp_path, service).level is Level.WARN
+    member = replace(service, groups=frozenset({node.stat().st_gid}))
+    assert device_access([CUDA], tmp_path, member).level is Level.OK
+
+
+def test_another_users_right_to_a_file_is_that_of_its_class(tmp_path: Path) -> None:
+    file = write(tmp_path, {"x": ""}) / "x"
+    status = file.stat()
+    owner = Whom("owner", status.st_uid or 4242, frozenset(), other=True)
+    stranger = Whom("stranger", status.st_uid + 1, frozenset({status.st_gid + 1}), other=True)
+    member = replace(stranger, groups=frozenset({status.st_gid}))
+    file.chmod(0o604)
+    assert [stranger.may(file), member.may(file), stranger.may(file, write=True)] == [True, False, False]
+    file.chmod(0o060)
+    assert [stranger.may(file), member.may(file, write=True)] == [False, True]
+    assert replace(owner, uid=0).may(file, write=True)
+    assert not stranger.may(tmp_path / "none")
+
+
+def test_what_cannot_be_tried_for_another_user_is_said_to_be_skipped() -> None:
+    service = replace(ME, name="service", other=True)
+    for check in (real_time(50, service, lambda _priority: []), locked_memory(65536, service)):
+        assert (check.level, "service" in check.found) == (Level.SKIP, True)
+
+
+def test_the_line_says_for_whom_it_was_judged(tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    mine = replace(ME, uid=tmp_path.stat().st_uid)
+    checks = (
+        real_time(50, ME, lambda _priority: []),
+        locked_memory(65536, ME),
+        socket_folder(tmp_path / "bridge.sock", mine),
+    )
+    assert all(ME.name in check.found for check in checks)
+
+
+def test_a_user_that_this_machine_does_not_know_is_bad_input() -> None:
+    with pytest.raises(ConfigError, match="--user no-such-user"):
+        user_named("no-such-user")
+    assert user_named(None).uid == os.geteuid()
+
+
+@pytest.mark.parametrize(("mode_bits", "level"), [(0o700, Level.OK), (0o755, Level.FAIL)])
+def test_nobody_else_may_reach_the_socket(tmp_path: Path, mode_bits: int, level: Level) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    folder.chmod(mode_bits)
+    assert socket_folder(folder / "bridge.sock", replace(ME, uid=folder.stat().st_uid)).level is level
+
+
+def test_a_socket_folder_of_another_user_fails(tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    assert socket_folder(tmp_path / "bridge.sock", replace(ME, uid=tmp_path.stat().st_uid + 1)).level is Level.FAIL
+
+
+class TestServiceSockets:
+    """Sockets of the installed service: the bridge's user owns them, the runner is in the command socket's group."""
+
+    RUNNERS, OPERATORS = 4301, 4302
+
+    @pytest.fixture
+    def path(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """Two socket files; `status` below says which groups they have, since only root can change that."""
+        folder = tmp_path / "run"
+        folder.mkdir()
+        folder.chmod(0o711)
+        path = folder / "bridge.sock"
+        for file, group in ((path, self.RUNNERS), (Path(f"{path}{OPERATOR_SUFFIX}"), self.OPERATORS)):
+            file.touch()
+            file.chmod(0o660)
+            monkeypatch.setitem(self.groups, file, group)
+        real = Path.stat
+
+        def status(file: Path, **options: bool) -> os.stat_result:
+            found = list(real(file, **options))
+            found[5] = self.groups.get(file, found[5])
+            return os.stat_result(found)
+
+        monkeypatch.setattr(Path, "stat", status)
+        return path
+
+    groups: ClassVar[dict[Path, int]] = {}
+
+    def runner(self, path: Path, *groups: int) -> Whom:
+        return Whom("runner", path.parent.stat().st_uid + 4000, frozenset(groups), other=True)
+
+    def test_the_runner_reaches_its_own_socket_only(self, path: Path) -> None:
+        assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.OK
+
+    def test_a_runner_in_the_operators_group_fails(self, path: Path) -> None:
+        check = socket_folder(path, self.runner(path, self.RUNNERS, self.OPERATORS))
+        assert (check.level, "take back an emergency stop" in check.advice) == (Level.FAIL, True)
+
+    def test_a_runner_that_does_not_reach_its_socket_fails(self, path: Path) -> None:
+        check = socket_folder(path, self.runner(path))
+        assert (check.level, "--user" in check.advice) == (Level.FAIL, True)
+
+    def test_a_runner_of_the_bridges_own_user_fails(self, path: Path) -> None:
+        same = replace(self.runner(path, self.RUNNERS), uid=path.parent.stat().st_uid)
+        if same.uid != 0:
+            assert socket_folder(path, same).level is Level.FAIL
+
+    @pytest.mark.parametrize("mode", [0o666, 0o662, 0o661])
+    def test_a_socket_that_everybody_reaches_fails(self, path: Path, mode: int) -> None:
+        for file in (path, Path(f"{path}{OPERATOR_SUFFIX}")):
+            file.chmod(mode)
+            assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.FAIL
+            file.chmod(0o660)
+
+    def test_root_is_judged_by_modes_alone(self, path: Path) -> None:
+        assert socket_folder(path, replace(self.runner(path), uid=0)).level is Level.OK
+
+    def test_without_a_running_bridge_nothing_can_be_judged(self, path: Path) -> None:
+        path.unlink()
+        assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.SKIP
+
+
+def test_a_socket_folder_that_is_not_there_yet_is_made_by_the_bridge(tmp_path: Path) -> None:
+    assert socket_folder(tmp_path / "none" / "bridge.sock", ME).level is Level.SKIP
+
+
+class FakeMeter:
+    source = "ina3221 VDD_IN"
+    caveat = "not at the wall"
+
+    def read(self, now_ns: int) -> PowerSample:
+        return PowerSample(now_ns, 12.5)
+
+
+def meter(kind: str, open_it, sysfs_root: Path = Path("/nowhere"), whom: Whom = ME) -> Check:
+    return power_meter(kind, open_it, sysfs_root, whom, clock=lambda: 1, sleep=lambda _seconds: None)
+
+
+def test_a_meter_says_what_it_reads_and_what_that_leaves_out() -> None:
+    check = meter("ina3221", FakeMeter)
+    assert (check.level, check.found) == (Level.OK, "12.5 W, ina3221 VDD_IN, measured (not at the wall)")
+
+
+def test_a_meter_that_cannot_be_read_is_told() -> None:
+    def refuse() -> FakeMeter:
+        raise MeterError("rapl: readable by root only")
+
+    check = meter("rapl", refuse)
+    assert (check.level, check.found) == (Level.WARN, "rapl: readable by root only")
+    assert meter("none", refuse).level is Level.SKIP
+
+
+def test_temperatures_are_read_and_throttling_is_told(tmp_path: Path) -> None:
+    assert temperatures(tmp_path, 0).level is Level.SKIP
+    zone, fan = "class/thermal/thermal_zone0", "class/thermal/cooling_device0"
+    write(tmp_path, {f"{zone}/type": "tj-thermal\n", f"{zone}/temp": "81000\n"})
+    assert "81 °C" in temperatures(tmp_path, 0).found
+    write(tmp_path, {f"{fan}/type": "gpu-throttle-alert\n", f"{fan}/cur_state": "1\n"})
+    assert temperatures(tmp_path, 0).level is Level.WARN
+
+
+@pytest.mark.parametrize(
+    ("temp_c", "level"), [(95.9, Level.OK), (96.1, Level.WARN), (99.5, Level.WARN), (101.6, Level.FAIL)]
+)
+def test_near_where_clocks_are_held_back_it_warns_and_near_the_end_it_fails(
+    tmp_path: Path, temp_c: float, level: Level
+) -> None:
+    zone = "class/thermal/thermal_zone0"
+    trips = {"0": ("passive", 99000), "1": ("critical", 104500)}
+    files = {f"{zone}/trip_point_{number}_type": f"{kind}\n" for number, (kind, _) in trips.items()}
+    files |= {f"{zone}/trip_point_{number}_temp": f"{milli_c}\n" for number, (_, milli_c) in trips.items()}
+    write(tmp_path, {f"{zone}/type": "tj-thermal\n", f"{zone}/temp": f"{round(temp_c * 1000)}\n", **files})
+    assert temperatures(tmp_path, 0).level is level
+
+
+def test_an_energy_counter_that_only_root_may_read_is_told_of_the_services_user(tmp_path: Path) -> None:
+    counter = (
+        write(tmp_path, {"class/powercap/intel-rapl:0/energy_uj": "1\n"}) / "class/powercap/intel-rapl:0/energy_uj"
+    )
+    rapl = FakeMeter()
+    rapl.source = "rapl package-0"
+    service = replace(ME, uid=4242, other=True)
+    counter.chmod(0o400)
+    assert meter("rapl", lambda: rapl, tmp_path, service).level is Level.WARN
+    counter.chmod(0o444)
+    assert meter("rapl", lambda: rapl, tmp_path, service).level is Level.OK

@@ -1,0 +1,90 @@
+"""Old flight logs: all of them together stay bounded, and the newest are never deleted."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
+from edge.flightlog.cleanup import KEEP_RUNS, clean, main
+
+HUGE = 1 << 60
+
+
+def log(folder: Path, name: str, size: int, at_s: int) -> Path:
+    path = folder / name
+    path.write_bytes(b"x" * size)
+    os.utime(path, (at_s, at_s))
+    return path
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for number in range(5):
+        log(tmp_path, f"flight-{number}.mcap", 60, 10 * number)
+        log(tmp_path, f"flight-{number}.002.mcap", 40, 10 * number + 1)
+    return tmp_path
+
+
+def test_what_fits_stays(folder: Path) -> None:
+    assert clean(folder, 500) == ([], 500)
+    assert len(names(folder)) == 10
+
+
+def test_the_oldest_runs_are_deleted_as_a_whole_until_the_rest_fits(folder: Path) -> None:
+    deleted, left = clean(folder, 350)
+    assert {path.name for path in deleted} == {f"flight-{n}{p}.mcap" for n in (0, 1) for p in ("", ".002")}
+    assert left == 300
+    assert "flight-2.mcap" in names(folder)
+
+
+def test_a_run_is_as_old_as_its_newest_part(folder: Path) -> None:
+    log(folder, "flight-0.003.mcap", 1, 1000)
+    clean(folder, 0)
+    assert {"flight-0.mcap", "flight-4.mcap"} <= names(folder)
+    assert "flight-3.mcap" not in names(folder)
+
+
+def test_the_newest_runs_stay_whatever_they_take(folder: Path) -> None:
+    _, left = clean(folder, 0)
+    assert left == 100 * KEEP_RUNS
+    assert names(folder) == {f"flight-{n}{p}.mcap" for n in (3, 4) for p in ("", ".002")}
+
+
+def test_a_small_old_run_is_not_kept_in_the_place_of_a_large_newer_one(tmp_path: Path) -> None:
+    for number, size in enumerate((1, 300, 10, 10)):
+        log(tmp_path, f"flight-{number}.mcap", size, number)
+    clean(tmp_path, 100)
+    assert names(tmp_path) == {"flight-2.mcap", "flight-3.mcap"}
+
+
+def test_nothing_else_is_touched(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    outside = log(tmp_path_factory.mktemp("outside"), "flight-x.mcap", 5, 0)
+    others = {"release.json", "my flight.mcap", "flight.mcap", "flight-a.txt", "flight-a.2.mcap"}
+    for name in others:
+        log(folder, name, 1000, 0)
+    (folder / "flight-b.mcap").mkdir()
+    (folder / "flight-c.mcap").symlink_to(outside)
+    clean(folder, 0)
+    assert others | {"flight-b.mcap", "flight-c.mcap"} <= names(folder)
+    assert outside.exists()
+
+
+def test_on_a_small_file_system_less_is_kept(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(folder)], total_bytes=lambda _path: 1200) == EXIT_DONE
+    assert len(names(folder)) == 6
+    assert "4 files of old runs deleted" in capsys.readouterr().err
+    assert main([str(folder)], total_bytes=lambda _path: HUGE) == EXIT_DONE
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("words", [["none"], [".", "--keep-bytes", "-1"]])
+def test_bad_input_is_one_line(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / words[0]), *words[1:]]) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.count("\n") == 1

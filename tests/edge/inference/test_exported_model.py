@@ -1,0 +1,82 @@
+"""The exported model, run as the robot runs it, says what PyTorch says."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+import torch
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.inference.graph import CancelledError, Graph
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.state.ring import EncodedFrame
+from export.evaluation.gate_run import gate_provider
+from export.model.config import PRESETS
+from export.model.network import build
+
+NANO = PRESETS["nano"]
+
+
+def test_the_exported_model_generates_the_same_text_as_pytorch(artifacts: Artifacts) -> None:
+    """Greedy decoding over the runner's own prompt, segments and cache, against one uncached PyTorch pass a token."""
+    model = build(NANO, 0)
+    policy, language = Policy(artifacts), LanguageModel(artifacts)
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, 1, 128, 128, 3)).astype(np.uint8)
+    frames = [EncodedFrame(i, SE2(float(i), 0, 0), policy.encode(image)) for i, image in enumerate(images)]
+    segments = language.prompt.build(frames, "go to the bench")
+    found = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
+
+    ids = [i for segment in segments for i in segment.ids]
+    tokens = torch.cat([torch.from_numpy(f.tokens) for f in frames])
+    c = NANO.language
+    new: list[int] = []
+    with torch.no_grad():
+        while len(new) < 12:
+            past = [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
+            token, _, kv, *_ = model.language(torch.tensor([ids + new]), tokens, past)
+            if int(token) == c.im_end_id:
+                break
+            new.append(int(token))
+    assert found.token_ids == tuple(new)
+    assert found.text == language._tokenizer.decode(new, skip_special_tokens=True)
+    full = found.last_layer_kv
+    assert full.shape == (1, len(ids) + len(new), NANO.kv_dim)
+    assert np.allclose(full[:, : kv.shape[1]], kv.numpy()[:, : full.shape[1]], atol=1e-3)
+
+
+def test_a_generation_stops_between_two_calls(artifacts: Artifacts) -> None:
+    language = LanguageModel(artifacts)
+    calls: list[int] = []
+
+    def cancelled() -> bool:
+        calls.append(1)
+        return len(calls) > 3
+
+    frames = [EncodedFrame(0, SE2(0, 0, 0), np.zeros((1, 64, 256), dtype=np.float32))]
+    with pytest.raises(CancelledError):
+        language.generate(language.prompt.build(frames, "go"), max_new_tokens=48, cancelled=cancelled)
+    assert len(calls) == 4
+
+
+def test_a_provider_that_does_not_load_is_refused_and_not_silently_the_cpu(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
+    with (
+        pytest.warns(UserWarning, match="not in available provider names"),
+        pytest.raises(ArtifactError, match="on CPUExecutionProvider instead of CUDAExecutionProvider"),
+    ):
+        Graph(artifacts, "action_expert", threads=1, provider="CUDAExecutionProvider")
+
+
+def test_the_gate_runs_on_the_cpu_where_the_shipping_provider_does_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gate_provider("CPUExecutionProvider") == "CPUExecutionProvider"
+    assert gate_provider("TensorrtExecutionProvider") == "CPUExecutionProvider"
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["ListedExecutionProvider", "CPUExecutionProvider"])
+    with pytest.warns(UserWarning, match="not in available provider names"):
+        assert gate_provider("ListedExecutionProvider") == "CPUExecutionProvider"

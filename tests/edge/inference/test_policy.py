@@ -1,0 +1,177 @@
+"""The fast half of the model on buffers that are allocated once: the same numbers, and nothing shared by accident."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.artifacts.manifest import Artifacts
+from edge.core.geometry import SE2
+from edge.inference.graph import CancelledError, Graph, GraphError, Interrupt
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.inference.scheduling import Role, Schedule, TickActivity, schedule_for
+from edge.state.semantic import SemanticState
+
+HERE = SE2(0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def policy(artifacts: Artifacts) -> Policy:
+    return Policy(artifacts, threads=1)
+
+
+def picture(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (1, 128, 128, 3)).astype(np.uint8)
+
+
+def semantic(policy: Policy, artifacts: Artifacts, seed: int, tokens: int = 40) -> SemanticState:
+    kv = np.random.default_rng(seed).standard_normal((1, tokens, artifacts.runtime.kv_dim)).astype(np.float32)
+    return SemanticState(seed, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
+
+
+def test_tokens_are_written_where_they_are_asked_for(policy: Policy) -> None:
+    own = policy.encode(picture(1))
+    buffer = np.zeros(policy.tokens_shape, dtype=np.float32)
+    assert policy.encode(picture(1), out=buffer) is buffer
+    np.testing.assert_array_equal(buffer, own)
+
+
+def test_the_next_frame_does_not_touch_the_tokens_of_the_last(policy: Policy) -> None:
+    first = policy.encode(picture(1))
+    kept = first.copy()
+    policy.encode(picture(2))
+    np.testing.assert_array_equal(first, kept)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda shape: np.zeros((1, 3, 3), dtype=np.float32),
+        lambda shape: np.zeros(shape, dtype=np.float64),
+        lambda shape: np.zeros((*shape[:-1], 2 * shape[-1]), dtype=np.float32)[..., ::2],
+    ],
+)
+def test_a_buffer_that_tokens_do_not_fit_is_refused(
+    policy: Policy, wrong: Callable[[tuple[int, ...]], np.ndarray]
+) -> None:
+    with pytest.raises(ValueError, match="contiguous float32"):
+        policy.encode(picture(1), out=wrong(policy.tokens_shape))
+
+
+def test_every_input_of_a_tick_counts_in_that_tick(policy: Policy, artifacts: Artifacts) -> None:
+    """Bound buffers: a stale one would give the plan of the tick before."""
+    tokens, other = policy.encode(picture(1)), policy.encode(picture(2))
+    one, two = semantic(policy, artifacts, 1), semantic(policy, artifacts, 2, tokens=60)
+    base = (tokens, (0.1, 0.0, 0.0), 1.0, HERE, one)
+    changed = [
+        (other, *base[1:]),
+        (base[0], (0.9, 0.0, 0.3), *base[2:]),
+        (*base[:2], 5.0, *base[3:]),
+        (*base[:3], SE2(1.0, 0.5, 0.4), one),
+        (*base[:4], two),
+    ]
+    before = policy.act(*base)
+    for inputs in changed:
+        assert not np.array_equal(policy.act(*inputs), before)
+        np.testing.assert_array_equal(policy.act(*base), before)
+
+
+def test_a_bound_tick_plans_what_a_graph_of_its_own_plans(policy: Policy, artifacts: Artifacts) -> None:
+    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
+    graph = Graph(artifacts, "action_expert", threads=1)
+    feeds = {
+        "visual_tokens": tokens,
+        "state": np.array([[0.4, 0.0, 0.1]], dtype=np.float32),
+        "latency": np.array([[2.0, 0.3, 0.1, 0.2]], dtype=np.float32),
+        **state.context,
+    }
+    found = policy.act(tokens, (0.4, 0.0, 0.1), 2.0, SE2(0.3, 0.1, 0.2), state)
+    np.testing.assert_array_equal(found, graph.run(feeds)[0][0])
+
+
+def test_a_plan_survives_the_next_tick(policy: Policy, artifacts: Artifacts) -> None:
+    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
+    first = policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state)
+    kept = first.copy()
+    policy.act(tokens, (0.9, 0.0, 0.9), 9.0, HERE, state)
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_a_context_that_does_not_fit_the_graph_is_a_failure_of_that_tick_only(
+    policy: Policy, artifacts: Artifacts
+) -> None:
+    """The control thread takes a GraphError for no plan at all; anything else would end it."""
+    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
+    good = policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state)
+    foreign = {**state.context, "context.0.key": np.zeros((1, 1, 1, 1), dtype=np.float32)}
+    with pytest.raises(GraphError, match="action_expert"):
+        policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, dataclasses.replace(state, context=foreign))
+    np.testing.assert_array_equal(policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state), good)
+
+
+def test_a_semantic_context_can_be_interrupted(policy: Policy, artifacts: Artifacts) -> None:
+    interrupt = Interrupt()
+    interrupt.set()
+    with pytest.raises(CancelledError):
+        policy.semantic_context(np.zeros((1, 8, artifacts.runtime.kv_dim), dtype=np.float32), interrupt)
+
+
+def test_others_see_when_a_tick_computes(artifacts: Artifacts) -> None:
+    seen: list[str] = []
+
+    class Spy(TickActivity):
+        def begin(self, now_ns: int) -> None:
+            seen.append("begin")
+
+        def end(self, now_ns: int) -> None:
+            seen.append("end")
+
+    policy = Policy(artifacts, threads=1, activity=Spy(100_000_000))
+    policy.semantic_context(np.zeros((1, 8, artifacts.runtime.kv_dim), dtype=np.float32))
+    assert seen == []
+    policy.encode(picture(1))
+    assert seen == ["begin", "end"]
+
+
+def test_a_graphs_own_workers_run_where_the_role_says(artifacts: Artifacts) -> None:
+    """`/proc` knows where a thread may run."""
+    core = max(os.sched_getaffinity(0))
+    tasks = Path("/proc/self/task")
+    before = {path.name for path in tasks.iterdir()}
+    graph = Graph(artifacts, "action_expert", threads=2, cores=(core,))
+    workers = [int(path.name) for path in tasks.iterdir() if path.name not in before]
+    assert graph.name == "action_expert"
+    assert [os.sched_getaffinity(worker) for worker in workers] == [{core}]
+
+
+def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts) -> None:
+    runtime = dataclasses.replace(artifacts.runtime, control_cores=(7,), reasoning_cores=(5, 6), control_priority=40)
+    made = schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed=range(8))
+    assert (made.control.cores, made.control.priority) == ((7,), 40)
+    assert (made.reasoning.cores, made.reasoning.priority, made.shared) == ((5, 6), None, False)
+    assert schedule_for(artifacts, allowed={0}).shared
+
+
+def test_a_priority_of_zero_is_none(artifacts: Artifacts) -> None:
+    runtime = dataclasses.replace(artifacts.runtime, control_priority=0)
+    assert schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed={0}).control.priority is None
+
+
+def test_the_language_models_workers_are_as_patient_as_reasoning_is(artifacts: Artifacts) -> None:
+    """Else they would be as urgent as the control thread, whatever the thread that calls them is."""
+    core = min(os.sched_getaffinity(0))
+    schedule = Schedule(Role("control"), Role("reasoning", cores=(core,), niceness=17), shared=False)
+    tasks = Path("/proc/self/task")
+    before = {path.name for path in tasks.iterdir()}
+    language = LanguageModel(artifacts, threads=2, schedule=schedule)
+    workers = [int(path.name) for path in tasks.iterdir() if path.name not in before]
+    assert language.runtime is artifacts.runtime
+    assert workers
+    assert {os.getpriority(os.PRIO_PROCESS, worker) for worker in workers} == {17}
+    assert {frozenset(os.sched_getaffinity(worker)) for worker in workers} == {frozenset({core})}

@@ -1,0 +1,219 @@
+"""The controller: an arc to the point 1 s ahead, within limits and slew, and zero whenever something is missing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from edge.core.geometry import SE2
+from edge.motion.controller import Controller, ControllerConfig, ControllerInputs, arc_to, scale_to_limits
+from firmware_bridge.core.config import LimitsConfig
+
+LIMITS = LimitsConfig(
+    vx_min_mps=-0.4, vx_max_mps=0.8, vy_max_mps=0.3, wz_max_radps=1.0, accel_mps2=2.0, alpha_radps2=4.0
+)
+CONFIG = ControllerConfig(LIMITS, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
+TICK_NS = 100_000_000
+
+
+def plan(dx: float, dy: float = 0.0, dtheta: float = 0.0) -> np.ndarray:
+    return np.cumsum(np.tile(np.float32([dx, dy, dtheta]), (30, 1)), axis=0)
+
+
+def fresh(trajectory: np.ndarray | None) -> ControllerInputs:
+    return ControllerInputs(trajectory, frame_age_ms=50.0, odometry_age_ms=20.0)
+
+
+def settled(trajectory: np.ndarray) -> tuple[float, float]:
+    controller = Controller(CONFIG)
+    for tick in range(50):
+        command = controller.step(fresh(trajectory), tick * TICK_NS)
+    return command.vx_mps, command.wz_radps
+
+
+def test_before_the_first_semantic_state_the_command_is_zero() -> None:
+    command = Controller(CONFIG).step(fresh(None), 0)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "no-semantic-state")
+
+
+def test_the_target_is_the_point_one_second_ahead() -> None:
+    command = Controller(CONFIG).step(fresh(plan(0.05)), 0)
+    assert command.target is not None
+    assert command.target.x_m == pytest.approx(0.5)
+
+
+def test_a_straight_plan_is_driven_at_its_own_speed() -> None:
+    assert settled(plan(0.05)) == (pytest.approx(0.5), pytest.approx(0.0))
+
+
+def test_a_point_to_the_left_turns_left() -> None:
+    assert settled(plan(0.05, 0.01))[1] > 0
+
+
+@given(st.floats(0.06, 2.0), st.floats(-1.5, 1.5))
+def test_the_arc_meets_its_target(distance: float, bearing: float) -> None:
+    target = SE2(distance * math.cos(bearing), distance * math.sin(bearing), 0.0)
+    speed, yaw_rate = arc_to(target, 1.0)
+    if abs(yaw_rate) < 1e-9:
+        x, y = speed, 0.0
+    else:
+        radius = speed / yaw_rate
+        x, y = radius * math.sin(yaw_rate), radius * (1 - math.cos(yaw_rate))
+    assert x == pytest.approx(target.x_m, abs=1e-5)
+    assert y == pytest.approx(target.y_m, abs=1e-5)
+
+
+def test_a_point_behind_is_turned_to_in_place() -> None:
+    speed, yaw_rate = arc_to(SE2(-1.0, 0.2, 0.0), 1.0)
+    assert speed == 0.0
+    assert yaw_rate > 0
+
+
+def test_a_plan_that_stays_in_place_only_turns() -> None:
+    speed, yaw_rate = arc_to(SE2(0.01, -0.01, 0.3), 1.0)
+    assert (speed, yaw_rate) == (0.0, pytest.approx(0.3))
+
+
+finite = st.floats(-1e6, 1e6, width=32)
+
+
+@settings(derandomize=True, max_examples=500)
+@given(
+    st.lists(st.tuples(finite, finite, finite), min_size=30, max_size=30), st.lists(st.integers(0, 10**9), max_size=5)
+)
+def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], gaps_ns: list[int]) -> None:
+    controller = Controller(CONFIG)
+    now_ns = 0
+    for gap_ns in [0, *gaps_ns]:
+        now_ns += gap_ns
+        command = controller.step(fresh(np.float32(points)), now_ns)
+        assert LIMITS.vx_min_mps <= command.vx_mps <= LIMITS.vx_max_mps
+        assert abs(command.wz_radps) <= LIMITS.wz_max_radps
+        assert command.vy_mps == 0.0
+
+
+@settings(derandomize=True, max_examples=2000)
+@given(
+    st.floats(0.0, 1e6),
+    st.floats(-1e6, 1e6),
+    st.floats(0.01, 3.8),
+    st.floats(0.01, 4.0),
+    st.floats(1e-6, 1.0),
+)
+@example(speed=3.2254540894089683, yaw_rate=0.0, vx_max_mps=0.8, wz_max_radps=1.0, speed_scale=1.0)
+def test_no_velocity_leaves_a_limit_by_a_single_bit(
+    speed: float, yaw_rate: float, vx_max_mps: float, wz_max_radps: float, speed_scale: float
+) -> None:
+    limits = replace(LIMITS, vx_max_mps=vx_max_mps, wz_max_radps=wz_max_radps)
+    vx_mps, wz_radps = scale_to_limits(speed, yaw_rate, limits, speed_scale)
+    assert 0.0 <= vx_mps <= vx_max_mps * speed_scale
+    assert abs(wz_radps) <= wz_max_radps * speed_scale
+
+
+def test_speed_rises_no_faster_than_the_slew_limit() -> None:
+    controller = Controller(CONFIG)
+    speeds = [controller.step(fresh(plan(0.08)), tick * TICK_NS).vx_mps for tick in range(6)]
+    steps = np.diff([0.0, *speeds])
+    assert max(steps) <= LIMITS.accel_mps2 * 0.1 + 1e-9
+
+
+def test_slowing_down_is_immediate() -> None:
+    controller = Controller(CONFIG)
+    for tick in range(20):
+        controller.step(fresh(plan(0.08)), tick * TICK_NS)
+    assert controller.step(fresh(plan(0.0)), 20 * TICK_NS).vx_mps == 0.0
+
+
+@given(st.floats(0.06, 4.0), st.floats(-1.5, 1.5))
+def test_limits_make_the_robot_slower_on_its_arc_not_take_another(distance: float, bearing: float) -> None:
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    trajectory = np.tile(np.float32([x, y, 0.0]), (30, 1))
+    speed, yaw_rate = settled(trajectory)
+    wanted_speed, wanted_yaw_rate = arc_to(SE2(float(np.float32(x)), float(np.float32(y)), 0.0), 1.0)
+    assert yaw_rate * wanted_speed == pytest.approx(wanted_yaw_rate * speed, abs=1e-6)
+
+
+def test_a_long_pause_does_not_buy_a_jump() -> None:
+    controller = Controller(CONFIG)
+    controller.step(fresh(plan(0.08)), 0)
+    assert controller.step(fresh(plan(0.08)), 3600 * 10**9).vx_mps <= LIMITS.accel_mps2 * 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_an_output_that_is_not_finite_stops_in_the_same_step(bad: float) -> None:
+    controller = Controller(CONFIG)
+    for tick in range(10):
+        controller.step(fresh(plan(0.05)), tick * TICK_NS)
+    poisoned = plan(0.05)
+    poisoned[29, 2] = bad
+    command = controller.step(fresh(poisoned), 10 * TICK_NS)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "bad-output")
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (30, 2), (30,), (1, 30, 3)])
+def test_an_output_of_another_shape_stops_in_the_same_step(shape: tuple[int, ...]) -> None:
+    command = Controller(CONFIG).step(fresh(np.zeros(shape, dtype=np.float32)), 0)
+    assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "bad-output")
+
+
+def driven(scale: float, trajectory: np.ndarray) -> tuple[float, float]:
+    controller = Controller(CONFIG)
+    for tick in range(10):
+        command = controller.step(replace(fresh(trajectory), speed_scale=scale), tick * TICK_NS)
+    return command.vx_mps, command.wz_radps
+
+
+def test_a_lower_speed_scale_lowers_the_limit_and_leaves_a_slow_plan_as_it_is() -> None:
+    assert driven(0.5, plan(0.2))[0] == pytest.approx(0.5 * LIMITS.vx_max_mps)
+    assert driven(0.5, plan(0.03))[0] == pytest.approx(0.3)
+
+
+@given(st.floats(0.01, 1.0), st.floats(0.06, 4.0), st.floats(-1.5, 1.5))
+def test_a_lower_speed_scale_keeps_the_arc(scale: float, distance: float, bearing: float) -> None:
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    trajectory = np.tile(np.float32([x, y, 0.0]), (30, 1))
+    (speed, yaw_rate), (full_speed, full_yaw_rate) = driven(scale, trajectory), driven(1.0, trajectory)
+    assert yaw_rate * full_speed == pytest.approx(full_yaw_rate * speed, abs=1e-6)
+    assert speed <= full_speed + 1e-12
+
+
+@pytest.mark.parametrize("scale", [1.5, 1e9, math.inf])
+def test_no_speed_scale_raises_a_limit(scale: float) -> None:
+    assert driven(scale, plan(0.5))[0] == pytest.approx(LIMITS.vx_max_mps)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, -math.inf])
+def test_a_speed_scale_that_is_none_gives_no_speed(scale: float) -> None:
+    assert driven(scale, plan(0.5)) == (0.0, 0.0)
+
+
+def test_a_reason_to_hold_is_zero_whatever_the_plan_and_speeding_up_begins_anew() -> None:
+    controller = Controller(CONFIG)
+    for tick in range(20):
+        controller.step(fresh(plan(0.08)), tick * TICK_NS)
+    held = controller.step(replace(fresh(plan(0.08)), hold="camera-stopped"), 20 * TICK_NS)
+    assert (held.vx_mps, held.reason) == (0.0, "camera-stopped")
+    assert controller.step(fresh(plan(0.08)), 21 * TICK_NS).vx_mps <= LIMITS.accel_mps2 * 0.1 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("frame_age_ms", "odometry_age_ms", "reason"),
+    [
+        (None, 20.0, "stale-frame"),
+        (501.0, 20.0, "stale-frame"),
+        (-1.0, 20.0, "stale-frame"),
+        (50.0, None, "stale-odometry"),
+        (50.0, 201.0, "stale-odometry"),
+        (50.0, -1.0, "stale-odometry"),
+    ],
+)
+def test_old_missing_and_future_inputs_stop(
+    frame_age_ms: float | None, odometry_age_ms: float | None, reason: str
+) -> None:
+    command = Controller(CONFIG).step(ControllerInputs(plan(0.05), frame_age_ms, odometry_age_ms), 0)
+    assert (command.vx_mps, command.reason) == (0.0, reason)

@@ -1,0 +1,287 @@
+"""The power thread's shell: nobody waits for a meter, and whatever fails costs its own value only."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.flightlog.schemas import SCHEMAS
+from edge.power.governor.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
+from edge.power.governor.statistics import PowerStatistics
+from edge.power.meters.meter import MeterError, PowerSample
+from edge.power.meters.modelled import ModelledMeter
+from edge.power.meters.thermal import ThermalReader, ThermalState
+from edge.power.monitor import Activity, PowerMonitor
+from edge.safety.faults.findings import FindingQueue
+
+SECOND = 1_000_000_000
+
+
+class FakeMeter:
+    """Gives one value, or fails, or hangs."""
+
+    source, caveat = "fake", None
+
+    def __init__(self, read: Callable[[int], PowerSample]) -> None:
+        self.read = read
+
+
+def steady(power_w: float = 20.0) -> FakeMeter:
+    return FakeMeter(lambda now_ns: PowerSample(now_ns, power_w, {"VDD_IN": power_w}, source="fake"))
+
+
+def monitor(meter: Any, **options: Any) -> PowerMonitor:
+    governor = options.pop("governor", None) or Governor(GovernorConfig(25.0, 48))
+    return PowerMonitor(meter, governor, activity=Activity, period_s=0.005, **options)
+
+
+def until(reached: Callable[[], bool]) -> bool:
+    deadline_s = time.monotonic() + 20
+    while not reached() and time.monotonic() < deadline_s:
+        time.sleep(0.005)
+    return reached()
+
+
+def test_before_the_first_step_nothing_is_limited() -> None:
+    assert monitor(steady()).budget().allowed
+
+
+def test_a_meter_that_works_gives_samples_records_and_statistics() -> None:
+    records: list[tuple[int, dict[str, Any]]] = []
+    running = monitor(steady(), on_sample=lambda stamp_ns, record: records.append((stamp_ns, record)))
+    running.start()
+    try:
+        assert until(lambda: running.statistics()["mean"] is not None)
+    finally:
+        running.close()
+    statistics = running.statistics()
+    assert (statistics["mean"], statistics["source"], statistics["tagged"]) == (20.0, "fake", "measured")
+    assert statistics["p99"] == pytest.approx(20.0, abs=0.06)
+    stamp_ns, record = records[-1]
+    assert (record["stamp_ns"], record["total_w"], record["tagged"]) == (stamp_ns, 20.0, "measured")
+
+
+def test_a_record_has_the_fields_that_the_flight_log_describes() -> None:
+    record = monitor(steady()).step(SECOND).record()
+    assert set(SCHEMAS["/power"]["properties"]) <= set(record)
+
+
+def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
+    hang = threading.Event()
+
+    def read(now_ns: int) -> PowerSample:
+        hang.wait(60)
+        raise MeterError("too late")
+
+    running = monitor(FakeMeter(read))
+    before_ns = running.snapshot().stamp_ns
+    running.start()
+    try:
+        assert until(lambda: running.snapshot().stamp_ns > before_ns)
+        assert running.snapshot().sample is None
+        assert running.budget().allowed
+        closed = threading.Thread(target=running.close)
+        closed.start()
+        closed.join(20)
+        assert not closed.is_alive()
+    finally:
+        hang.set()
+
+
+@pytest.mark.parametrize("error", [MeterError("gone"), OSError("i2c"), ValueError("nonsense")])
+def test_a_meter_that_raises_is_asked_again_and_its_error_is_kept(error: Exception) -> None:
+    count = 0
+
+    def read(now_ns: int) -> PowerSample:
+        nonlocal count
+        count += 1
+        if count < 4:
+            raise error
+        return PowerSample(now_ns, 20.0, source="fake")
+
+    errors: list[str | None] = []
+    running = monitor(FakeMeter(read), on_sample=lambda *_: errors.append(running.snapshot().meter_error))
+    running.start()
+    try:
+        assert until(lambda: running.snapshot().sample is not None)
+    finally:
+        running.close()
+    assert any(line is not None and str(error) in line for line in errors)
+
+
+def test_a_sample_that_is_old_counts_as_none() -> None:
+    running = monitor(None)
+    running._power = None
+    assert running.step(SECOND).sample is None
+    now = [SECOND]
+    live = monitor(steady(), clock=lambda: now[0])
+    live._power._newest = (SECOND, PowerSample(SECOND, 20.0))  # type: ignore[union-attr]
+    assert live.step(SECOND + SECOND // 4).sample is not None
+    assert live.step(SECOND + SECOND).sample is None
+
+
+def test_without_a_meter_the_result_says_that_there_was_none() -> None:
+    running = monitor(None)
+    running.step(SECOND)
+    assert running.statistics() == {"mean": None, "p99": None, "source": "none", "tagged": "modelled"}
+
+
+def test_figures_of_a_model_are_never_called_measured() -> None:
+    meter = ModelledMeter(4.6, lambda: 0.0)
+    running = monitor(meter)
+    for index in range(5):
+        now_ns = (index + 1) * SECOND
+        running._power._newest = (now_ns, meter.read(now_ns))  # type: ignore[union-attr]
+        running.step(now_ns)
+    statistics = running.statistics()
+    assert (statistics["source"], statistics["tagged"]) == ("the plan's model", "modelled")
+    assert statistics["mean"] == pytest.approx(4.6)
+
+
+def test_a_callback_that_fails_does_not_end_the_thread_but_reasoning_and_is_said_once() -> None:
+    said: list[str] = []
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no room")
+
+    running = monitor(steady(), on_sample=fail, say=said.append)
+    running.start()
+    try:
+        assert until(lambda: not running.budget().allowed)
+        first_ns = running.snapshot().stamp_ns
+        assert until(lambda: running.snapshot().stamp_ns > first_ns)
+    finally:
+        running.close()
+    assert sum("no room" in line for line in said) == 1
+
+
+def test_a_governor_that_fails_leaves_reasoning_off() -> None:
+    class Broken(Governor):
+        def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
+            raise ZeroDivisionError
+
+    running = monitor(steady(), governor=Broken(GovernorConfig(25.0, 48)))
+    running.start()
+    try:
+        assert until(lambda: not running.budget().allowed)
+    finally:
+        running.close()
+
+
+def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
+    class Hot(ThermalReader):
+        def __init__(self) -> None:
+            pass
+
+        def read(self, now_ns: int) -> ThermalState:
+            return ThermalState(now_ns, {"tj-thermal": 103.0}, 103.0, -4.0, 1.5, ("gpu-throttle-alert",))
+
+    queue = FindingQueue()
+    running = monitor(steady(), thermal=Hot(), on_findings=queue.put)
+    running.start()
+    try:
+        assert until(lambda: len(queue) > 1)
+    finally:
+        running.close()
+    found = {finding.name: finding.detail for finding in queue.take()}
+    assert found["thermal-trip"] == "103 °C (gpu-throttle-alert)"
+    assert "thermal-throttle" in found
+
+
+@dataclass(frozen=True)
+class Charge:
+    """A battery report."""
+
+    received_ns: int
+    soc_percent: float | None = 5.0
+    voltage_v: float | None = None
+    current_a: float | None = None
+
+
+def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
+    running = monitor(None, battery=lambda: Charge(SECOND))
+    assert running.step(12 * SECOND).outputs.findings == ()
+    assert running.step(10 * SECOND).outputs.findings == ("battery-empty", "battery-low")
+
+
+def heated(state: ThermalState, say: Callable[[str], object] = lambda _line: None) -> PowerMonitor:
+    """A monitor whose thermal source has given one state at 1 s; its thread is not started."""
+    running = PowerMonitor(
+        None, Governor(GovernorConfig(None, 48)), activity=Activity, thermal=ThermalReader(Path("/nowhere")), say=say
+    )
+    assert running._heat is not None
+    running._heat._newest = (SECOND, state)
+    return running
+
+
+HOT = ThermalState(0, {"tj": 102.0}, 102.0, -3.0, 2.5, ("gpu-throttle-alert",))
+
+
+def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
+    said: list[str] = []
+    running = heated(HOT, said.append)
+    for second in (1, 5, 60, 120):
+        outputs = running.step(second * SECOND).outputs
+        assert outputs.findings == ("thermal-trip", "thermal-throttle")
+        assert not outputs.budget.allowed
+    assert running.snapshot().thermal is None
+    assert sum("temperatures are not read" in line for line in said) == 1
+
+
+def test_a_zone_that_gives_no_value_any_more_keeps_its_last_distance() -> None:
+    running = heated(HOT)
+    running.step(SECOND)
+    assert running._heat is not None
+    for second in range(2, 60):
+        running._heat._newest = (second * SECOND, ThermalState(0))
+        assert running.step(second * SECOND).outputs.findings == ("thermal-trip", "thermal-throttle")
+    running._heat._newest = (60 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
+    assert running.step(60 * SECOND).outputs.findings == ("thermal-throttle",)
+    running._heat._newest = (71 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
+    assert running.step(71 * SECOND).outputs.findings == ()
+
+
+def test_generations_are_counted_from_what_the_program_does_where_it_does_not_count() -> None:
+    states = iter([False, True, True, False, True])
+    seen: list[GovernorInputs] = []
+
+    class Watching(Governor):
+        def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
+            seen.append(inputs)
+            return super().step(inputs, now_ns)
+
+    governor = Watching(GovernorConfig(25.0, 48))
+    running = PowerMonitor(None, governor, activity=lambda: Activity(reasoning=next(states)))
+    for index in range(5):
+        running.step((index + 1) * SECOND)
+    assert [inputs.generations for inputs in seen] == [0, 0, 0, 1, 1]
+    assert [inputs.reasoning_s for inputs in seen] == [0.0, 0.0, 1.0, 2.0, 2.0]
+
+
+def test_statistics_weigh_by_time_and_a_gap_counts_as_one_second() -> None:
+    statistics = PowerStatistics()
+    for stamp_s, power_w in ((0, 10.0), (1, 30.0), (100, 10.0)):
+        statistics.add(stamp_s * SECOND, power_w)
+    assert statistics.mean_w == pytest.approx(20.0)
+
+
+def test_the_percentile_is_not_exceeded_for_that_share_of_the_time() -> None:
+    statistics = PowerStatistics()
+    for index in range(1001):
+        statistics.add(index * SECOND // 10, 30.0 if index % 50 == 0 else 10.0)
+    assert statistics.percentile_w(0.9) == pytest.approx(10.0, abs=0.051)
+    assert statistics.percentile_w(0.99) == pytest.approx(30.0, abs=0.051)
+
+
+def test_memory_of_the_statistics_does_not_grow() -> None:
+    statistics = PowerStatistics()
+    before = len(statistics._seconds)
+    for index in range(10_000):
+        statistics.add(index, float(index % 2000))
+    assert len(statistics._seconds) == before

@@ -1,0 +1,356 @@
+"""What both loops remember for as long as an instruction is followed: its way, and the progress that was said last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from edge.core.geometry import SE2
+from edge.reasoning.decoding_rules import BACK, DONE
+from edge.reasoning.instruction_state import InstructionMemory
+from edge.reasoning.path_memory import PathMemory, Way, way_of
+from edge.reasoning.progress_rules import EITHER_WAY, FREE, ONWARD
+from edge.reasoning.turn_estimate import LEFT, MOST_REFUSED, RIGHT, Look
+from edge.run.reasoning_loop import Mode
+from edge.state.reasoning_budget import ReasoningBudget
+from edge.state.reasoning_text import Progress
+from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot
+from sim_hil.benchmark.conditions.latency import Timing
+from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from tests.support.runner.reasoning_bench import KV, Bench, Clock, FakeLanguage, FakePolicy
+
+TICK_NS = 100_000_000
+LINE = "\nwaypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)"
+FIRST = "Progress: turn 1 of 3, passed 2." + LINE
+
+
+def pose_at(tick: int) -> SE2:
+    """Round a square of 8 m at 0.8 m/s."""
+    side, along = divmod(0.08 * tick, 8.0)
+    T_odom_corner = SE2(0.0, 0.0, 0.0)
+    for _ in range(int(side) % 4):
+        T_odom_corner = T_odom_corner @ SE2(8.0, 0.0, math.pi / 2)
+    return T_odom_corner @ SE2(along, 0.0, 0.0)
+
+
+def frame_at(tick: int) -> EncodedFrame:
+    return EncodedFrame(1_000_000_000 + tick * TICK_NS, pose_at(tick), KV)
+
+
+def counting(language: FakeLanguage) -> FakeLanguage:
+    """A model that says one turn more each time, and means to say another number of them every third time."""
+
+    def think(_run: object) -> None:
+        language.overruled = len(language.prompts) % 3 == 2
+        language.wanted = BACK if language.overruled else None
+        language.look = Look("left", 9.0)
+        language.text = f"Progress: turn {len(language.prompts) + 1} of 99, passed 0.{LINE}"
+
+    language.during_finish = think
+    return language
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench(clock=Clock())
+
+
+def think_at(bench: Bench, second: float) -> tuple[Way, Progress | None]:
+    """What a generation with a newest frame of that second is told; the robot drives at 1 m/s."""
+    bench.frame(second)
+    assert bench.loop.step()
+    return bench.language.prompt.told[-1]
+
+
+# Both loops
+
+
+def claiming(side: str, language: FakeLanguage) -> FakeLanguage:
+    """A model that has seen a turn to that side, says nothing else of it, and each time would have it done."""
+    language.text = FIRST
+
+    def think(_run: object) -> None:
+        language.look = None if language.prompts else Look(side, 9.0)
+        language.overruled = bool(language.prompts)
+        language.wanted = DONE if language.overruled else None
+
+    language.during_finish = think
+    return language
+
+
+def lockstep(
+    ticks: int,
+    latency_s: float,
+    of: Callable[[FakeLanguage], FakeLanguage] = counting,
+    slot: SemanticSlot | None = None,
+    instruction: str = "go",
+) -> FakeLanguage:
+    """Ticks of the benchmark's reasoner."""
+    language, ring, slot = of(FakeLanguage()), TokenRing(160), slot or SemanticSlot()
+    begin = language.begin
+    language.begin = lambda cancelled: begin(  # type: ignore[method-assign, assignment, misc]
+        cancelled,
+        interrupt=None,
+        before_call=lambda _: None,  # type: ignore[arg-type]
+    )
+    policy = FakePolicy()
+    policy.semantic_context = lambda kv, interrupt=None: {"context.0.key": kv}  # type: ignore[method-assign]
+    reasoner = LockstepReasoner(
+        language=language,  # type: ignore[arg-type]
+        policy=policy,  # type: ignore[arg-type]
+        ring=ring,
+        slot=slot,
+        instruction=instruction,
+        frame_offsets_s=(0.0, 3.0),
+        max_new_tokens=4,
+        draw=lambda: Timing(round(latency_s * 1e9), 0),
+        mode=Mode.ASYNC,
+    )
+    for tick in range(ticks):
+        now_ns = frame_at(tick).stamp_ns
+        reasoner.release(now_ns)
+        ring.put(frame_at(tick))
+        reasoner.start(now_ns)
+    return language
+
+
+def threaded(ticks: int, every: int, of: Callable[[FakeLanguage], FakeLanguage] = counting) -> FakeLanguage:
+    """The runner's loop, a generation after every so many ticks."""
+    bench = Bench(clock=Clock(), late_anchor=False)
+    of(bench.language)
+    for tick in range(ticks):
+        bench.ring.put(frame_at(tick))
+        if tick % every == 0:
+            assert bench.loop.step()
+    return bench.language
+
+
+def test_both_loops_tell_the_same_way_and_progress() -> None:
+    """Here the runner's text is there at once, the benchmark's after 2 s: both before the next generation begins."""
+    of_lockstep, of_runner = lockstep(801, 2.0).prompt.told, threaded(800, 20).prompt.told
+    assert len(of_runner) == 40
+    assert of_lockstep[:40] == of_runner
+    assert [before for _, before in of_runner[:3]] == [None, Progress(1, 99, 0), Progress(2, 99, 0)]
+
+
+def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None:
+    of_lockstep, of_runner = lockstep(801, 2.0).guided, threaded(800, 20).guided
+    assert of_lockstep[:40] == of_runner
+    assert [(known.before, known.follow) for known in of_runner[:4]] == [
+        (None, FREE), (Progress(1, 99, 0), ONWARD), (Progress(2, 99, 0), ONWARD), (Progress(3, 99, 0), EITHER_WAY),
+    ]  # fmt: skip
+
+
+def test_both_loops_refuse_a_turn_that_the_robot_has_not_made_as_often() -> None:
+    """It drives round to the left, and is to turn right."""
+    right = partial(claiming, RIGHT)
+    of_lockstep, of_runner = lockstep(401, 2.0, right).guided, threaded(400, 20, right).guided
+    assert of_lockstep[:20] == of_runner
+    may_be_done = [known.may_be_done for known in of_runner]
+    assert may_be_done == [True, *[False] * MOST_REFUSED, *[True] * (19 - MOST_REFUSED)]
+
+
+def test_both_loops_see_the_robot_turn() -> None:
+    """It is to turn left, and does so after 10 s."""
+    left = partial(claiming, LEFT)
+    of_lockstep, of_runner = lockstep(401, 2.0, left).guided, threaded(400, 20, left).guided
+    assert of_lockstep[:20] == of_runner
+    assert [known.may_be_done for known in of_runner] == [True, *[False] * 4, *[True] * 15]
+
+
+def test_a_text_that_is_cut_short_changes_nothing_of_the_turn() -> None:
+    bench = Bench(clock=Clock(), late_anchor=False)
+    claiming(LEFT, bench.language)
+    think_at(bench, 2.0)
+    bench.language.during_finish = lambda _run: None
+    bench.language.look, bench.language.plan_said = None, False
+    for second, text in ((5.0, FIRST), (8.0, "Situation: in a corri"), (11.0, FIRST)):
+        bench.language.text = text
+        think_at(bench, second)
+    assert bench.language.guided[-1].turn is not None
+
+
+def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_frames() -> None:
+    """2 s at 0.8 m/s; a generation's own picture is the newest of its frames."""
+    known = threaded(800, 20).guided[1]
+    assert known.turn is not None and known.turn.side == "left"
+    assert known.turn.left_m == pytest.approx([9.0 - 1.6])
+
+
+def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:
+    for number, (way, _) in enumerate(threaded(400, 20).prompt.told):
+        poses = [(frame_at(tick).stamp_ns, pose_at(tick)) for tick in range(20 * number + 1)]
+        assert way == way_of(poses)
+
+
+def test_the_way_does_not_depend_on_how_often_generations_run() -> None:
+    often, seldom = threaded(701, 5).prompt.told, threaded(701, 100).prompt.told
+    assert [way for way, _ in often][::20] == [way for way, _ in seldom]
+
+
+def test_the_way_goes_on_while_reasoning_is_paused_for_longer_than_the_ring_is_long() -> None:
+    bench = Bench(clock=Clock(), late_anchor=False)
+    bench.budget = ReasoningBudget(allowed=False)
+    for tick in range(700):
+        bench.ring.put(frame_at(tick))
+        assert not bench.loop.step()
+    bench.budget = ReasoningBudget()
+    bench.ring.put(frame_at(700))
+    assert bench.loop.step()
+    assert bench.language.prompt.told == [(way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(701)), None)]
+
+
+# An instruction's memory
+
+
+def test_the_first_generation_is_told_where_the_instruction_began_and_no_progress(bench: Bench) -> None:
+    assert think_at(bench, 2.0) == (((0.0, 0.0),), None)
+    assert think_at(bench, 5.0) == (((-3.0, 0.0),), None)
+
+
+def test_progress_that_was_said_is_told_next(bench: Bench) -> None:
+    bench.language.text = FIRST
+    assert [think_at(bench, second)[1] for second in (2.0, 3.0)] == [None, Progress(1, 3, 2)]
+
+
+def test_a_text_that_says_no_valid_progress_keeps_the_last(bench: Bench) -> None:
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    for number, text in enumerate(("Clear." + LINE, "Progress: turn 9 of 3, passed 2." + LINE, "")):
+        bench.language.text = text
+        assert think_at(bench, 3.0 + number)[1] == Progress(1, 3, 2)
+    assert think_at(bench, 9.0)[1] == Progress(1, 3, 2)
+
+
+def test_a_new_instruction_begins_where_the_robot_is_with_no_progress(bench: Bench) -> None:
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    think_at(bench, 4.0)
+    bench.loop.submit("left")
+    assert think_at(bench, 5.0) == (((-1.0, 0.0),), None)
+    assert think_at(bench, 6.0) == (((-2.0, 0.0),), Progress(1, 3, 2))
+
+
+def test_the_same_instruction_given_anew_begins_anew(bench: Bench) -> None:
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    bench.loop.submit("go")
+    assert think_at(bench, 3.0) == (((-1.0, 0.0),), None)
+
+
+def test_a_generation_that_is_ended_forgets_nothing(bench: Bench) -> None:
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    bench.loop.cancel()
+    assert think_at(bench, 3.0) == (((-1.0, 0.0),), Progress(1, 3, 2))
+
+
+def test_a_failed_generation_changes_nothing() -> None:
+    clock = Clock()
+    bench = Bench(clock=clock)
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    bench.language.text, bench.language.broken = "Progress: last leg of 3, passed 0." + LINE, 1
+    bench.frame(3.0)
+    assert not bench.loop.step() and bench.loop.failed == 1
+    clock.s += 1.0
+    bench.language.text = FIRST
+    assert think_at(bench, 4.0) == (((-2.0, 0.0),), Progress(1, 3, 2))
+
+
+def test_a_text_that_is_not_driven_by_is_not_remembered(bench: Bench) -> None:
+    bench.policy.guided_by_waypoints = True
+    bench.language.text = "Progress: turn 1 of 3, passed 2.\nno waypoints"
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    bench.language.text = FIRST
+    assert think_at(bench, 3.0)[1] is None
+
+
+def test_without_reasoning_the_way_is_told_and_no_progress() -> None:
+    bench = Bench(clock=Clock(), mode=Mode.NO_REASONING)
+    bench.language.text = ""
+    assert [think_at(bench, second) for second in (2.0, 3.0, 4.0)] == [
+        (((0.0, 0.0),), None),
+        (((-1.0, 0.0),), None),
+        (((-2.0, 0.0),), None),
+    ]
+
+
+HERE = "Objects: vending machine left 2 m.\nProgress: last leg of 0, passed 0.\nPlan: stop in 2 m." + LINE
+
+
+def test_where_to_stop_goes_with_the_answer_that_placed_it_and_ends_with_its_instruction(bench: Bench) -> None:
+    bench.loop.submit("stop at the vending machine")
+    bench.language.text = HERE
+    for second, known in ((2.0, False), (3.0, True)):
+        think_at(bench, second)
+        assert bench.slot.state is not None
+        assert (bench.slot.state.T_odom_stop is not None) is known
+        assert (bench.records[-1]["stop"] is not None) is known
+    bench.loop.submit("stop at the desk")
+    think_at(bench, 4.0)
+    assert bench.slot.state.T_odom_stop is None
+
+
+def saying_here(language: FakeLanguage) -> FakeLanguage:
+    language.text = HERE
+    return language
+
+
+@pytest.mark.parametrize(("ticks", "known"), [(30, False), (50, True)], ids=["one answer", "two"])
+def test_the_benchmarks_loop_hands_it_over_as_well(ticks: int, known: bool) -> None:
+    slot = SemanticSlot()
+    lockstep(ticks, 2.0, saying_here, slot, "stop at the vending machine")
+    assert slot.state is not None
+    assert (slot.state.T_odom_stop is not None) is known
+
+
+@pytest.mark.parametrize(("overruled", "whole"), [(True, True), (False, False)], ids=["overruled", "cut short"])
+def test_an_answer_that_is_not_the_models_own_or_not_whole_places_no_stop(
+    bench: Bench, overruled: bool, whole: bool
+) -> None:
+    bench.loop.submit("stop at the vending machine")
+    bench.language.text, bench.language.overruled, bench.language.plan_said = HERE, overruled, whole
+    for second in (2.0, 3.0, 4.0):
+        think_at(bench, second)
+    assert bench.slot.state is not None
+    assert bench.slot.state.T_odom_stop is None
+
+
+def test_what_was_told_is_recorded(bench: Bench) -> None:
+    bench.language.text = FIRST
+    think_at(bench, 2.0)
+    think_at(bench, 4.0)
+    assert [(record["way"], record["before"]) for record in bench.records] == [
+        (((0.0, 0.0),), "none."),
+        (((-2.0, 0.0),), "turn 1 of 3, passed 2."),
+    ]
+
+
+def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None:
+    ring, memory = TokenRing(100), InstructionMemory(None, "")
+    for tick in range(60):
+        ring.put(frame_at(tick))
+    assert memory.way(ring, frame_at(30)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(31))
+    assert memory.way(ring, frame_at(59)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(60))
+
+
+def test_watching_the_ring_looks_at_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring, memory, puts = TokenRing(100), InstructionMemory(None, ""), [0]
+    put = PathMemory.put
+
+    def counted(path: PathMemory, stamp_ns: int, T_odom_base: SE2) -> None:
+        puts[0] += 1
+        put(path, stamp_ns, T_odom_base)
+
+    monkeypatch.setattr(PathMemory, "put", counted)
+    for tick in range(100):
+        ring.put(frame_at(tick))
+        for _ in range(5):  # the loop polls more often than frames come
+            memory.watch(ring)
+    assert puts[0] == sum(1 + 10 * second for second in range(10))

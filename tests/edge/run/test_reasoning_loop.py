@@ -1,0 +1,359 @@
+"""The reasoning loop: one generation at a time, from the newest frames, published whole with its own anchor."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from edge.core.geometry import SE2
+from edge.run.reasoning_loop import ReasoningLoop
+from tests.support.runner.reasoning_bench import Bench, Clock, FakeRun
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def bench(clock: Clock) -> Bench:
+    return Bench(clock=clock)
+
+
+# A semantic state
+
+
+def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame(bench: Bench) -> None:
+    bench.frame(2.0)
+    assert bench.loop.step()
+    state = bench.slot.state
+    assert state is not None
+    assert state.anchor_ns == 2_000_000_000
+    assert state.T_odom_anchor == SE2(2.0, 0.0, 0.0)
+    assert state.waypoints == ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0))
+    assert [part[0, 0, 0] for part in state.context.values()] == [1.0, 2.0]
+
+
+def test_the_same_frame_is_not_thought_about_twice(bench: Bench) -> None:
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert not bench.loop.step()
+    bench.frame(5.0)
+    assert bench.loop.step()
+    assert bench.language.prompts == [[2.0], [2.0, 5.0]]
+
+
+def test_without_a_frame_there_is_nothing_to_think_about(bench: Bench) -> None:
+    assert not bench.loop.step()
+
+
+def test_delay_at_release_counts_from_the_capture_of_the_newest_frame(bench: Bench, clock: Clock) -> None:
+    def think(_run: FakeRun) -> None:
+        clock.s += 1.5
+
+    bench.language.during_finish = think
+    bench.frame(99.8)
+    bench.loop.step()
+    assert bench.loop.anchor_to_ready_ms.newest == pytest.approx(1700.0)
+    assert bench.slot.state is not None and bench.slot.state.ready_ns == clock()
+
+
+def test_what_is_recorded_is_what_was_published(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    [record] = bench.records
+    assert (record["anchor_ns"], record["frames_ns"], record["new_tokens"]) == (2_000_000_000, [2_000_000_000], 3)
+
+
+# Release delay
+
+
+def test_a_finished_generation_is_held_back_by_the_release_delay() -> None:
+    with Bench(delay_s=0.3) as bench:
+        started = time.monotonic()
+        bench.frame(2.0)
+        bench.wait_for(lambda: bench.loop.generations == 1)
+        assert time.monotonic() - started >= 0.3
+
+
+def test_until_the_new_state_is_released_the_old_one_stays() -> None:
+    with Bench(delay_s=0.2) as bench:
+        bench.frame(2.0)
+        bench.wait_for(lambda: bench.loop.generations == 1)
+        first = bench.slot.state
+        bench.frame(3.0)
+        bench.wait_for(lambda: len(bench.language.prompts) == 2)
+        assert bench.slot.state is first
+        bench.wait_for(lambda: bench.slot.state is not first)
+
+
+def test_a_stop_ends_a_generation_that_is_held_back() -> None:
+    with Bench(delay_s=30.0) as bench:
+        bench.frame(2.0)
+        bench.wait_for(lambda: len(bench.language.prompts) == 1)
+    assert bench.slot.state is None
+    assert bench.loop.cancelled == 0
+
+
+# The queue of one
+
+
+def test_a_new_instruction_ends_the_generation_under_way_and_is_followed_next(bench: Bench) -> None:
+    def change(run: FakeRun) -> None:
+        bench.language.during_finish = lambda _run: None
+        bench.loop.submit("left")
+        bench.loop.submit("right")
+        assert run.interrupt.is_set
+
+    bench.language.during_finish = change
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    bench.frame(2.1)
+    assert bench.loop.step()
+    assert (bench.loop.cancelled, bench.language.instructions) == (1, ["right"])
+
+
+def test_a_cancelled_generation_begins_again_with_the_newest_frames(bench: Bench) -> None:
+    def cancel(_run: FakeRun) -> None:
+        bench.language.during_finish = lambda _run: None
+        bench.frame(9.0)
+        bench.loop.cancel()
+
+    bench.language.during_finish = cancel
+    bench.frame(2.0)
+    assert not bench.loop.step()
+    assert bench.loop.step()
+    assert (bench.language.prompts, bench.language.instructions) == ([[9.0]], ["go"])
+
+
+def test_an_instruction_given_between_two_generations_interrupts_neither(bench: Bench) -> None:
+    bench.frame(2.0)
+    bench.loop.step()
+    bench.loop.submit("left")
+    bench.frame(3.0)
+    assert bench.loop.step()
+    assert (bench.loop.cancelled, bench.language.instructions) == (0, ["go", "left"])
+
+
+# Late anchor
+
+
+def test_older_frames_are_prefilled_before_the_newest_is_captured(bench: Bench, clock: Clock) -> None:
+    """The second generation knows from the first how long that takes, and plans the spacing of 3 s for it."""
+
+    def prefill() -> None:
+        clock.s += 0.4
+        bench.frame(clock.s)
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    for tenth in range(1005, 1010):
+        bench.frame(tenth / 10)
+    clock.s = 100.9
+    bench.loop.step()
+    assert bench.language.prompts[1] == pytest.approx([98.3, 101.3])
+    assert bench.loop.late_anchor_ms.newest == pytest.approx(400.0)
+
+
+def test_without_late_anchor_the_newest_frame_is_that_of_the_beginning(clock: Clock) -> None:
+    bench = Bench(clock=clock, late_anchor=False)
+    bench.language.during_feed = lambda: bench.frame(100.4)
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    assert bench.language.prompts == [[97.0, 100.0]]
+    assert bench.loop.late_anchor_ms.newest == 0.0
+
+
+def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
+    with Bench() as bench:
+        for tenth in range(70, 101):
+            bench.frame(tenth / 10)
+        bench.language.during_feed = lambda: time.sleep(0.3)
+        bench.wait_for(lambda: bench.loop.generations == 1)
+        bench.language.during_feed = lambda: None
+        bench.frame(10.1)
+        time.sleep(0.1)
+        assert bench.loop.generations == 1
+        bench.frame(10.4)
+        bench.wait_for(lambda: bench.loop.generations == 2)
+        assert bench.language.prompts[1][-1] == pytest.approx(10.4)
+
+
+def test_one_slow_prefill_does_not_make_the_next_generation_wait(bench: Bench, clock: Clock) -> None:
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    for took_s in (0.2, 0.2, 0.2, 1.5, 0.2):
+
+        def prefill(took_s: float = took_s) -> None:
+            for _ in range(round(took_s * 10)):
+                clock.s += 0.1
+                bench.frame(clock.s)
+
+        clock.s += 0.1
+        bench.frame(clock.s)
+        bench.language.during_feed = prefill
+        assert bench.loop.step()
+    assert bench.loop.late_anchor_ms.newest == pytest.approx(200.0)
+
+
+def test_when_prefill_takes_far_longer_than_planned_the_spacing_is_kept(bench: Bench, clock: Clock) -> None:
+    def prefill() -> None:
+        for tenth in range(1, 21):
+            bench.frame(100.0 + tenth / 10)
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    assert bench.language.prompts == [pytest.approx([97.0, 100.5])]
+
+
+def test_a_generation_is_given_up_when_no_frame_was_captured_around_the_planned_instant(
+    bench: Bench, clock: Clock
+) -> None:
+    def prefill() -> None:
+        clock.s += 2.0
+
+    bench.language.during_feed = prefill
+    for tenth in range(960, 1021):
+        bench.frame(tenth / 10)
+    bench.loop.step()
+    bench.frame(102.1)
+    bench.language.during_feed = lambda: bench.frame(120.0)
+    assert not bench.loop.step()
+    assert (len(bench.language.prompts), bench.loop.missed_frames) == (1, 1)
+    assert bench.loop.failed == 0
+
+
+# What a supervisor sees
+
+
+def test_progress_is_seen_while_there_is_nothing_to_do(bench: Bench, clock: Clock) -> None:
+    clock.s += 5.0
+    bench.loop.step()
+    assert bench.loop.last_progress_ns == clock()
+
+
+def test_a_call_that_hangs_makes_no_progress(bench: Bench, clock: Clock) -> None:
+    seen: list[int] = []
+
+    def hang(_run: FakeRun) -> None:
+        before = clock()
+        clock.s += 60.0
+        seen.append(bench.loop.last_progress_ns - before)
+
+    bench.language.during_finish = hang
+    bench.frame(2.0)
+    bench.loop.step()
+    assert seen == [0]
+
+
+def test_every_generation_is_in_the_statistics(bench: Bench, clock: Clock) -> None:
+    for second in range(3):
+        bench.frame(float(second))
+        bench.loop.step()
+    assert {len(bench.loop.generation_ms), len(bench.loop.anchor_to_ready_ms), len(bench.loop.late_anchor_ms)} == {3}
+
+
+def test_a_policy_that_reads_waypoints_keeps_the_last_ones_when_a_text_has_none(bench: Bench, clock: Clock) -> None:
+    bench.policy.guided_by_waypoints = True
+    bench.frame(2.0)
+    bench.loop.step()
+    good = bench.slot.state
+    assert good is not None and good.waypoints is not None
+    bench.language.text = "no waypoints here"
+    bench.frame(3.0)
+    assert not bench.loop.step()
+    assert bench.slot.state is good
+    assert (bench.loop.invalid_texts, bench.loop.failed) == (1, 0)
+
+
+def test_the_time_spent_computing_is_counted(bench: Bench, clock: Clock) -> None:
+    seen: list[tuple[bool, int]] = []
+
+    def think(_run: FakeRun) -> None:
+        clock.s += 0.7
+        seen.append((bench.loop.busy, bench.loop.busy_ns))
+
+    bench.language.during_finish = think
+    bench.frame(2.0)
+    bench.loop.step()
+    clock.s += 5.0
+    assert seen == [(True, 700_000_000)]
+    assert (bench.loop.busy, bench.loop.busy_ns) == (False, 700_000_000)
+
+
+class Waiting:
+    """Gives way for half a second before every call."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.waited_ns, self.busy_ns = clock, 0, -1
+        self.loop: ReasoningLoop | None = None
+
+    def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
+        assert self.loop is not None
+        self.clock.s += 0.5
+        self.waited_ns += 500_000_000
+        self.busy_ns = self.loop.busy_ns
+        assert self.loop.busy, "a generation is under way all the same"
+
+
+def test_giving_way_to_ticks_is_not_computing(clock: Clock) -> None:
+    way = Waiting(clock)
+    bench = Bench(clock=clock, give_way=way)
+    way.loop = bench.loop
+    bench.language.during_finish = lambda _run: setattr(clock, "s", clock.s + 0.7)
+    bench.frame(2.0)
+    assert bench.loop.step()
+    assert (way.busy_ns, bench.loop.busy_ns, bench.loop.busy) == (700_000_000, 700_000_000, False)
+    assert bench.loop.gave_way_ns == 500_000_000
+
+
+class Ticking(threading.Event):
+    """A stop that is never asked for; waiting for it lets the time pass."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self.clock = clock
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.clock.s += timeout or 0.0
+        return False
+
+
+def camera_stops(bench: Bench, clock: Clock) -> None:
+    """The older frames of the second generation take 2 s, and no newer frame comes."""
+
+    def prefill() -> None:
+        clock.s += 2.0
+
+    bench.language.during_feed = prefill
+    bench.frame(97.0)
+    bench.frame(100.0)
+    assert bench.loop.step()
+    bench.frame(102.0)
+    bench.frame(103.0)
+    bench.loop._stop = Ticking(clock)
+
+
+def test_a_frame_that_never_comes_is_not_waited_for_for_ever(bench: Bench, clock: Clock) -> None:
+    camera_stops(bench, clock)
+    started_s = clock.s
+    assert not bench.loop.step()
+    assert bench.loop.missed_frames == 1
+    assert clock.s - started_s == pytest.approx(2.0 + 2.0 + 0.5 + 1.0, abs=0.1)
+    assert not bench.loop.step(), "nothing to do until there is another frame"
+    assert bench.loop.missed_frames == 1
+
+
+def test_waiting_for_a_frame_is_not_computing(bench: Bench, clock: Clock) -> None:
+    camera_stops(bench, clock)
+    before_ns = bench.loop.busy_ns
+    bench.loop.step()
+    assert bench.loop.busy_ns - before_ns == pytest.approx(2e9, abs=1e6)

@@ -1,0 +1,302 @@
+"""`edge-export`: the graphs are the model, or there are no graphs."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from export.cli import DEFAULT_CALIBRATION, main
+from export.core.cache import StageCache
+from export.evaluation.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
+from export.evaluation.gates import GateError, judge
+from export.evaluation.metrics import Arrays, ParityResult, Sample, compare
+from export.evaluation.parity import references, sample_inputs
+from export.evaluation.task_error import TaskError, prompt_parts
+from export.graphs.build import graph_names, write_graph
+from export.model.network import TicVla, build
+from export.pipeline.artifacts import build_artifacts
+from export.pipeline.build import Pipeline, WeightsRecord
+from export.target.file import with_settings
+from tests.support.export.export_job import NANO, TARGET, job, manifest, progress
+
+GRAPHS = graph_names(pair=False)
+RANDOM = ("--random-weights", "0")
+"""What `artifacts_dir` was exported with."""
+
+
+@pytest.fixture(scope="module")
+def model() -> TicVla:
+    return build(NANO, 0)
+
+
+@pytest.fixture(scope="module")
+def samples(model: TicVla) -> dict[str, list[Sample]]:
+    return {name: references(model, name, TARGET.gate(name).inputs) for name in GRAPHS}
+
+
+def verdict(name: str, found: ParityResult) -> str:
+    return judge(found, None, TARGET.gate(name), TARGET.task_gate).level
+
+
+# ---- the directory
+
+
+def test_the_directory_holds_what_the_design_lists(artifacts_dir: Path) -> None:
+    graphs = {f"{name}.onnx" for name in GRAPHS}
+    assert {p.name for p in artifacts_dir.iterdir()} == graphs | {
+        "manifest.json",
+        "tokenizer.json",
+        "report.json",
+        "report.html",
+    }
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_every_graph_passed_the_gate_on_eight_inputs(artifacts_dir: Path, name: str) -> None:
+    parity, gate = manifest(artifacts_dir)["graphs"][name]["parity"], TARGET.gate(name)
+    assert parity["verdict"] == "PASS"
+    assert parity["inputs"] == 8
+    assert parity["cosine"] >= gate.min_cosine
+    assert parity["max_abs"] <= gate.max_abs
+    assert parity["min_difference"] >= gate.min_difference
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_every_graph_was_run_on_the_provider_that_ships_and_on_the_task(artifacts_dir: Path, name: str) -> None:
+    parity = manifest(artifacts_dir)["graphs"][name]["parity"]
+    assert parity["provider"] == "CPUExecutionProvider"
+    assert parity["shipping_provider_checked"] is True
+    assert parity["task"]["waypoint_cm"] < TARGET.task_gate.waypoint_cm
+    assert [delay_s for delay_s, _ in parity["task"]["by_delay_cm"]] == [0, 1, 2, 3, 5, 7, 10]
+
+
+def test_the_language_model_chooses_the_same_tokens(artifacts_dir: Path) -> None:
+    assert manifest(artifacts_dir)["graphs"]["language_model"]["parity"]["top1"] == 1.0
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_the_manifest_says_what_a_graph_is_made_of_and_how_it_is_opened(artifacts_dir: Path, name: str) -> None:
+    graph = manifest(artifacts_dir)["graphs"][name]
+    assert graph["bytes"] == (artifacts_dir / graph["file"]).stat().st_size
+    assert graph["precision"] == {"default": "fp32", "overrides": {}}
+    assert graph["precision_reason"]
+    assert graph["session"] == {"provider": "CPUExecutionProvider", "options": {}, "threads": 1, "engine": False}
+
+
+def test_the_manifest_holds_plan_calibration_and_target(artifacts_dir: Path) -> None:
+    content = manifest(artifacts_dir)
+    assert content["plan"]["tagged"] in ("modelled", "measured")
+    assert content["provenance"]["calibration"]["name"] == DEFAULT_CALIBRATION
+    assert len(content["provenance"]["calibration"]["sha256"]) == 64
+    assert content["provenance"]["target"]["gates"]["task"]["waypoint_cm"] == TARGET.task_gate.waypoint_cm
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_no_graph_names_the_machine_it_was_made_on(artifacts_dir: Path, name: str) -> None:
+    data = (artifacts_dir / f"{name}.onnx").read_bytes()
+    assert str(Path(__file__).parents[3]).encode() not in data
+    assert b"site-packages" not in data
+    proto = onnx.load_from_string(data)
+    assert all(not t.external_data for t in proto.graph.initializer)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "report.json", "report.html"])
+def test_no_report_names_the_machine_it_was_made_on(artifacts_dir: Path, name: str) -> None:
+    text = (artifacts_dir / name).read_text()
+    for place in (artifacts_dir, Path(__file__).parents[3], Path.home()):
+        assert str(place) not in text
+
+
+def test_the_manifest_says_that_the_weights_are_untrained(artifacts_dir: Path) -> None:
+    assert manifest(artifacts_dir)["model"]["trained"] is False
+    assert "untrained" in (artifacts_dir / "report.html").read_text()
+    assert not load_artifacts(artifacts_dir).trained
+
+
+# ---- the gate
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_the_eight_inputs_are_all_different(name: str) -> None:
+    inputs = [sample_inputs(NANO, name, i) for i in range(8)]
+    keys = [b"".join(a.tobytes() for a in feeds.values()) for feeds in inputs]
+    assert len(set(keys)) == 8
+
+
+@pytest.mark.parametrize("name", ["vision_encoder", "action_expert"])
+def test_a_graph_that_ignores_its_input_fails(samples: dict[str, list[Sample]], name: str) -> None:
+    first = samples[name][0].expected
+    assert verdict(name, compare(name, samples[name], lambda _: first)) == "FAIL"
+
+
+def test_a_small_error_in_one_output_fails(samples: dict[str, list[Sample]], artifacts: Artifacts) -> None:
+    graph = OpenGraph(artifacts, "action_expert", threads=1)
+    assert verdict("action_expert", compare("action_expert", samples["action_expert"], graph)) == "PASS"
+
+    def shifted(feeds: Arrays) -> Arrays:
+        return {name: y + np.float32(2e-3) for name, y in graph(feeds).items()}
+
+    assert verdict("action_expert", compare("action_expert", samples["action_expert"], shifted)) == "FAIL"
+
+
+@pytest.mark.parametrize("dead", ["visual_tokens", "state", "latency", "context.0.key", "context.5.value"])
+def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
+    samples: dict[str, list[Sample]], artifacts: Artifacts, dead: str
+) -> None:
+    graph = OpenGraph(artifacts, "action_expert", threads=1)
+    found = compare("action_expert", samples["action_expert"], lambda f: graph({**f, dead: np.zeros_like(f[dead])}))
+    assert verdict("action_expert", found) == "FAIL"
+
+
+class Blind(TaskCheck):
+    """A runner that never feeds its language model a frame."""
+
+    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
+        unseen = [np.zeros_like(tokens) for tokens in self._reference.visual]
+        kv, texts = [], []
+        for sample in self._samples.samples:
+            state, ids = self._torch.language(prompt_parts(sample, unseen), NEW_TOKENS)
+            kv.append(state)
+            texts.append(ids)
+        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
+
+
+def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("export.pipeline.build.TaskCheck", Blind)
+    assert main([*RANDOM, "--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "language_model: not the same model: deviation as a share of the plans' spread" in said
+    assert "cosine of the semantic state" in said
+    assert not (tmp_path / "blind").exists()
+
+
+def test_a_failed_gate_leaves_no_directory(cache: StageCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = build(NANO, 1)
+    rounded = Pipeline.graph
+
+    def graph(self: Pipeline, name: str) -> list[Path]:
+        if name != "semantic_context":
+            return rounded(self, name)
+        # The file on disk comes from other weights than those it is checked against.
+        (tmp_path / "made").mkdir(exist_ok=True)
+        write_graph(other, name, TARGET.precision(name), "fused", tmp_path / "made")
+        return [tmp_path / "made" / f"{name}.onnx"]
+
+    monkeypatch.setattr(Pipeline, "graph", graph)
+    with pytest.raises(GateError, match=r"semantic_context: not the same model: "):
+        build_artifacts(job(), tmp_path / "out", cache, progress())
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [*RANDOM, "--out", str(tmp_path / "out"), "--set", "gates.task.waypoint_cm=1e-9"]
+    assert main([*arguments, "--set", "gates.task.warn_waypoint_cm=1e-10"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "vision_encoder: not the same model: waypoint error in cm" in said
+    assert said.endswith("; nothing was written")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main([*RANDOM, "--out", str(out), "--set", "gates.task.warn_waypoint_cm=1e-9"]) == 0
+    assert "vision_encoder: near a limit: waypoint error in cm" in capsys.readouterr().err
+    parity = manifest(out)["graphs"]["vision_encoder"]["parity"]
+    assert parity["verdict"] == "WARN"
+    assert "waypoint error" in parity["reasons"][0]
+    assert "with a warning" in (out / "report.html").read_text()
+
+
+# ---- the same again
+
+
+def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
+    artifacts_dir: Path, tmp_path: Path
+) -> None:
+    assert main([*RANDOM, "--out", str(tmp_path / "cold"), "--no-cache"]) == 0
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(tmp_path / "cold")], check=True, timeout=60)
+    assert [path.name for path in tmp_path.iterdir()] == ["cold"]
+
+
+def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened_to_the_first(
+    artifacts_dir: Path, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main([*RANDOM, "--out", str(first)]) == 0
+    data = bytearray((first / "action_expert.onnx").read_bytes())
+    data[1000] ^= 1
+    (first / "action_expert.onnx").write_bytes(data)
+    assert main([*RANDOM, "--out", str(second)]) == 0
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM], ids=lambda told: told.name)
+def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
+    artifacts_dir: Path, tmp_path: Path, told: signal.Signals
+) -> None:
+    cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
+    command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
+    # A background job of a shell ignores SIGINT and so would its children; what is handled here is default there.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    try:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "gate vision_encoder · " in line:
+                break
+        process.send_signal(told)
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+        process.wait(timeout=60)
+        process.stderr.close()
+    assert not any(out.parent.iterdir())
+    assert [path for path in cache.iterdir() if path.name.endswith(".partial")] == []
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[3], check=True
+    )
+    assert "weights: from the cache" in done.stderr
+    assert "graph action_expert: from the cache" in done.stderr
+    assert done.stdout == ""
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=60)
+
+
+def test_weights_that_are_trained_or_other_threads_choose_a_precision_anew(
+    cache: StageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = with_settings(TARGET, ["graphs.vision_encoder.candidates=fp32,int8"])
+    keys: list[str] = []
+
+    def key_of(pipeline: Pipeline) -> str:
+        keys.clear()
+        monkeypatch.setattr(Pipeline, "_stage", lambda _, title, key, build: keys.append(key) or Path("none"))
+        with pytest.raises(FileNotFoundError):
+            pipeline.decision("vision_encoder")
+        return keys[-1]
+
+    def pipeline(trained: bool, threads: int) -> Pipeline:
+        record = WeightsRecord("0" * 64, trained, "a test", {})
+        monkeypatch.setattr(Pipeline, "weights", lambda _: record)
+        monkeypatch.setattr(Pipeline, "tokenizer", lambda _: b"")
+        monkeypatch.setattr("export.pipeline.build.threads_for", lambda _: threads)
+        return Pipeline(replace(job(), target=target), cache, progress())
+
+    found = {key_of(pipeline(trained, threads)) for trained in (False, True) for threads in (1, 2)}
+    torch.set_num_threads(1)
+    assert len(found) == 4

@@ -1,0 +1,106 @@
+"""`edge-export --out`: whole directories only, and nothing of the user's is ever lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from edge.artifacts.manifest import load_artifacts
+from export.cli import main
+from export.core.cache import StageCache
+from export.pipeline.artifacts import build_artifacts, workplace
+from tests.support.export.export_job import job, manifest, progress
+
+
+def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    (out / "flight.mcap").write_bytes(b"evidence")
+    assert main(["--out", str(out)]) == 2
+    assert "flight.mcap" in capsys.readouterr().err
+    assert (out / "flight.mcap").read_bytes() == b"evidence"
+
+
+def test_a_failed_swap_puts_the_old_directory_back(
+    cache: StageCache, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == "new":
+            raise OSError("disk full")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="disk full"):
+        build_artifacts(job(), out, cache, progress())
+    assert [p.name for p in tmp_path.iterdir()] == ["nano"]
+    load_artifacts(out)
+
+
+def test_an_existing_directory_that_is_not_ours_is_not_touched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
+    assert main(["--out", str(tmp_path / "thesis")]) == 2
+    assert "manifest.json" in capsys.readouterr().err
+    assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("name", ["nano.partial", "nano.old.partial"])
+def test_a_directory_of_the_users_beside_the_output_stays(artifacts_dir: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "notes.txt").write_text("mine")
+    (tmp_path / "nano").mkdir()  # empty: may be used
+    assert main(["--out", str(tmp_path / "nano")]) == 0
+    assert (tmp_path / name / "notes.txt").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["nano", name])
+
+
+def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "nano").symlink_to("disk")
+    assert main(["--out", str(tmp_path / "nano")]) == 0
+    assert (tmp_path / "nano").is_symlink()
+    load_artifacts(tmp_path / "disk")
+
+
+def test_an_older_directory_of_ours_is_replaced_if_its_files_are_as_it_says(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    content = {"schema_version": 1, "files": manifest(out)["files"]}
+    (out / "manifest.json").write_text(json.dumps(content))
+    tokenizer = (out / "tokenizer.json").read_bytes()
+    (out / "tokenizer.json").write_bytes(tokenizer + b"\n")
+    assert main(["--out", str(out)]) == 2
+    assert "schema version 1" in capsys.readouterr().err
+    (out / "tokenizer.json").write_bytes(tokenizer)
+    assert main(["--out", str(out)]) == 0
+    load_artifacts(out)
+
+
+def test_a_second_export_into_one_directory_is_refused(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with workplace(tmp_path / "nano") as work:
+        (work / "new").mkdir()
+        assert main(["--out", str(tmp_path / "nano")]) == 2
+        assert "another export is writing" in capsys.readouterr().err.splitlines()[-1]
+        assert (work / "new").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_export_was_replacing_comes_back(artifacts_dir: Path, tmp_path: Path) -> None:
+    work = tmp_path / ".nano.edge-export"
+    shutil.copytree(artifacts_dir, work / "old")
+    (work / "new").mkdir()
+    with workplace(tmp_path / "nano"):
+        load_artifacts(tmp_path / "nano")
+    assert [path.name for path in tmp_path.iterdir()] == ["nano"]

@@ -1,0 +1,197 @@
+"""report.html: everything that report.json says, on one page that loads nothing."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from export.pipeline.report import precision_text, report_html, size_text
+from export.pipeline.report_plots import Dot, Line, dot_plot, line_plot
+
+
+@pytest.fixture(scope="module")
+def report(artifacts_dir: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((artifacts_dir / "report.json").read_text())
+    return content
+
+
+@pytest.fixture
+def changed(report: dict[str, Any]) -> dict[str, Any]:
+    return copy.deepcopy(report)
+
+
+class _Page(HTMLParser):
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def test_the_page_is_made_of_report_json_alone(artifacts_dir: Path, report: dict[str, Any]) -> None:
+    assert report_html(report) == (artifacts_dir / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_page_loads_nothing(report: dict[str, Any]) -> None:
+    page = report_html(report)
+    for tag, attributes in _Page(page).tags:
+        assert tag not in {"script", "link", "iframe", "object", "embed", "base", "img", "image", "use"}
+        assert not {"href", "src", "srcset", "onload"} & set(attributes)
+    assert "url(" not in page
+    assert "@import" not in page
+
+
+@pytest.mark.parametrize("name", ["vision_encoder", "language_model", "semantic_context", "action_expert"])
+def test_every_graph_has_its_size_exactness_verdict_and_reason(report: dict[str, Any], name: str) -> None:
+    graph, text = report["graphs"][name], _Page(report_html(report)).text
+    assert size_text(graph["bytes"]) in text
+    assert f"{graph['parity']['cosine']:.6f}" in text
+    assert f"{name}: fp32" in text
+    assert graph["precision_reason"] in text
+    assert text.count("PASS") == 4
+
+
+def test_plan_calibration_and_provenance_are_on_the_page(report: dict[str, Any]) -> None:
+    text = _Page(report_html(report)).text
+    assert f"{report['plan']['tick_ms']:,.4g} ms" in text
+    assert report["plan"]["tagged"] in text
+    assert report["provenance"]["calibration"]["name"] in text
+    assert report["provenance"]["weights_sha256"] in text
+    assert f"onnxruntime {report['provenance']['packages']['onnxruntime']}" in text
+
+
+def test_graphs_come_in_the_order_in_which_they_run(report: dict[str, Any]) -> None:
+    text = _Page(report_html(report)).text
+    places = [text.index(name) for name in ("vision_encoder", "language_model", "semantic_context", "action_expert")]
+    assert places == sorted(places)
+
+
+def test_untrained_weights_are_said_plainly_and_trained_ones_are_not(changed: dict[str, Any]) -> None:
+    assert "The weights are untrained" in report_html(changed)
+    changed["model"]["trained"] = True
+    assert "untrained" not in report_html(changed)
+
+
+def test_a_graph_that_ran_elsewhere_than_it_will_is_said_plainly(changed: dict[str, Any]) -> None:
+    assert "repeat this check" not in report_html(changed)
+    changed["graphs"]["vision_encoder"]["session"]["provider"] = "TensorrtExecutionProvider"
+    changed["graphs"]["vision_encoder"]["parity"]["shipping_provider_checked"] = False
+    text = _Page(report_html(changed)).text
+    assert "The device still has to repeat this check." in text
+    assert "made for TensorrtExecutionProvider" in text
+    assert "edge-export verify DIR" in text
+
+
+def test_a_warning_is_shown_with_its_reason(changed: dict[str, Any]) -> None:
+    changed["graphs"]["action_expert"]["parity"] |= {"verdict": "WARN", "reasons": ["cosine 0.995 (≥ 0.999)"]}
+    text = _Page(report_html(changed)).text
+    assert "4 graphs pass, 1 with a warning" in text
+    assert "action_expert : cosine 0.995 (≥ 0.999)" in text
+
+
+def test_a_plan_that_does_not_fit_says_why(changed: dict[str, Any]) -> None:
+    changed["plan"] |= {"fits": False, "reasons": ["tick 250 ms exceeds the period of 100 ms"], "generation_ms": None}
+    text = _Page(report_html(changed)).text
+    assert "Does not fit: tick 250 ms exceeds the period of 100 ms" in text
+
+
+def test_the_halves_of_a_language_model_share_its_thresholds(changed: dict[str, Any]) -> None:
+    whole = changed["graphs"].pop("language_model")
+    changed["graphs"] |= {f"language_model.{half}": whole for half in ("prefill", "decode")}
+    text = _Page(report_html(changed)).text
+    assert text.index("language_model.prefill") < text.index("language_model.decode")
+
+
+def test_layers_that_were_searched_are_plotted(changed: dict[str, Any]) -> None:
+    row = {"precision": "int8", "waypoint_cm": 0.3}
+    changed["sensitivity"]["vision_encoder"] = {
+        "precision": {"default": "int8", "overrides": {"blocks.1.*": "fp32"}},
+        "table": [{**row, "group": "*"}, {**row, "group": "blocks.1.*"}, {**row, "group": "projector.*"}],
+    }
+    text = _Page(report_html(changed)).text
+    assert "the 2 most sensitive groups of layers, each rounded alone to int8, filled: kept more exact" in text
+
+
+def test_text_from_files_cannot_act_on_the_page(changed: dict[str, Any]) -> None:
+    evil = "<script>alert(1)</script>\u202e"
+    changed["provenance"]["weights_origin"] = evil
+    changed["provenance"]["calibration"]["name"] = evil
+    changed["graphs"]["vision_encoder"]["precision_reason"] = evil
+    changed["model"]["name"] = evil
+    changed["graphs"]["vision_encoder"]["session"]["provider"] = evil
+    page = report_html(changed)
+    assert "<script" not in page
+    assert "\u202e" not in page
+
+
+# ---- plots
+
+
+def test_plots_are_whole_svg() -> None:
+    dots = dot_plot([Dot("a<b", 0.1, True), Dot("c", 0.0, False)], "error & more", 5)
+    lines = line_plot([Line("a<b", ((0, 1), (10, 2)))], "x", "y", 2.5)
+    for svg in (dots, lines):
+        assert ET.fromstring(svg).tag == "svg"
+
+
+def test_a_larger_value_lies_further_right_and_nothing_leaves_the_picture() -> None:
+    values = [0.0, 1e-9, 0.02, 3.0, 4e5]
+    svg = ET.fromstring(dot_plot([Dot(str(v), v, False) for v in values], "error"))
+    places = [float(circle.get("cx", "nan")) for circle in svg.findall("circle")]
+    assert places == sorted(places)
+    assert places[0] > 0
+    assert places[-1] < 440
+
+
+def test_a_line_goes_up_with_its_values() -> None:
+    svg = ET.fromstring(line_plot([Line("a", ((0, 0), (5, 1), (10, 4)))], "x", "y"))
+    line = svg.find("polyline")
+    assert line is not None
+    ys = [float(point.split(",")[1]) for point in str(line.get("points")).split()]
+    assert ys == sorted(ys, reverse=True)
+
+
+@pytest.mark.parametrize(("limit", "said"), [(2.0, "gate: 2"), (50.0, "gate: 50, off the scale")])
+def test_a_gate_far_above_all_lines_is_named_not_drawn(limit: float, said: str) -> None:
+    svg = ET.fromstring(line_plot([Line("a", ((0, 1), (10, 1.5)))], "x", "y", limit))
+    assert said in [text.text for text in svg.findall("text")]
+    assert len([line for line in svg.findall("line") if line.get("stroke") == "#b3261e"]) == (limit == 2.0)
+
+
+def test_nothing_to_plot_is_no_picture() -> None:
+    assert dot_plot([], "x") == line_plot([], "x", "y") == line_plot([Line("a", ())], "x", "y") == ""
+
+
+def test_values_of_zero_alone_are_plotted_too() -> None:
+    assert ET.fromstring(dot_plot([Dot("a", 0.0, False)], "x")).tag == "svg"
+    line = ET.fromstring(line_plot([Line("a", ((0, 0.0),))], "x", "y")).find("polyline")
+    assert line is not None
+    assert all(math.isfinite(float(v)) for v in str(line.get("points")).replace(",", " ").split())
+
+
+@pytest.mark.parametrize(("count", "shown"), [(1.234e9, "1.23 GB"), (48e6, "48 MB"), (2500, "2.5 kB"), (12, "12 B")])
+def test_sizes_are_in_the_unit_that_fits(count: float, shown: str) -> None:
+    assert size_text(count) == shown
+
+
+def test_exceptions_to_a_precision_are_counted() -> None:
+    assert precision_text({"default": "int8", "overrides": {}}) == "int8"
+    assert precision_text({"default": "int8", "overrides": {"a": "fp32"}}) == "int8 + 1 exception"
+    assert precision_text({"default": "int8", "overrides": {"a": "fp32", "b": "fp32"}}) == "int8 + 2 exceptions"

@@ -1,0 +1,373 @@
+"""The plan: what a target's figures say that a model takes, and that it refuses what does not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from export.graphs.build import linear_layers
+from export.model.config import PRESETS, TicVlaConfig
+from export.plan.cost import DECODE, PREFILL, action_call, context_call, language_call, vision_call
+from export.plan.plan import Plan, PlanError, plan
+from export.plan.table import plan_table
+from export.quantize.precision import Precision
+from export.target.file import Target, load_target, with_settings
+from export.target.sections import MEASURED, MODELLED, Measured
+
+BIG, NANO = PRESETS["1b"], PRESETS["nano"]
+PAPER_MS = {"orin": (120.27, 4831.73), "rtx4060": (85.73, 3430.73)}
+FP32 = Precision("fp32")
+
+
+def target(name: str, *settings: str, model: str = "1b") -> Target:
+    return with_settings(load_target(name, model), settings)
+
+
+def planned(name: str, *settings: str, tokens: int | None = None, text_tokens: int | None = None) -> Plan:
+    return plan(target(name, *settings), BIG, tokens=tokens, text_tokens=text_tokens)
+
+
+def stage(made: Plan, name: str) -> dict:
+    return made.to_dict()["per_graph"][name]
+
+
+@pytest.mark.parametrize("name", ["orin", "rtx4060"])
+def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> None:
+    made = planned(name)
+    assert made.fits, made.reasons
+    assert made.tick.ms <= made.period_ms
+    assert made.tokens > 0
+    assert made.tagged == MODELLED
+
+
+def test_two_calls_give_the_same_plan() -> None:
+    assert json.dumps(planned("orin").to_dict()) == json.dumps(planned("orin").to_dict())
+
+
+@pytest.mark.parametrize("name", ["orin", "rtx4060", "cpu"])
+def test_more_tokens_take_longer_and_make_the_state_older(name: str) -> None:
+    few, many = (planned(name, "runtime.tick_period_ms=5000", tokens=n) for n in (8, 64))
+    assert few.generation is not None and many.generation is not None
+    assert few.generation.ms < many.generation.ms
+    assert few.delay_s is not None and many.delay_s is not None
+    assert few.delay_s < many.delay_s
+
+
+@pytest.mark.parametrize(("exact", "coarse"), [("fp16", "int8-b32"), ("int8-b32", "int4-b32")])
+def test_a_lower_precision_takes_fewer_bytes_and_decodes_faster(exact: str, coarse: str) -> None:
+    a, b = (plan(target("orin"), BIG, {"language_model": Precision(name)}, tokens=32) for name in (exact, coarse))
+    assert stage(b, "decode")["weight_bytes"] < stage(a, "decode")["weight_bytes"]
+    assert stage(b, "decode")["moved_bytes"] < stage(a, "decode")["moved_bytes"]
+    assert stage(b, "decode")["ms"] < stage(a, "decode")["ms"]
+    assert b.memory.needed < a.memory.needed
+
+
+def test_an_override_counts_for_its_layer_alone() -> None:
+    plain, mixed = (
+        plan(target("orin"), BIG, {"language_model": p}, tokens=8)
+        for p in (Precision("int4-b32"), Precision("int4-b32", (("lm_head", "int8-b32"),)))
+    )
+    heavier = mixed.memory.weights - plain.memory.weights
+    assert heavier == pytest.approx(BIG.language.vocab * BIG.language.hidden / 2)
+
+
+def test_a_slower_mode_makes_a_longer_tick() -> None:
+    ticks = [planned("orin", f"power.mode={mode}", tokens=8).tick.ms for mode in ("40W", "25W", "15W")]
+    assert ticks == sorted(ticks)
+
+
+def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
+    made = planned("orin", "power.mode=25W")
+    assert not made.fits
+    with pytest.raises(PlanError) as refusal:
+        made.require()
+    line = str(refusal.value)
+    assert "\n" not in line
+    for part in ("1b does not fit orin (25W)", "exceeds the period of 100 ms by", "vision_encoder takes", "40W"):
+        assert part in line
+
+
+def test_a_tick_at_the_stock_25_watt_clocks_cannot_take_100_ms_even_at_the_peak() -> None:
+    roofline = target("orin").roofline
+    peak_ms = vision_call(BIG).flops() / (roofline.fp16_gflops.value * 1e9) * 1e3
+    assert peak_ms > 100
+
+
+def test_a_budget_that_control_alone_exceeds_is_refused() -> None:
+    made = planned("orin", "power.budget_w=20")
+    assert not made.fits
+    assert any("of a budget of 20 W" in reason for reason in made.reasons)
+
+
+@pytest.mark.parametrize("budget_w", [23.0, 25.0, 27.0])
+def test_reasoning_gets_what_the_budget_leaves_and_never_more(budget_w: float) -> None:
+    made = planned("orin", f"power.budget_w={budget_w}", "runtime.max_delay_s=60")
+    assert made.average_w is not None
+    assert made.average_w <= budget_w + 1e-6
+    assert 0 < made.duty <= 1
+
+
+def test_less_power_means_less_reasoning_but_the_same_tick() -> None:
+    rich, poor = (planned("orin", f"power.budget_w={w}", "runtime.max_delay_s=60", tokens=16) for w in (27, 23))
+    assert poor.duty < rich.duty
+    assert poor.tick.ms == rich.tick.ms
+
+
+def test_tokens_are_cut_so_that_the_state_stays_young_enough() -> None:
+    made = planned("orin", "runtime.max_delay_s=6")
+    assert 0 < made.tokens < target("orin").runtime.max_new_tokens
+    assert made.delay_s is not None and made.delay_s <= 6
+    one_more = planned("orin", "runtime.max_delay_s=6", tokens=made.tokens + 1)
+    assert one_more.delay_s is not None and one_more.delay_s > 6
+    assert any("keep Δt in bounds" in warning for warning in made.warnings)
+
+
+def test_a_state_that_gets_too_old_without_any_new_token_is_refused() -> None:
+    made = planned("orin", "runtime.max_delay_s=1")
+    assert any("the ceiling is 1 s" in reason for reason in made.reasons)
+
+
+def test_memory_that_is_not_there_is_refused() -> None:
+    made = planned("rtx4060", "device.memory_gib=4")
+    assert any("memory" in reason and "exceeds the 3.00 GiB" in reason for reason in made.reasons)
+
+
+def test_a_tick_waits_at_most_for_the_call_in_flight_where_both_threads_share_a_device() -> None:
+    made = planned("orin")
+    longest = max(stage(made, name)["call_ms"] for name in ("prefill", "decode", "semantic_context"))
+    assert made.tick.ms == pytest.approx(made.tick_alone.ms + longest, abs=1e-3)
+
+
+def test_larger_prefill_chunks_make_control_wait_longer() -> None:
+    small, large = (planned("orin", f"runtime.prefill_chunk_tokens={n}", tokens=8) for n in (64, 512))
+    assert small.tick.ms < large.tick.ms
+
+
+def test_an_error_bar_that_reaches_over_the_period_is_a_warning() -> None:
+    assert any("measure it on the device first" in warning for warning in planned("orin").warnings)
+
+
+def test_a_development_machine_says_what_it_cannot_do_in_time_and_is_not_made_to_stop() -> None:
+    made = planned("cpu")
+    assert not made.fits
+    assert not target("cpu").runtime.enforce_plan
+
+
+def test_the_small_model_fits_a_cpu() -> None:
+    assert plan(target("cpu", model="nano"), NANO).fits
+
+
+def test_without_a_budget_no_power_is_claimed() -> None:
+    made = planned("cpu")
+    assert made.average_w is None
+    assert {entry["energy_j"] for entry in made.to_dict()["per_graph"].values()} == {None}
+
+
+def test_average_power_is_idle_power_and_the_stages_energy_over_time() -> None:
+    made = planned("orin", "runtime.max_delay_s=60", tokens=32)
+    energy = {name: entry["energy_j"] for name, entry in made.to_dict()["per_graph"].items()}
+    control_w = (energy["vision_encoder"] + energy["action_expert"]) / (made.period_ms / 1e3)
+    generation_j = energy["prefill"] + energy["decode"] + energy["semantic_context"]
+    assert made.generation is not None
+    generation_w = generation_j / (made.generation.ms / 1e3 / made.duty)
+    assert 4.6 + control_w + generation_w == pytest.approx(made.average_w, rel=0.01)
+
+
+def with_point(base: Target, **changes: object) -> Target:
+    point = Measured(
+        **{
+            "model": "1b",
+            "graph": "vision_encoder",
+            "precision": "fp16",
+            "form": "plain",
+            "provider": "tensorrt",
+            "machine": "the board in the laboratory",
+            "date": "2026-11-21",
+            "ms": 61.5,
+            **changes,
+        }
+    )
+    return dataclasses.replace(base, measured=(point,))
+
+
+def test_a_measured_point_replaces_the_model_and_says_where_it_was_taken() -> None:
+    entry = stage(plan(with_point(target("orin")), BIG), "vision_encoder")
+    assert (entry["ms"], entry["tagged"], entry["bound"]) == (61.5, MEASURED, MEASURED)
+    assert "the board in the laboratory, 2026-11-21" in entry["source"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"precision": "fp32"},
+        {"form": "fused"},
+        {"provider": "cuda"},
+        {"graph": "action_expert"},
+        {"model": "nano"},
+        {"mode": "25W"},
+        {"overrides": {"blocks.0.fc1": "fp32"}},
+    ],
+)
+def test_a_point_of_anything_else_replaces_nothing(changes: dict) -> None:
+    entry = stage(plan(with_point(target("orin"), **changes), BIG), "vision_encoder")
+    assert entry["tagged"] == MODELLED
+
+
+def test_a_point_at_another_length_only_scales_the_model() -> None:
+    point = {"graph": "language_model", "precision": "int4-b32", "form": "fused", "provider": "cuda"}
+    overridden = {"lm_head": "int8-b32"}
+    base = with_point(target("orin"), **point, ms=50.0, tokens=400, chunk_tokens=128, overrides=overridden)
+    entry = stage(plan(base, BIG), "prefill")
+    assert entry["tagged"] == MODELLED
+    assert "scaled by" in entry["source"]
+    assert stage(plan(base, BIG), "decode")["source"].startswith("roofline of")
+    assert 50.0 < entry["ms"] < 50.0 * (1100 / 400) ** 2
+
+
+def test_a_point_of_decoding_is_per_token() -> None:
+    point = {"graph": "language_model", "precision": "int4-b32", "form": "fused", "provider": "cuda", "ms": None}
+    base = with_point(target("orin"), **point, tokens_per_s=100.0, tokens=1200, overrides={"lm_head": "int8-b32"})
+    assert stage(plan(base, BIG, tokens=20), "decode")["ms"] == pytest.approx(200.0)
+
+
+def test_the_newest_of_several_points_counts() -> None:
+    base = with_point(target("orin"))
+    newer = dataclasses.replace(base.measured[0], ms=50.0, date="2026-11-22")
+    both = dataclasses.replace(base, measured=(newer, *base.measured))
+    assert stage(plan(both, BIG), "vision_encoder")["ms"] == 50.0
+
+
+def test_every_time_says_whether_it_was_measured() -> None:
+    made = planned("cpu").to_dict()
+    assert made["tagged"] == MODELLED
+    assert {entry["tagged"] for entry in made["per_graph"].values()} == {MEASURED, MODELLED}
+    assert all(entry["source"] for entry in made["per_graph"].values())
+
+
+def test_the_keys_that_other_tools_rely_on_are_there() -> None:
+    expected = {"tick_ms", "generation_ms", "tokens", "duty", "average_w", "budget_w", "memory_bytes", "per_graph"}
+    assert expected | {"tagged"} <= set(planned("orin").to_dict())
+
+
+@pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
+def test_the_counted_layers_are_the_layers_of_the_graphs(config: object) -> None:
+    calls = {
+        "vision_encoder": vision_call(config),
+        "language_model": language_call(config, "language_model", tokens=2, past=0),
+        PREFILL: language_call(config, PREFILL, tokens=2, past=0),
+        DECODE: language_call(config, DECODE, tokens=1, past=0),
+        "semantic_context": context_call(config, tokens=3),
+        "action_expert": action_call(config, context=3),
+    }
+    for graph, call in calls.items():
+        counted = {linear.name for linear in call.linears if not (linear.name.startswith("embed") and graph[0] == "v")}
+        assert counted == set(linear_layers(config, graph)) - ({"embed"} if graph[0] == "v" else set())
+
+
+def test_counted_work_is_that_of_the_paper_size_model() -> None:
+    """724 GFLOP an image, 839 a prompt of 1,100 tokens (counted independently when the runtimes were compared)."""
+    assert vision_call(BIG).flops() == pytest.approx(724e9, rel=0.01)
+    causal = language_call(BIG, PREFILL, tokens=1100, past=0)
+    assert causal.flops() - causal.attention_flops / 2 == pytest.approx(839e9, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("stage_name", "settings", "measured_ms", "tolerance"),
+    [
+        ("vision_encoder", ["graphs.vision_encoder.precision=fp32"], 3400, 0.15),
+        ("prefill", ["graphs.language_model.precision=fp32"], 3993, 0.25),
+        ("decode", ["graphs.language_model.precision=fp32"], 1000 / 8.8, 0.5),
+        ("decode", ["graphs.language_model.decode.precision=int8-b128"], 1000 / 23.2, 0.25),
+        ("action_expert", [], 16.1, 0.3),
+        ("semantic_context", [], 40, 0.4),
+    ],
+)
+def test_the_model_of_a_cpu_comes_near_what_was_measured_there(
+    stage_name: str, settings: list[str], measured_ms: float, tolerance: float
+) -> None:
+    made = planned("cpu", *settings, tokens=32, text_tokens=1100 - 4 * BIG.frame_tokens)
+    entry = made.to_dict()["per_graph"][stage_name]
+    assert entry["tagged"] == MODELLED
+    each = entry["ms"] / (32 if stage_name == "decode" else 1)
+    assert each == pytest.approx(measured_ms, rel=tolerance)
+
+
+def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_and_a_ninth() -> None:
+    """Modelled for TensorRT fp16 at our power modes, over the paper's PyTorch at modes it does not give:
+    control 0.65 on Orin NX and 0.89 on the RTX 4060."""
+    ratios = {name: planned(name).tick_alone.ms / PAPER_MS[name][0] for name in PAPER_MS}
+    assert ratios == {"orin": pytest.approx(0.65, abs=0.01), "rtx4060": pytest.approx(0.89, abs=0.01)}
+
+
+def test_against_the_paper_a_generation_alone_is_far_shorter() -> None:
+    """0.12 of the paper's reasoning time on Orin NX, 0.085 on the RTX 4060, with 1,134 tokens read and 48 new: the
+    paper does not say how many it generates, and an eager PyTorch decoder is bound by launches, which a roofline
+    does not see. Under the power budget and beside control it is 0.54 and 0.37: too good to be believed before it is
+    measured."""
+    alone = {name: planned(name, text_tokens=110).generation_alone.ms / PAPER_MS[name][1] for name in PAPER_MS}
+    assert alone == {"orin": pytest.approx(0.12, abs=0.005), "rtx4060": pytest.approx(0.085, abs=0.005)}
+    beside = {name: planned(name, text_tokens=110).generation.ms / PAPER_MS[name][1] for name in PAPER_MS}
+    assert beside == {"orin": pytest.approx(0.54, abs=0.01), "rtx4060": pytest.approx(0.37, abs=0.01)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"tokens": 5000}, "the model has room for 346"),
+        ({"tokens": -1}, "the model has room for 346"),
+        ({"text_tokens": 5000}, "the prompt of 6024 tokens exceeds the context of 1536"),
+        ({"precisions": {"vision": FP32}}, "no graph 'vision'"),
+    ],
+)
+def test_arguments_that_make_no_plan_are_refused(arguments: dict, line: str) -> None:
+    with pytest.raises(PlanError, match=line):
+        plan(target("orin"), BIG, **arguments)
+
+
+@pytest.mark.parametrize("name", ["orin", "cpu"])
+def test_a_person_sees_every_stage_and_the_verdict(name: str) -> None:
+    console = Console(file=io.StringIO(), width=160)
+    made = planned(name)
+    console.print(plan_table(made))
+    text = console.file.getvalue()
+    assert all(s.stage in text for s in made.stages)
+    assert ("verdict     fits" in text) == made.fits
+    assert text.count(MODELLED) >= 1
+
+
+@pytest.mark.parametrize("name", ["orin", "rtx4060"])
+@pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
+def test_the_engines_of_a_board_cover_the_context_of_both_models(name: str, config: TicVlaConfig) -> None:
+    assert plan(target(name, model=config.name), config).tokens >= 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "context", "line"),
+    [
+        ((), 4096, r"semantic_context\.profile\.T covers 1 to 1536, 1b needs 256 to 4096"),
+        (("graphs.action_expert.profile.T=1,64,512",), 1536, r"action_expert\.profile\.T covers 1 to 512, 1b needs"),
+        (("graphs.action_expert.profile.T=900,900,1536",), 1536, r"action_expert\.profile\.T covers 900 to 1536"),
+    ],
+)
+def test_an_engine_that_the_context_would_outgrow_is_refused_before_anything_is_built(
+    settings: tuple[str, ...], context: int, line: str
+) -> None:
+    config = dataclasses.replace(BIG, language=dataclasses.replace(BIG.language, max_context=context))
+    with pytest.raises(PlanError, match=line) as refusal:
+        plan(target("orin", *settings), config)
+    assert "\n" not in str(refusal.value)
+
+
+def test_16_bit_weights_take_32_in_memory_where_activations_do() -> None:
+    sizes = {
+        (name, kind): planned(
+            name, "runtime.tick_period_ms=60000", f"graphs.vision_encoder.precision={kind}"
+        ).weight_bytes["vision_encoder"]
+        for name in ("cpu", "orin")
+        for kind in ("fp32", "fp16")
+    }
+    assert sizes["cpu", "fp16"] == sizes["cpu", "fp32"] == 2 * sizes["orin", "fp16"]

@@ -1,0 +1,95 @@
+"""Datagrams between runner and bridge."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_bridge.core.link import (
+    CAUSES,
+    MAX_DATAGRAM_BYTES,
+    MOTIONS,
+    PERMITS,
+    STATES,
+    VERSION,
+    Arm,
+    BridgeStatus,
+    LinkError,
+    Message,
+    Release,
+    Stop,
+    Velocity,
+    decode,
+    encode,
+)
+
+i64 = st.integers(-(2**63), 2**63 - 1)
+u64 = st.integers(0, 2**64 - 1)
+f64 = st.floats(allow_nan=False)
+velocities = st.builds(Velocity, u64, i64, f64, f64, f64)
+reasons = st.text(max_size=90)
+statuses = st.builds(
+    BridgeStatus, i64, st.sampled_from(STATES), reasons, u64, u64, u64, st.tuples(f64, f64, f64), st.booleans(),
+    st.sampled_from(CAUSES), st.sampled_from(CAUSES), st.sampled_from(PERMITS), st.sampled_from(MOTIONS), f64,
+)  # fmt: skip
+messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), velocities, statuses)
+
+
+@given(messages)
+def test_what_is_encoded_is_decoded(message: Message) -> None:
+    assert decode(encode(message)) == message
+
+
+@given(statuses, st.text(min_size=300, max_size=600))
+def test_a_long_reason_is_cut_and_still_decodes(status: BridgeStatus, reason: str) -> None:
+    data = encode(BridgeStatus(**{**status.__dict__, "reason": reason}))
+    decoded = decode(data)
+    assert len(data) <= MAX_DATAGRAM_BYTES
+    assert isinstance(decoded, BridgeStatus) and reason.startswith(decoded.reason)
+
+
+@given(st.binary(max_size=600))
+def test_foreign_bytes_raise_link_error_and_nothing_else(data: bytes) -> None:
+    with contextlib.suppress(LinkError):
+        decode(data)
+
+
+@given(messages, st.data())
+def test_a_changed_header_or_length_never_decodes_to_another_kind_of_message(message: Message, data) -> None:
+    good = encode(message)
+    cut = data.draw(st.integers(0, len(good) - 1))
+    with pytest.raises(LinkError):
+        decode(good[:cut])
+    with pytest.raises(LinkError):
+        decode(good + b"\0")
+    with pytest.raises(LinkError):
+        decode(b"XXXX" + good[4:])
+
+
+@pytest.mark.parametrize("version", [0, 1, 2, 255])
+def test_another_version_is_refused(version: int) -> None:
+    with pytest.raises(LinkError, match="version"):
+        decode(struct.pack("<4sBBH", b"TVEB", version, 1, 0))
+
+
+@pytest.mark.parametrize("kind", [0, 6, 255])
+def test_an_unknown_kind_is_refused(kind: int) -> None:
+    with pytest.raises(LinkError, match="kind"):
+        decode(struct.pack("<4sBBH", b"TVEB", VERSION, kind, 0))
+
+
+@pytest.mark.parametrize("offset", [8, 9, 10, 11, 12, 13])
+def test_a_status_with_an_unknown_state_flag_cause_permit_or_motion_is_refused(offset: int) -> None:
+    good = bytearray(encode(BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), False)))
+    good[8 + offset] = 200  # header of 8 bytes, then the stamp
+    with pytest.raises(LinkError, match="200"):
+        decode(bytes(good))
+
+
+def test_numbers_that_are_not_finite_pass_the_codec_because_the_gate_judges_them() -> None:
+    decoded = decode(encode(Velocity(1, 2, float("nan"), float("inf"), 0.0)))
+    assert isinstance(decoded, Velocity) and decoded.vx_mps != decoded.vx_mps

@@ -1,0 +1,154 @@
+"""Robot files: every key checked, one clear line for what is wrong."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from firmware_bridge.core.config import ConfigError, load_robot_config
+from tests.support.processes import GO2_SIM
+
+GO2 = GO2_SIM.with_name("go2.toml")
+
+
+def test_simulated_and_real_robot_differ_in_their_addresses_only() -> None:
+    simulated, real = load_robot_config(GO2_SIM), load_robot_config(GO2)
+    assert simulated.dds != real.dds
+    assert replace(simulated, dds=real.dds) == real
+
+
+def test_the_shipped_files_load() -> None:
+    assert load_robot_config(GO2_SIM).dds.interface == "lo"
+    assert load_robot_config(GO2).bridge.deadman_ms == 250
+
+
+def test_a_relative_socket_lies_in_the_runtime_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert load_robot_config(GO2_SIM).bridge.socket == tmp_path / "tic-vla-edge" / "bridge.sock"
+
+
+def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
+    config = load_robot_config(GO2_SIM, socket=tmp_path / "s", domain=7)
+    assert (config.bridge.socket, config.dds.domain) == (tmp_path / "s", 7)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("rate_hz = 50", "rate_hz = 50\nspeed = 1", "unknown key bridge.speed"),
+        ("deadman_ms = 250", "deadman_ms = 251", "bridge.deadman_ms: expected 20..250, found 251"),
+        ("deadman_ms = 250", "deadman_ms = true", "bridge.deadman_ms: expected int, found True"),
+        ("vx_max_mps = 0.8", "vx_max_mps = 4.0", "limits.vx_max_mps: expected 0..3.8, found 4.0"),
+        ("vx_max_mps = 0.8", "vx_max_mps = nan", "limits.vx_max_mps: expected float, found nan"),
+        ("accel_mps2 = 2.0", "", "missing key limits.accel_mps2"),
+        ('interface = "lo"', 'interface = "lo\\"/>"', "dds.interface/peers"),
+        ('protocol = "unitree"', 'protocol = "carrier pigeon"', "protocol: expected one of"),
+        ('velocity_frame = "odom"', 'velocity_frame = "map"', "odometry.velocity_frame"),
+        ("[limits]", "[limits", "cannot be read"),
+        ("accel_mps2 = 2.0", f"accel_mps2 = {10**400}", "limits.accel_mps2: expected float"),
+        (
+            "battery_min_percent = 10",
+            "battery_min_percent = 91",
+            "safety.battery_min_percent: expected 0..90, found 91",
+        ),
+        ('["L2", "B"]', '["L2", "C"]', "safety.remote_estop_keys: expected one or more of R1"),
+        ('["L2", "B"]', "[]", "safety.remote_estop_keys: expected one or more of R1"),
+        ("remote_deadband = 0.1", "remote_deadband = 0", "safety.remote_deadband: expected 0.01..0.5, found 0.0"),
+        ("remote_deadband = 0.1", 'estop_file = "gpio"', "safety.estop_file: expected an absolute path"),
+        ("operator_arm = false", "operator_arm = 1", "safety.operator_arm: expected bool, found 1"),
+        ("accepted_error_codes = [0]", "accepted_error_codes = [true]", "expected int, found True"),
+        ('socket = "bridge.sock"', 'socket = "a\\u0000b"', "bridge.socket: expected Path"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, before: str, after: str, complaint: str) -> None:
+    path = tmp_path / "robot.toml"
+    text = GO2_SIM.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError) as error:
+        load_robot_config(path)
+    assert complaint in str(error.value) and str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def robot_file(folder: Path, limits: dict[str, float], *, above_walking_speed: bool = False) -> Path:
+    """The simulated robot's file with other limits."""
+    text = GO2_SIM.read_text()
+    for key, value in limits.items():
+        text, changed = re.subn(rf"^{key} = \S+", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert changed == 1
+    if above_walking_speed:
+        text = text.replace("above_walking_speed = false", "above_walking_speed = true")
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+# (key, largest magnitude without the opt-in, and with it)
+FASTEST = [
+    ("vx_max_mps", 1.5, 3.8),
+    ("vx_min_mps", -1.0, -2.5),
+    ("vy_max_mps", 0.5, 1.0),
+    ("wz_max_radps", 2.0, 4.0),
+    ("accel_mps2", 4.0, 8.0),
+    ("alpha_radps2", 10.0, 20.0),
+]
+
+
+@pytest.mark.parametrize(("key", "walking", "documented"), FASTEST)
+def test_walking_speed_needs_no_opt_in(tmp_path: Path, key: str, walking: float, documented: float) -> None:
+    assert getattr(load_robot_config(robot_file(tmp_path, {key: walking})).limits, key) == walking
+
+
+@pytest.mark.parametrize(("key", "walking", "documented"), FASTEST)
+def test_above_walking_speed_is_refused_without_the_opt_in_and_says_which(
+    tmp_path: Path, key: str, walking: float, documented: float
+) -> None:
+    above = math.nextafter(walking, 2 * walking)
+    with pytest.raises(ConfigError) as error:
+        load_robot_config(robot_file(tmp_path, {key: above}))
+    text = str(error.value)
+    assert f"limits.{key}: expected {walking:g} at most" in text and f"found {above}" in text
+    assert "safety.above_walking_speed = true" in text and "\n" not in text
+
+
+@pytest.mark.parametrize(("key", "walking", "documented"), FASTEST)
+def test_with_the_opt_in_the_robots_own_range_is_accepted(
+    tmp_path: Path, key: str, walking: float, documented: float
+) -> None:
+    config = load_robot_config(robot_file(tmp_path, {key: documented}, above_walking_speed=True))
+    assert getattr(config.limits, key) == documented
+
+
+@pytest.mark.parametrize(("key", "walking", "documented"), FASTEST)
+def test_no_key_permits_more_than_the_robots_own_range(
+    tmp_path: Path, key: str, walking: float, documented: float
+) -> None:
+    above = math.nextafter(documented, 2 * documented)
+    with pytest.raises(ConfigError, match=rf"limits\.{key}: expected .*, found {re.escape(str(above))}"):
+        load_robot_config(robot_file(tmp_path, {key: above}, above_walking_speed=True))
+
+
+@pytest.mark.parametrize("value", [2.9, 5.0])
+def test_a_speed_that_looks_like_kilometres_an_hour_is_asked_about(tmp_path: Path, value: float) -> None:
+    with pytest.raises(ConfigError, match=rf"if it is in km/h, write {value / 3.6:.2f}"):
+        load_robot_config(robot_file(tmp_path, {"vx_max_mps": value}))
+
+
+def test_a_fast_robot_with_an_impossible_acceleration_is_refused_with_the_opt_in_too(tmp_path: Path) -> None:
+    limits = {"vx_max_mps": 3.8, "accel_mps2": 20.0}
+    with pytest.raises(ConfigError, match=r"limits\.accel_mps2: expected 8 at most"):
+        load_robot_config(robot_file(tmp_path, limits, above_walking_speed=True))
+
+
+def test_the_shipped_files_stay_at_walking_speed_without_the_opt_in() -> None:
+    assert not any(load_robot_config(path).safety.above_walking_speed for path in (GO2_SIM, GO2))
+
+
+def test_a_socket_path_the_system_cannot_bind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the system allows 107"):
+        load_robot_config(GO2_SIM, socket=tmp_path / ("x" * 120))

@@ -1,0 +1,143 @@
+"""What a robot reports: converted when every field can be true, dropped whole when one cannot."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_bridge.unitree.messages.idl import SportModeState_, TimeSpec_
+from firmware_bridge.unitree.messages.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
+from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from tests.support.robot.fake_go2 import standing
+
+S = 1_000_000_000
+wild = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+def sample(**changes: object) -> SportModeState_:
+    """A report of a robot that stands, with `changes`; dotted names reach into the IMU."""
+    made = sport_mode_state(standing(), OdometryFrame((0.0, 0.0, 0.0)))
+    for name, value in changes.items():
+        setattr(made.imu_state if hasattr(made.imu_state, name) else made, name, value)
+    return made
+
+
+def state(robot_stamp_ns: int, received_ns: int = 10 * S) -> RobotState:
+    converted = robot_state(sample(stamp=TimeSpec_(robot_stamp_ns // S, robot_stamp_ns % S)), received_ns, "odom")
+    assert converted is not None
+    return converted
+
+
+def test_every_field_arrives() -> None:
+    report = sample(
+        stamp=TimeSpec_(3, 5), position=[1.0, 2.0, 0.3], velocity=[0.5, 0.1, 0.0], yaw_speed=0.2, rpy=[0.1, -0.2, 0.0],
+        gyroscope=[0.0, 0.0, 0.25], foot_force=[10, 20, 30, 40], mode=3, error_code=7,
+    )  # fmt: skip
+    converted = robot_state(report, 99, "odom")
+    assert converted == RobotState(
+        99, (1.0, 2.0, 0.0), 0.5, 0.1, 0.2, 3, 7, robot_stamp_ns=3 * S + 5, position_z_m=0.3, roll_rad=0.1,
+        pitch_rad=-0.2, gyro_wz_radps=0.25, foot_forces=(10, 20, 30, 40),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"position": [math.nan, 0.0, 0.0]},
+        {"position": [0.0, 0.0, 1.1e6]},
+        {"velocity": [0.0, 20.1, 0.0]},
+        {"velocity": [0.0, 0.0, math.inf]},
+        {"yaw_speed": 51.0},
+        {"gyroscope": [0.0, -math.inf, 0.0]},
+        {"rpy": [0.0, 0.0, 7.0]},
+        {"quaternion": [0.0, 0.0, 0.0, 0.0]},
+        {"quaternion": [2.0, 0.0, 0.0, 0.0]},
+        {"quaternion": [math.nan, 0.0, 0.0, 0.0]},
+        {"mode": 14},
+        {"stamp": TimeSpec_(-1, 0)},
+        {"stamp": TimeSpec_(1, S)},
+    ],
+)
+def test_a_report_with_an_impossible_field_is_dropped(change: dict[str, object]) -> None:
+    assert robot_state(sample(**change), 1, "odom") is None
+
+
+@given(st.lists(wild, min_size=3, max_size=3), st.lists(wild, min_size=3, max_size=3), wild, wild)
+def test_whatever_is_reported_what_comes_out_is_finite_and_bounded(
+    position: list[float], velocity: list[float], yaw_speed: float, roll: float
+) -> None:
+    report = sample(position=position, velocity=velocity, yaw_speed=yaw_speed, rpy=[roll, 0.0, 0.0])
+    converted = robot_state(report, 1, "odom")
+    if converted is not None:
+        assert math.hypot(converted.vx_mps, converted.vy_mps) <= 30
+        assert all(abs(value) <= 1e6 for value in (*converted.T_odom_base, converted.wz_radps, converted.roll_rad))
+
+
+def test_the_battery_is_read_from_the_low_state() -> None:
+    message = LowStateMessage().message
+    message.bms_state.soc, message.power_v, message.power_a = 57, 28.5, 3.25
+    assert battery_state(message, 5) == BatteryState(5, 57, 28.5, 3.25)
+
+
+@pytest.mark.parametrize(("field", "value"), [("power_v", math.nan), ("power_v", -1.0), ("power_a", 1e9), ("soc", 101)])
+def test_an_impossible_battery_is_dropped(field: str, value: float) -> None:
+    message = LowStateMessage().message
+    setattr(message.bms_state if field == "soc" else message, field, value)
+    assert battery_state(message, 5) is None
+
+
+class TestOrder:
+    def test_an_older_report_and_a_repeated_one_are_dropped_and_counted(self) -> None:
+        order = StampOrder()
+        assert [order.accept(state(stamp)) for stamp in (100, 300, 200, 300, 301)] == [True, True, False, False, True]
+        assert order.dropped == 2
+
+    def test_a_robot_without_a_clock_is_believed(self) -> None:
+        order = StampOrder()
+        assert all(order.accept(state(0)) for _ in range(3))
+
+    def test_a_robot_whose_clock_starts_over_is_believed_after_a_second(self) -> None:
+        order = StampOrder()
+        order.accept(state(500 * S, received_ns=10 * S))
+        assert not order.accept(state(1 * S, received_ns=11 * S))
+        assert order.accept(state(1 * S + 1, received_ns=11 * S + 1))
+        assert order.accept(state(1 * S + 2, received_ns=11 * S + 2))
+
+    def test_a_publisher_that_repeats_itself_for_ever_is_never_believed(self) -> None:
+        order = StampOrder()
+        order.accept(state(5, received_ns=0))
+        assert not any(order.accept(state(5, received_ns=k * S)) for k in range(1, 10))
+
+    def test_a_stamp_from_the_future_does_not_hide_the_reports_after_it(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(500 * S, received_ns=10 * S))
+        assert not order.accept(state(900 * S, received_ns=10 * S + 10))
+        assert order.accept(state(500 * S + 20, received_ns=10 * S + 20))
+
+    def test_a_forger_that_creeps_into_the_future_is_not_followed(self) -> None:
+        """Each of its stamps is 0.4 s ahead of the one before, which alone would pass for jitter."""
+        order = StampOrder()
+        ahead_ns, hidden_ms, longest_ms, ms = 0, 0, 0, S // 1000
+        for k in range(500):
+            now_ns = k * 20 * ms
+            genuine = order.accept(state(100 * S + now_ns, received_ns=now_ns))
+            hidden_ms = 0 if genuine else hidden_ms + 20
+            longest_ms = max(longest_ms, hidden_ms)
+            ahead_ns += 400 * ms
+            order.accept(state(100 * S + now_ns + ahead_ns, received_ns=now_ns + 10 * ms))
+        assert longest_ms <= 520
+
+    def test_a_robots_clock_may_drift_and_its_reports_may_be_late(self) -> None:
+        order, ms = StampOrder(), S // 1000
+        for k in range(20_000):
+            stamp_ns = 100 * S + k * 20 * ms + k * 2000  # 100 ppm fast
+            assert order.accept(state(stamp_ns, received_ns=k * 20 * ms + (400 * ms if k % 50 < 10 else 0)))
+
+    def test_a_robot_without_a_clock_is_not_hidden_by_a_forger_with_one(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(0, received_ns=S))
+        assert not order.accept(state(10**18, received_ns=S + 1))
+        assert order.accept(state(0, received_ns=S + 2))

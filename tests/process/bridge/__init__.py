@@ -1,0 +1,1 @@
+"""Tests that start the bridge and end, freeze or replace it or its clients."""

@@ -1,0 +1,55 @@
+"""A handful of `make faults`' injections into real processes; the sniffer on the robot's side is the judge.
+
+The other rows, and enough samples to speak of a percentile, are `make faults`.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.stack import socket_dir
+from tools.faults.__main__ import run_row
+from tools.faults.host_stall import HostStall
+from tools.faults.rig import Rig
+from tools.faults.rows import rows
+
+ROWS = {row.name: row for row in rows()}
+
+
+@pytest.fixture(scope="module")
+def host() -> Iterator[HostStall]:
+    with HostStall() as watching:
+        yield watching
+
+
+@pytest.fixture(scope="module")
+def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
+    with socket_dir() as folder:
+        # None of these rows is about the recording: they need no disk that has room for one.
+        record = space_refusal(folder / "flight.mcap") is None
+        with Rig(folder, artifacts_dir, dds_domain, print, record=record) as rig:
+            rig.start()
+            yield rig
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        # In this order: those that leave the run alive share one runner.
+        "camera stops",
+        "clock in a frozen picture",
+        "plan is NaN",
+        "robot's state silent",
+        "remote: L2+B",
+        "runner SIGSTOP, SIGCONT",
+        "bridge SIGKILL",
+    ],
+)
+def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
+    result = run_row(rig, ROWS[name], 1, random.Random(name), host)
+    assert not result.problems, result.as_json()

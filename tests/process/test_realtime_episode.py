@@ -1,0 +1,131 @@
+"""The benchmark's episodes in real time: what goes with that clock, and when an episode is over."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
+from sim_hil.benchmark.conditions.latency import LatencyProfile
+from sim_hil.benchmark.env.metrics import FRAME_HZ
+from sim_hil.benchmark.suite.episode import Episode, load_suite
+from sim_hil.benchmark.workers import realtime_episode as realtime
+from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
+from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.hil.loop import STEPS_PER_S, HilLoop
+from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.stack import StackOptions, slow_robot
+from sim_hil.realtime.truth import TruePose
+from tests.support.robot.front_end_contract import options
+
+POLICY = PolicySpec("artifacts", "out/nano")
+GOOD = Conditions(POLICY, clock="realtime", mode="async")
+ALONE = {"jobs": 1, "cluster": False, "video": "none"}
+S = 1_000_000_000
+
+
+def test_artifacts_on_one_stack_at_a_time_are_what_it_takes() -> None:
+    check_realtime(GOOD, jobs=1, cluster=False, video="none")
+
+
+@pytest.mark.parametrize(
+    ("conditions", "named"),
+    [
+        (Conditions(PolicySpec("expert"), clock="realtime"), "--policy"),
+        (Conditions(POLICY, clock="realtime", mode="async", latency=LatencyProfile.constant(2.0)), "--latency"),
+        (Conditions(POLICY, clock="realtime", mode="async", camera="128x128"), "--camera"),
+    ],
+)
+def test_conditions_that_need_virtual_time_are_refused(conditions: Conditions, named: str) -> None:
+    with pytest.raises(ConditionsError, match=named):
+        check_realtime(conditions, jobs=1, cluster=False, video="none")
+
+
+@pytest.mark.parametrize("jobs, cluster, video", [(2, False, "none"), (1, True, "none"), (1, False, "all")])
+def test_what_would_disturb_the_clock_is_refused(jobs: int, cluster: bool, video: str) -> None:
+    with pytest.raises(ConditionsError, match="--clock realtime"):
+        check_realtime(GOOD, jobs=jobs, cluster=cluster, video=video)
+
+
+def test_episodes_of_another_robot_are_left_out_by_name() -> None:
+    suite = load_suite("dynanav")
+    kept, skipped = drivable(suite)
+    assert {episode.robot for episode in kept} == {"go2"}
+    assert len(kept) + len(skipped) == len(suite) and all("carter" in name for name in skipped)
+
+
+def episode() -> Episode:
+    return next(one for one in load_suite("dynanav") if one.robot == "go2")
+
+
+def followed(*poses: TruePose) -> realtime._Drive:
+    drive = realtime._Drive([poses[0]])
+    for pose in poses[1:]:
+        if realtime._over(drive, pose, episode()):
+            break
+    return drive
+
+
+def test_an_episode_is_reached_by_ground_truth() -> None:
+    goal = episode().goal_xy
+    drive = followed(TruePose(0, 0, 0, 0, ()), TruePose(S, goal[0] + 1.4, goal[1], 0, ()), TruePose(2 * S, 0, 0, 0, ()))
+    assert (drive.end, drive.time_s) == ("reached", 1.0)
+
+
+def test_time_is_up_after_the_episodes_timeout() -> None:
+    end_ns = round(episode().timeout_s * S)
+    drive = followed(TruePose(0, -50, 0, 0, ()), TruePose(end_ns - 1, -50, 0, 0, ()), TruePose(end_ns, -50, 0, 0, ()))
+    assert drive.end == "timeout" and len(drive.poses) == 3
+
+
+def test_the_first_contact_is_remembered() -> None:
+    touches = [(), ("wall 1",), (), ("person",)]
+    drive = followed(*(TruePose(t * S, -50, 0, 0, touching) for t, touching in enumerate(touches)))
+    assert drive.collisions == {"wall 1", "person"} and drive.first_collision_s == 1.0
+
+
+def test_the_true_path_is_sampled_as_in_lockstep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def start(_children: Children, step: str, command: Sequence[str]) -> Child:
+        asked.extend(command)
+        raise StepError(step)
+
+    monkeypatch.setattr(Children, "start", start)
+    task = EpisodeTask(episode(), GOOD, tmp_path)
+    with pytest.raises(StepError, match="edge-hil"):
+        realtime.run_realtime(task, lambda _seconds: None)
+    assert asked[asked.index("--pose-hz") + 1] == str(FRAME_HZ)
+
+
+@pytest.mark.parametrize("rate", [10, 30])
+def test_the_trace_has_as_many_poses_as_asked_evenly_in_the_robots_time(rate: int) -> None:
+    steps: list[int] = []
+    truth = SimpleNamespace(position_m=(0, 0, 0), rpy_rad=(0, 0, 0), velocity_world_mps=(0, 0, 0), gyro_radps=(0, 0, 0))
+    world = SimpleNamespace(step=lambda: None, truth=lambda: truth, touching=(), people=list)
+    protocol = SimpleNamespace(publish=lambda step, _stamp_s: None)
+    trace = SimpleNamespace(put=lambda _t_ns, kind, **_fields: steps.append(loop._steps) if kind == "pose" else None)
+    loop = HilLoop(world, protocol, options("go2"), pose_hz=rate)  # type: ignore[arg-type]
+    loop._trace = trace  # type: ignore[assignment]
+    for _ in range(2 * STEPS_PER_S):
+        loop._step()
+    assert len(steps) == 2 * rate
+    assert {b - a for a, b in itertools.pairwise(steps)} <= {STEPS_PER_S // rate, STEPS_PER_S // rate + 1}
+
+
+def test_a_slow_robot_differs_in_its_speed_limit_alone(tmp_path: Path) -> None:
+    from firmware_bridge.core.config import load_robot_config
+    from sim_hil.realtime.stack import ROBOT_FILE
+
+    slow, standard = load_robot_config(slow_robot(tmp_path, 0.1)), load_robot_config(ROBOT_FILE)
+    assert slow.limits.vx_max_mps == 0.1 and standard.limits.vx_max_mps > 0.1
+    assert slow.limits.wz_max_radps == standard.limits.wz_max_radps and slow.bridge.rate_hz == standard.bridge.rate_hz
+
+
+def test_a_speed_limit_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="speed limit"):
+        StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1, speed_limit_mps=0.0)

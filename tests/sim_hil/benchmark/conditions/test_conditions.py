@@ -1,0 +1,82 @@
+"""What a run may be asked for, and that it means the same wherever it is read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sim_hil.benchmark.cli import conditions_of, parser
+from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
+from sim_hil.benchmark.conditions.latency import LatencyProfile
+
+
+def asked(*arguments: str) -> Conditions:
+    return conditions_of(parser().parse_args(["--suite", "s", *arguments]))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--policy", "expert", "--drift", "severe"),
+        ("--policy", "artifacts:nano", "--mode", "sync", "--latency", "3", "--variant", "no-latency"),
+        ("--policy", "artifacts:nano", "--stay"),
+        ("--policy", "external:127.0.0.1:7001", "--latency", "1.5", "--wording", "2"),
+        ("--policy", "external:unix:server.sock", "--camera", "320x180"),
+    ],
+)
+def test_conditions_survive_json(arguments: tuple[str, ...]) -> None:
+    conditions = asked(*arguments)
+    assert Conditions.of_json(conditions.as_json()) == conditions
+
+
+@pytest.mark.parametrize(("mode", "latency_s"), [("async", 2.0), ("sync", 2.0), ("no-reasoning", 0.25)])
+def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: float) -> None:
+    latency = asked("--policy", "artifacts:nano", "--mode", mode).latency
+    assert latency is not None and latency.generation_s == (latency_s,)
+
+
+def test_the_goal_ends_an_episode_unless_it_is_asked_to_stay_where_it_thinks_that_it_is() -> None:
+    free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
+    assert not free.stays and "stays" not in free.describe()
+    assert stays.stays and "stays where it says" in stays.describe()
+
+
+def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
+    assert asked("--policy", "artifacts:nano").policy.where.startswith("/")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
+        (("--policy", "artifacts:"), "expected artifacts:DIR"),
+        (("--policy", "expert:here"), "expected artifacts:DIR"),
+        (("--policy", "expert", "--mode", "sync"), "mode: belongs to a policy from artifacts"),
+        (("--policy", "expert", "--latency", "2"), "latency: expert does not think"),
+        (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
+        (("--policy", "expert", "--stay"), "stay: belongs to a policy from artifacts"),
+        (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
+        (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
+        (("--policy", "still", "--camera", "8x8"), "expected auto or WxH"),
+        (("--policy", "still", "--wording", "-1"), "wording"),
+        (("--policy", "external:h:1", "--external-timeout", "0"), "external timeout"),
+    ],
+)
+def test_what_contradicts_itself_is_refused_in_one_line(arguments: tuple[str, ...], says: str) -> None:
+    with pytest.raises(ConditionsError, match=says) as caught:
+        asked(*arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [{"clock": "lockstep", "more": 1}, {"drift": "mild"}, {"policy": 7}])
+def test_conditions_of_another_kind_are_refused(change: dict[str, Any]) -> None:
+    content = {**Conditions(PolicySpec("still")).as_json(), **change}
+    with pytest.raises(ConditionsError):
+        Conditions.of_json(content)
+
+
+def test_a_model_needs_a_latency_in_lockstep() -> None:
+    with pytest.raises(ConditionsError, match="needs one in lockstep"):
+        Conditions(PolicySpec("artifacts", "/nano"), mode="async")
+    Conditions(PolicySpec("artifacts", "/nano"), mode="async", latency=LatencyProfile.constant(1))

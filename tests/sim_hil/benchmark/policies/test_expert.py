@@ -1,0 +1,171 @@
+"""The privileged expert: gets there with room to spare round things and people, smoothly, and can say where it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import hypot
+
+import numpy as np
+import pytest
+
+from sim_hil.benchmark.env.outcome import Outcome
+from sim_hil.benchmark.env.world import EpisodeWorld
+from sim_hil.benchmark.policies.expert import ExpertPolicy
+from sim_hil.benchmark.policies.expert_motion import Driving, Motion
+from sim_hil.benchmark.policies.expert_route import SPACING_M, RoutePlanner
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene
+from tests.support.benchmark.benchmark_episodes import block, corridor_episode, hall
+
+NOBODY = np.zeros((0, 2))
+WAY = np.stack((np.arange(0.0, 8.0, SPACING_M), np.zeros(80)), axis=1)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What an episode left behind."""
+
+    outcome: Outcome
+    commands: np.ndarray
+    plans: list[list[tuple[float, float]]]
+    poses: np.ndarray
+
+
+def driven(scene: Scene | None = None, **changes: object) -> Drive:
+    episode, policy, commands, plans, poses = corridor_episode(**changes), ExpertPolicy(), [], [], []
+    with EpisodeWorld(episode, scene=scene) as world:
+        policy.reset(episode, "Go.", world, 0)
+        while not world.done:
+            commands.append(policy.act(world.observe()))
+            plans.append(policy.plan())
+            poses.append(world.pose().as_tuple())
+            world.step(commands[-1])
+        return Drive(world.outcome(), np.array(commands), plans, np.array(poses))
+
+
+@pytest.fixture(scope="module")
+def round_a_wall() -> Drive:
+    """A way that is barred in the middle of the hall."""
+    return driven(hall(block(0.0, -1.5, 0.4, 6.0)), start=(-4.0, 0.0, 0.0), goal_xy=(4.0, 0.0), shortest_m=9.3)
+
+
+@pytest.fixture(scope="module")
+def crowded() -> Iterator[Drive]:
+    """The corridor with people coming and going."""
+    yield driven(people=6, seed=1, goal_xy=(12.0, 0.0), timeout_s=60.0, shortest_m=12.0)
+
+
+def test_it_goes_round_what_bars_the_way_without_touching_it(round_a_wall: Drive) -> None:
+    assert round_a_wall.outcome.success and not round_a_wall.outcome.collided
+    assert round_a_wall.outcome.spl > 0.9
+
+
+def test_it_reaches_its_goal_among_people_without_coming_near_them(crowded: Drive) -> None:
+    assert crowded.outcome.success and not crowded.outcome.collided
+
+
+def test_it_drives_smoothly_and_within_comfortable_limits(round_a_wall: Drive) -> None:
+    commands, driving = round_a_wall.commands, Driving()
+    assert np.all(commands[:, 1] == 0.0)
+    assert commands[:, 0].max() <= driving.speed_mps and np.abs(commands[:, 2]).max() <= driving.turn_radps
+    assert np.diff(commands[:, 0]).max() <= driving.accel_mps2 * 0.1 + 1e-9
+    assert np.abs(np.diff(commands[:, 2])).max() <= driving.turn_accel_radps2 * 0.1 + 1e-9
+
+
+def test_where_it_says_that_it_will_be_is_where_it_is(round_a_wall: Drive) -> None:
+    errors = []
+    for tick in range(10, len(round_a_wall.poses) - 30):
+        x, y, heading = round_a_wall.poses[tick]
+        ahead, left = round_a_wall.plans[tick][0]
+        c, s = np.cos(heading), np.sin(heading)
+        later = round_a_wall.poses[tick + 30]
+        errors.append(hypot(x + c * ahead - s * left - later[0], y + s * ahead + c * left - later[1]))
+    assert np.median(errors) < 0.5
+
+
+def test_the_same_episode_is_driven_alike(crowded: Drive) -> None:
+    again = driven(people=6, seed=1, goal_xy=(12.0, 0.0), timeout_s=60.0, shortest_m=12.0)
+    assert again.outcome.trajectory_sha256 == crowded.outcome.trajectory_sha256
+
+
+def test_without_the_world_it_is_refused() -> None:
+    with pytest.raises(ValueError, match="world"):
+        ExpertPolicy().reset(corridor_episode(), "Go.", None, 0)
+
+
+def test_a_goal_without_a_way_to_it_is_refused() -> None:
+    episode = corridor_episode(start=(-4.0, 0.0, 0.0), goal_xy=(4.0, 0.0))
+    with (
+        EpisodeWorld(episode, scene=hall(block(0.0, 0.0, 0.4, 10.0))) as world,
+        pytest.raises(ValueError, match="no way"),
+    ):
+        ExpertPolicy().reset(episode, "Go.", world, 0)
+
+
+def planner() -> RoutePlanner:
+    # Two ways round a block in the middle, the lower one shorter.
+    return RoutePlanner(hall(block(0.0, 0.6, 1.0, 4.0)), (6.0, 0.0), 0.33, 0.06)
+
+
+def test_a_route_is_evenly_spaced_keeps_its_room_and_leads_to_the_goal() -> None:
+    plan = planner()
+    route = plan.route((-6.0, 0.0), NOBODY, 20.0)
+    steps = np.hypot(*np.diff(route, axis=0).T)
+    assert np.all(steps < 1.5 * SPACING_M)
+    assert plan.grid.clearances_at(route).min() > 0.3
+    assert hypot(route[-1, 0] - 6.0, route[-1, 1]) < 0.2
+
+
+def test_a_route_leads_round_those_who_stand_in_the_shorter_way() -> None:
+    free = planner().route((-6.0, 0.0), NOBODY, 20.0)
+    barred = planner().route((-6.0, 0.0), np.array([(0.0, -2.0), (0.0, -2.8), (0.0, -3.6), (0.0, -4.4)]), 20.0)
+    assert free[:, 1].min() < -1.4 and barred[:, 1].max() > 2.6
+
+
+def test_a_way_begun_is_kept_until_another_is_clearly_better() -> None:
+    plan = planner()
+    upper = plan.route((-6.0, 0.0), np.array([(0.0, -2.0), (0.0, -3.0), (0.0, -4.0)]), 20.0)
+    assert np.allclose(plan.route((-6.0, 0.0), NOBODY, 20.0, upper)[: len(upper)], upper)
+
+
+def motion() -> Motion:
+    return Motion(NavGrid(hall(), clearance_m=0.33), Driving())
+
+
+def settled(people: np.ndarray, velocities: np.ndarray) -> tuple[float, float]:
+    """What it commands after thinking for a second in the same place."""
+    moving, speed = motion(), 0.0
+    for _ in range(10):
+        choice = moving.choose((0.0, 0.0, 0.0), speed, WAY, people, velocities)
+        speed = choice.vx_mps
+    return choice.vx_mps, choice.shift_m
+
+
+def test_on_a_free_way_it_speeds_up_to_the_comfortable_speed() -> None:
+    assert settled(NOBODY, NOBODY) == (pytest.approx(1.0), 0.0)
+
+
+@pytest.mark.parametrize("side", [0.25, -0.25])
+def test_somebody_in_the_way_is_passed_on_the_freer_side(side: float) -> None:
+    _, shift = settled(np.array([(2.5, side)]), np.zeros((1, 2)))
+    assert np.sign(shift) == -np.sign(side)
+
+
+def test_somebody_who_crosses_is_let_pass() -> None:
+    crossing = settled(np.array([(1.3, 1.6)]), np.array([(0.0, -1.0)]))
+    assert crossing[0] < 0.8
+
+
+def test_whoever_stands_right_before_it_is_not_driven_into() -> None:
+    speed, _ = settled(np.array([(0.8, 0.0)]), np.zeros((1, 2)))
+    assert speed <= 0.3
+
+
+def test_where_people_take_the_goal_up_being_near_it_is_enough() -> None:
+    around = np.array([(6.0, 0.0), (6.0, 0.9), (6.0, -0.9)])
+    exact, near = (RoutePlanner(hall(), (6.0, 0.0), 0.33, 0.06, near_m) for near_m in (0.0, 1.2))
+    assert np.allclose(exact.route((0.0, 0.0), around, 20.0)[-1], (6.0, 0.0), atol=0.15)
+    end = near.route((0.0, 0.0), around, 20.0)[-1]
+    assert 0.5 < hypot(end[0] - 6.0, end[1]) < 1.25
+    assert np.allclose(near.route((0.0, 0.0), NOBODY, 20.0)[-1], (6.0, 0.0), atol=0.15)

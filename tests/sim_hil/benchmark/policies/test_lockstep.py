@@ -1,0 +1,189 @@
+"""Reasoning in virtual time (paper appendix D): what was started at t is there at t + L, and not before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge.core.geometry import SE2
+from edge.run.reasoning_loop import Mode
+from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot
+from sim_hil.benchmark.conditions.latency import Timing
+from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from tests.support.runner.reasoning_bench import KV, FakeLanguage, FakePolicy
+
+TICK_NS = 100_000_000
+
+
+class Policy(FakePolicy):
+    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: object = None) -> dict[str, np.ndarray]:
+        return {"context.0.key": last_layer_kv}
+
+
+class Bench:
+    """Ticks of 0.1 s from 1 s on: a frame each, the robot 0.05 m further in every one in which it may drive.
+
+    `coasting`: by how much further in each of the ticks after a halt, m.
+    """
+
+    def __init__(
+        self,
+        latency_s: float = 2.0,
+        *,
+        mode: Mode = Mode.ASYNC,
+        anchor_after_s: float = 0.0,
+        coasting: tuple[float, ...] = (),
+    ) -> None:
+        self.x_m, self.coasting, self.left = 0.0, coasting, ()
+        self.language, self.policy = FakeLanguage(), Policy()
+        self.language.begin = lambda cancelled: type(self.language).begin(  # type: ignore[method-assign]
+            self.language, cancelled, interrupt=None, before_call=lambda _: None
+        )
+        self.ring, self.slot, self.tick = TokenRing(160), SemanticSlot(), 0
+        timing = Timing(round(latency_s * 1e9), round(anchor_after_s * 1e9))
+        self.reasoner = LockstepReasoner(
+            language=self.language,  # type: ignore[arg-type]
+            policy=self.policy,  # type: ignore[arg-type]
+            ring=self.ring,
+            slot=self.slot,
+            instruction="go",
+            frame_offsets_s=(0.0, 3.0),
+            max_new_tokens=4,
+            draw=lambda: timing,
+            mode=mode,
+        )
+        self.seen: list[tuple[float, int | None, float | None]] = []
+
+    def run(self, until_s: float) -> None:
+        """Tick up to a time; `seen` has (time, generation, delay) as each tick sees them."""
+        while (now_ns := 1_000_000_000 + self.tick * TICK_NS) <= round((1 + until_s) * 1e9):
+            self.reasoner.release(now_ns)
+            self.ring.put(EncodedFrame(now_ns, SE2(self.x_m, 0.0, 0.0), KV))
+            state = self.slot.state
+            delay = None if state is None else round(state.delay_s(now_ns), 3)
+            self.seen.append((round(self.tick / 10, 3), None if state is None else state.generation, delay))
+            self.reasoner.start(now_ns)
+            self.tick += 1
+            self.x_m += self._moves(now_ns)
+
+    def _moves(self, now_ns: int) -> float:
+        if self.slot.drive_until_ns is None or now_ns < self.slot.drive_until_ns:
+            self.left = self.coasting
+            return 0.05
+        now_m, *self.left = self.left or (0.0,)
+        return now_m
+
+
+def test_before_the_first_latency_is_over_there_is_no_semantic_state() -> None:
+    bench = Bench(2.0)
+    bench.run(1.9)
+    assert {generation for _, generation, _ in bench.seen} == {None}
+
+
+def test_a_generation_is_there_after_exactly_its_latency_and_its_delay_then_is_that_latency() -> None:
+    bench = Bench(2.0)
+    bench.run(2.0)
+    assert bench.seen[-1] == (2.0, 0, 2.0)
+
+
+def test_the_next_starts_on_release_so_the_delay_grows_to_nearly_twice_the_latency() -> None:
+    bench = Bench(2.0)
+    bench.run(8.0)
+    delays = [delay for _, _, delay in bench.seen if delay is not None]
+    assert (min(delays), max(delays)) == (2.0, 3.9)
+    assert [record["started_s"] - 1 for record in bench.reasoner.released] == pytest.approx([0.0, 2.0, 4.0, 6.0])
+
+
+@pytest.mark.parametrize(("latency_s", "there_s"), [(0.0, 0.1), (0.25, 0.3), (1.0, 1.0), (4.99, 5.0)])
+def test_availability_is_at_the_first_tick_that_is_not_before_it(latency_s: float, there_s: float) -> None:
+    bench = Bench(latency_s)
+    bench.run(6.0)
+    assert next(time_s for time_s, generation, _ in bench.seen if generation == 0) == there_s
+
+
+def test_the_frames_are_those_that_there_are_at_the_offsets() -> None:
+    bench = Bench(2.0)
+    bench.run(8.1)
+    assert [[stamp - 1 for stamp in stamps] for stamps in bench.language.prompts] == [
+        pytest.approx([0.0]),
+        pytest.approx([2.0]),
+        pytest.approx([1.0, 4.0]),
+        pytest.approx([3.0, 6.0]),
+    ]
+
+
+def test_the_anchor_is_where_and_when_the_newest_frame_was_captured() -> None:
+    bench = Bench(2.0)
+    bench.run(4.0)
+    state = bench.slot.state
+    assert (
+        state is not None and (state.anchor_ns - 10**9) / 1e9 == 2.0 and state.T_odom_anchor.x_m == pytest.approx(1.0)
+    )
+
+
+def test_a_late_newest_frame_shortens_the_delay_and_not_the_generation() -> None:
+    bench = Bench(3.0, anchor_after_s=1.0)
+    bench.run(6.0)
+    assert next(row for row in bench.seen if row[1] == 0) == (3.0, 0, 2.0)
+    assert next(row for row in bench.seen if row[1] == 1) == (6.0, 1, 2.0)
+
+
+def test_without_reasoning_nothing_is_decoded() -> None:
+    bench = Bench(0.2, mode=Mode.NO_REASONING)
+    bench.run(1.0)
+    assert set(bench.language.caps) == {0} and not bench.slot.state.text_complete  # type: ignore[union-attr]
+
+
+def test_sync_drives_half_a_second_after_each_answer_and_then_thinks_anew() -> None:
+    bench = Bench(2.0, mode=Mode.SYNC)
+    bench.run(5.1)
+    starts = [record["started_s"] - 1 for record in bench.reasoner.released]
+    # The halt takes effect in the tick at 2.5 s, whose frame it has driven up to.
+    assert starts == pytest.approx([0.0, 2.6])
+    assert bench.slot.drive_until_ns == round((1 + 4.6 + 0.5) * 1e9)
+
+
+def test_sync_anchors_where_the_robot_has_come_to_stand() -> None:
+    bench = Bench(2.0, mode=Mode.SYNC, coasting=(0.06, 0.04, 0.02, 0.005))
+    bench.run(4.8)
+    stands_m = bench.x_m
+    bench.run(4.9)
+    assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 0.4)
+    state = bench.slot.state
+    assert state is not None and state.T_odom_anchor.x_m == pytest.approx(stands_m)
+
+
+def test_sync_does_not_wait_for_ever_for_odometry_to_rest() -> None:
+    bench = Bench(2.0, mode=Mode.SYNC, coasting=(0.02,) * 100)
+    bench.run(6.0)
+    assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 1.0)
+
+
+def test_sync_may_not_drive_before_the_first_answer() -> None:
+    assert Bench(2.0, mode=Mode.SYNC).slot.drive_until_ns == 0
+
+
+def test_a_policy_guided_by_waypoints_is_not_given_a_text_without_any() -> None:
+    bench = Bench(1.0)
+    bench.policy.guided_by_waypoints = True
+    bench.run(1.0)
+    bench.language.text = "no idea"
+    bench.run(5.0)
+    assert bench.slot.state is not None and bench.slot.state.generation == 0
+    assert [record["used"] for record in bench.reasoner.released] == [True, False, False, False, False]
+    assert bench.reasoner.invalid_in_a_row == 4
+
+
+def test_a_failed_generation_is_counted_and_tried_again_after_a_rest() -> None:
+    bench = Bench(1.0)
+    bench.language.broken = 1
+    bench.run(2.5)
+    assert bench.reasoner.failed == 1 and bench.reasoner.released[0]["started_s"] - 1 == pytest.approx(1.5)
+
+
+def test_five_failures_within_a_minute_end_reasoning_as_on_board() -> None:
+    bench = Bench(1.0)
+    bench.language.broken = 100
+    bench.run(20.0)
+    assert bench.reasoner.failed == 5 and "5 generations failed" in (bench.reasoner.failure or "")

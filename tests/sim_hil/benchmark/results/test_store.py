@@ -1,0 +1,119 @@
+"""A run's directory is valid after any interruption, and a resumed run is the same run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
+from sim_hil.benchmark.results.store import FAILED, RESULTS, ResultStore, StoreError, read_failed, read_results
+from tests.support.benchmark import dynanav_fakes as fakes
+
+CONFIG = {"suite": "dynanav", "conditions": {"drift": "none"}, "episodes": ["a", "b"]}
+
+
+def made(folder: Path) -> ResultStore:
+    return ResultStore.create(folder / "out", CONFIG)
+
+
+def test_a_result_is_on_the_disk_when_it_was_added(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    store.add(
+        fakes.result(
+            "a", collided=True, collisions=("person",), delay_s={"mean": 3.0, "p50": 3.0, "p99": 4.0, "max": 4.0}
+        )
+    )
+    assert read_results(store.directory) == store.results
+
+
+def test_a_second_result_of_an_episode_is_refused(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    assert store.add(fakes.result("a")) and not store.add(fakes.missed("a"))
+    assert [r.success for r in read_results(store.directory)] == [True]
+
+
+def test_a_line_that_was_cut_by_a_death_is_no_result_and_resuming_removes_it(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    store.add(fakes.result("a"))
+    store.close()
+    with (store.directory / RESULTS).open("a") as file:
+        file.write('{"id": "b", "sce')
+    resumed = ResultStore.resume(store.directory, CONFIG)
+    resumed.add(fakes.result("b"))
+    assert [r.id for r in read_results(store.directory)] == ["a", "b"]
+
+
+def test_resuming_with_other_conditions_is_refused_and_says_which(tmp_path: Path) -> None:
+    made(tmp_path).close()
+    other = {**CONFIG, "conditions": {"drift": "severe"}}
+    with pytest.raises(StoreError, match=r'conditions of .* differs .*drift: "none" then, "severe" now'):
+        ResultStore.resume(tmp_path / "out", other)
+
+
+def test_a_directory_with_files_is_not_written_into(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(StoreError, match="new or empty directory"):
+        ResultStore.create(tmp_path, CONFIG)
+
+
+def test_resuming_where_no_run_is_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="holds no benchmark run"):
+        ResultStore.resume(tmp_path, CONFIG)
+
+
+def test_two_runs_cannot_share_a_directory_at_a_time(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    with pytest.raises(StoreError, match="another edge-bench is running"):
+        ResultStore.resume(store.directory, CONFIG)
+    store.close()
+    ResultStore.resume(store.directory, CONFIG).close()
+
+
+def test_failed_runs_are_recorded_and_tried_again_by_a_resumed_run(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    store.add_failed(FailedRun("a", 2, "died"))
+    assert "died" in (store.directory / "failed.jsonl").read_text()
+    store.close()
+    resumed = ResultStore.resume(store.directory, CONFIG)
+    assert not resumed.failed and not resumed.has("a") and not (store.directory / "failed.jsonl").exists()
+
+
+def test_failed_runs_are_read_back_without_a_torn_last_line(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    assert read_failed(store.directory) == []
+    store.add_failed(FailedRun("a", 2, "died"))
+    with (store.directory / FAILED).open("a") as file:
+        file.write('{"id": "b", "att')
+    assert read_failed(store.directory) == [FailedRun("a", 2, "died")] == store.failed
+
+
+def test_a_damaged_failed_run_is_one_clear_line_with_its_number(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    (store.directory / FAILED).write_text('{"id": "a", "attempts": "two", "why": "died"}\n')
+    with pytest.raises(StoreError, match=r"failed.jsonl:1: failed run: expected an object with id"):
+        read_failed(store.directory)
+
+
+def test_a_damaged_line_is_one_clear_line_with_its_number(tmp_path: Path) -> None:
+    store = made(tmp_path)
+    store.add(fakes.result("a"))
+    with (store.directory / RESULTS).open("a") as file:
+        file.write('{"id": 3}\n')
+    with pytest.raises(StoreError, match=r"results.jsonl:2: result: expected an object with the keys"):
+        read_results(store.directory)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"ne_m": float("nan")}, {"spl": 120.0}, {"success": False}, {"collided": True}, {"trajectory_sha256": "abc"}],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_a_result_that_contradicts_itself_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ResultError):
+        fakes.result("a", **wrong)
+
+
+def test_a_result_survives_json(tmp_path: Path) -> None:
+    one = fakes.result("a", collided=True, collisions=("bench", "person"))
+    assert EpisodeResult.of_json(one.as_json()) == one

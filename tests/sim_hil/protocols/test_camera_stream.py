@@ -1,0 +1,162 @@
+"""The camera over HTTP: pictures for whoever looks, none for nobody, and an end when its parent ends."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from http.client import HTTPConnection, HTTPResponse
+
+import cv2
+import numpy as np
+import pytest
+
+from sim_hil.protocols.camera_stream import CameraServer, CameraStream, Shutter, listen
+from sim_hil.scene.scene import load_scene
+from sim_hil.simulation.physics import Simulation
+
+SIZE = (160, 90)
+
+
+class Studio:
+    """A server whose pictures are numbered and made as fast as they are wanted."""
+
+    def __init__(self) -> None:
+        self.shutter = Shutter()
+        self.server = CameraServer(listen(0), self.shutter)
+        self.port = int(self.server.server_address[1])
+        self.made = 0
+        self._ending = False
+        self._threads = [threading.Thread(target=work) for work in (self.server.serve_forever, self._render)]
+        for thread in self._threads:
+            thread.start()
+
+    def _render(self) -> None:
+        while not self._ending:
+            if self.shutter.wanted:
+                self.made += 1
+                self.shutter.show(1000 + self.made, b"picture %d" % self.made)
+            time.sleep(0.001)
+
+    def get(self, path: str) -> HTTPResponse:
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection.request("GET", path)
+        return connection.getresponse()
+
+    def close(self) -> None:
+        self._ending = True
+        self.server.shutdown()
+        self.server.server_close()
+        for thread in self._threads:
+            thread.join()
+
+
+@pytest.fixture
+def studio() -> Iterator[Studio]:
+    studio = Studio()
+    yield studio
+    studio.close()
+
+
+def test_a_picture_is_made_after_it_was_asked_for_and_says_when(studio: Studio) -> None:
+    time.sleep(0.05)
+    assert studio.made == 0, "nobody looks"
+    response = studio.get("/frame.jpg")
+    assert response.status == 200 and response.read() == b"picture 1"
+    assert response.headers["X-Capture-Ns"] == "1001"
+
+
+def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
+    stream = studio.get("/stream.mjpg")
+    boundary = stream.headers["Content-Type"].split("boundary=")[1].encode()
+    numbers = []
+    for _ in range(3):
+        assert stream.readline().strip() == b"--" + boundary
+        headers = dict(line.split(b": ") for line in iter(lambda: stream.readline().strip(), b""))
+        numbers.append(int(stream.read(int(headers[b"Content-Length"])).split()[1]))
+        assert int(headers[b"X-Capture-Ns"]) == 1000 + numbers[-1]
+        stream.readline()
+    assert numbers == sorted(set(numbers))
+    stream.close()
+
+
+def test_whoever_leaves_is_forgotten(studio: Studio) -> None:
+    stream = studio.get("/stream.mjpg")
+    stream.readline()
+    stream.close()
+    deadline = time.monotonic() + 10
+    while studio.shutter.wanted:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_another_path_is_refused(studio: Studio) -> None:
+    assert studio.get("/etc/passwd").status == 404
+
+
+def test_it_listens_on_the_loopback_only(studio: Studio) -> None:
+    assert studio.server.server_address[0] == "127.0.0.1"
+
+
+@pytest.fixture(scope="module")
+def state() -> np.ndarray:
+    simulation = Simulation(load_scene("corridor"), people=0, seed=0, robot="carter")
+    state = simulation.render_state()
+    simulation.close()
+    return state
+
+
+def _stream(state: np.ndarray, port: int = 0) -> CameraStream:
+    return CameraStream("corridor", robot="carter", people=0, seed=0, size=SIZE, port=port, state_length=len(state))
+
+
+def test_the_process_shows_the_world_at_the_pose_it_was_given(state: np.ndarray) -> None:
+    camera = _stream(state)
+    try:
+        camera.show(state)
+        assert camera.wait_ready([])
+        url = camera.url.replace("stream.mjpg", "frame.jpg")
+        pictures = []
+        for turn in (0.0, np.pi):
+            turned = state.copy()
+            turned[3:7] = (0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
+            camera.show(turned)
+            before_ns = time.monotonic_ns()
+            with urllib.request.urlopen(url, timeout=20) as response:
+                assert int(response.headers["X-Capture-Ns"]) >= before_ns
+                pictures.append(cv2.imdecode(np.frombuffer(response.read(), np.uint8), cv2.IMREAD_COLOR))
+        assert pictures[0].shape == (SIZE[1], SIZE[0], 3)
+        assert float(np.abs(pictures[0].astype(int) - pictures[1]).mean()) > 5.0, "it looks the other way"
+        deadline = time.monotonic() + 10
+        while camera.pictures < 2:
+            assert time.monotonic() < deadline
+            camera.poll()
+    finally:
+        camera.close()
+        camera.close()
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(state: np.ndarray) -> None:
+    with listen(0) as taken, pytest.raises(OSError, match=r"^camera: port \d+: expected a free one, .+$"):
+        _stream(state, taken.getsockname()[1])
+
+
+def test_its_address_is_known_before_it_is_ready(state: np.ndarray) -> None:
+    camera = _stream(state)
+    try:
+        assert camera.port > 0 and str(camera.port) in camera.url
+    finally:
+        camera.close()
+
+
+def test_waiting_for_it_ends_when_the_run_is_stopped(state: np.ndarray) -> None:
+    camera = _stream(state)
+    try:
+        assert not camera.wait_ready([15])
+    finally:
+        camera.close()
+    assert camera._process.returncode is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(camera._process.pid, 0)

@@ -1,0 +1,217 @@
+"""The wheeled base's drive electronics, odometry and battery without physics."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.core.geometry import SE2
+from sim_hil.robots.carter.battery import CAPACITY_WH, ELECTRONICS_W, CarterBattery, load_w
+from sim_hil.robots.carter.drive import HOLD_S, MAX_TORQUE_NM, NO_LOAD_RADPS, DriveController, DriveLimits
+from sim_hil.robots.carter.urdf import TRACK_M, WHEEL_RADIUS_M
+from sim_hil.robots.carter.wheel_odometry import COUNTS_PER_TURN, WheelCalibration, WheelOdometry
+
+DT_S = 1 / 240
+
+
+class IdealWheels:
+    """A controller whose wheels do exactly what its reference says."""
+
+    def __init__(self, limits: DriveLimits | None = None) -> None:
+        self.controller = DriveController(DT_S, limits)
+        self.controller.powered = True
+        self.references: list[tuple[float, float]] = []
+
+    def run(self, seconds: float) -> tuple[float, float]:
+        for _ in range(round(seconds / DT_S)):
+            v, w = self.controller.reference
+            half = TRACK_M / 2
+            self.controller.step((v - w * half) / WHEEL_RADIUS_M, (v + w * half) / WHEEL_RADIUS_M)
+            self.references.append(self.controller.reference)
+        return self.controller.reference
+
+
+@given(st.floats(-100, 100), st.floats(-100, 100))
+def test_the_reference_goes_where_the_command_points_and_never_beyond_the_limits(v: float, w: float) -> None:
+    wheels = IdealWheels()
+    for _ in range(4):
+        wheels.controller.command(v, w)
+        wheels.run(0.5)
+    limits = wheels.controller.limits
+    expected = (max(-limits.v_max_mps, min(limits.v_max_mps, v)), max(-limits.w_max_radps, min(limits.w_max_radps, w)))
+    assert wheels.controller.reference == pytest.approx(expected)
+
+
+@given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-3, 3)), min_size=1, max_size=6))
+def test_the_reference_never_changes_faster_than_the_limits(commands: list[tuple[float, float]]) -> None:
+    wheels = IdealWheels()
+    for v, w in commands:
+        wheels.controller.command(v, w)
+        wheels.run(0.1)
+    limits, before = wheels.controller.limits, (0.0, 0.0)
+    for now in wheels.references:
+        speeding_up = abs(now[0]) > abs(before[0])
+        most = (limits.accel_mps2 if speeding_up else limits.brake_mps2) * DT_S
+        assert abs(now[0] - before[0]) <= most + 1e-9
+        assert abs(now[1] - before[1]) <= limits.alpha_radps2 * DT_S + 1e-9
+        before = now
+
+
+def test_a_command_is_obeyed_for_one_second() -> None:
+    wheels = IdealWheels()
+    wheels.controller.command(0.5, 0.0)
+    wheels.run(HOLD_S - 2 * DT_S)
+    assert wheels.controller.commanded == (0.5, 0.0)
+    wheels.run(4 * DT_S)
+    assert wheels.controller.commanded == (0.0, 0.0)
+    assert wheels.run(1.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("command", [(math.nan, 0.0), (0.0, math.nan), (math.inf, 0.0), (0.0, -math.inf)])
+def test_a_command_that_is_no_number_is_refused_and_changes_nothing(command: tuple[float, float]) -> None:
+    wheels = IdealWheels()
+    wheels.controller.command(0.3, 0.1)
+    with pytest.raises(ValueError, match="finite"):
+        wheels.controller.command(*command)
+    assert wheels.controller.commanded == (0.3, 0.1)
+
+
+def test_without_power_it_obeys_nothing() -> None:
+    wheels = IdealWheels()
+    wheels.controller.powered = False
+    wheels.controller.command(0.5, 0.5)
+    assert wheels.run(0.5) == (0.0, 0.0)
+
+
+def test_an_emergency_stop_brakes_harder_than_a_command_to_stop() -> None:
+    def stopping_s(stop: bool) -> float:
+        wheels = IdealWheels()
+        for _ in range(3):
+            wheels.controller.command(1.5, 0.0)
+            wheels.run(0.9)
+        wheels.controller.estop = stop
+        wheels.controller.command(0.0, 0.0)
+        steps = 0
+        while wheels.controller.reference != (0.0, 0.0):
+            wheels.run(DT_S)
+            steps += 1
+        return steps * DT_S
+
+    assert stopping_s(True) == pytest.approx(1.5 / 2.5, abs=0.02)
+    assert stopping_s(False) == pytest.approx(1.5 / 2.0, abs=0.02)
+
+
+@given(st.floats(-60, 60), st.floats(-60, 60))
+def test_a_motor_never_gives_more_than_its_limit_nor_drives_beyond_its_top_speed(left: float, right: float) -> None:
+    controller = DriveController(DT_S)
+    for torque, speed in zip(controller.step(left, right), (left, right), strict=True):
+        assert abs(torque) <= MAX_TORQUE_NM
+        if abs(speed) >= NO_LOAD_RADPS:
+            assert torque * speed <= 0.0
+
+
+def test_a_wheel_that_was_blocked_lets_go_when_it_may_stop() -> None:
+    controller = DriveController(DT_S)
+    controller.powered = True
+    for _ in range(480):
+        controller.command(0.5, 0.0)
+        pushing, _ = controller.step(0.0, 0.0)
+    assert pushing == MAX_TORQUE_NM and controller.saturated
+    controller.command(0.0, 0.0)
+    for _ in range(240):
+        resting, _ = controller.step(0.0, 0.0)
+    assert resting == 0.0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_limits_that_make_no_sense_are_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="expected a number above 0"):
+        DriveLimits(accel_mps2=value)
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2))
+def test_odometry_of_a_steady_arc_is_that_arc(v: float, w: float) -> None:
+    odometry, steps = WheelOdometry(), 480
+    for step in range(1, steps + 1):
+        time_s = step * DT_S
+        left, right = (v - w * TRACK_M / 2) / WHEEL_RADIUS_M, (v + w * TRACK_M / 2) / WHEEL_RADIUS_M
+        odometry.step(left * time_s, right * time_s)
+    turned = w * steps * DT_S
+    radius = v / w if abs(w) > 1e-6 else 0.0
+    x = radius * math.sin(turned) if radius else v * steps * DT_S * math.cos(turned / 2)
+    y = radius * (1 - math.cos(turned)) if radius else v * steps * DT_S * math.sin(turned / 2)
+    found = odometry.sample(0.0, 0.0).T_odom_base
+    # A count is 0.2 mm of way, and as much between the wheels 0.5 mrad.
+    assert (found.x_m, found.y_m) == pytest.approx((x, y), abs=0.01)
+    assert found.theta_rad == pytest.approx(turned, abs=0.002)
+
+
+def test_encoders_count_whole_steps_of_a_turn() -> None:
+    odometry = WheelOdometry()
+    odometry.step(2 * math.pi + 1e-6, -1e-6)
+    sample = odometry.sample(0.0, 0.0)
+    assert (sample.left_counts, sample.right_counts) == (COUNTS_PER_TURN, -1)
+
+
+def test_wheels_of_another_size_than_believed_make_odometry_drift() -> None:
+    believed = WheelCalibration(left_radius_m=WHEEL_RADIUS_M * 0.999, right_radius_m=WHEEL_RADIUS_M * 1.001)
+    odometry = WheelOdometry(believed)
+    for step in range(1, 2001):
+        odometry.step(step * 0.05, step * 0.05)
+    found = odometry.sample(0.0, 0.0)
+    assert found.distance_m == pytest.approx(2000 * 0.05 * WHEEL_RADIUS_M, rel=1e-3)
+    assert found.T_odom_base.theta_rad == pytest.approx(found.distance_m * 0.002 / TRACK_M, rel=0.02)
+
+
+def test_a_robot_of_a_seed_is_always_the_same_and_no_other() -> None:
+    assert WheelCalibration.drawn(7) == WheelCalibration.drawn(7) != WheelCalibration.drawn(8)
+
+
+def test_odometry_reports_the_speeds_of_the_wheels() -> None:
+    sample = WheelOdometry().sample(2.0, 4.0)
+    assert sample.v_mps == pytest.approx(3.0 * WHEEL_RADIUS_M)
+    assert sample.w_radps == pytest.approx(2.0 * WHEEL_RADIUS_M / TRACK_M)
+    assert sample.T_odom_base == SE2(0.0, 0.0, 0.0)
+
+
+def test_a_full_battery_lasts_as_long_as_its_energy_says() -> None:
+    battery, hours = CarterBattery(), 0.0
+    while battery.read().soc_percent > 0.0:
+        battery.draw(ELECTRONICS_W + 30.0, 60.0)
+        hours += 1 / 60
+    # The maker's "over 8 hours"; the pack's mean voltage lies a percent below its nominal one.
+    assert hours == pytest.approx(CAPACITY_WH / (ELECTRONICS_W + 30.0), rel=0.03)
+    assert hours > 8.0
+
+
+def test_driving_takes_more_than_standing_and_braking_gives_nothing_back() -> None:
+    assert load_w(0.0, 0.0, 0.0, 0.0) == load_w(-5.0, 3.0, -5.0, 3.0) == ELECTRONICS_W
+    assert load_w(5.0, 3.0, 5.0, 3.0) > ELECTRONICS_W
+
+
+def test_a_battery_under_load_has_less_voltage() -> None:
+    idle, busy = CarterBattery(), CarterBattery()
+    idle.draw(0.0, 1.0)
+    busy.draw(500.0, 1.0)
+    assert busy.read().voltage_v < idle.read().voltage_v
+
+
+def test_the_current_is_a_mean_over_time_however_often_it_is_asked_for() -> None:
+    asked, silent = CarterBattery(), CarterBattery()
+    for step in range(48):  # 0.1 s of nothing, then 0.1 s of 400 W in every second step
+        power_w = 400.0 if step >= 24 and step % 2 else 0.0
+        for battery in (asked, silent):
+            battery.draw(power_w, 1 / 240)
+        assert asked.read() == asked.read()
+    found = silent.read()
+    assert asked.read() == found
+    assert found.current_a == pytest.approx(200.0 / 41.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("soc", [-0.1, 1.1, math.nan])
+def test_a_charge_that_cannot_be_is_refused(soc: float) -> None:
+    with pytest.raises(ValueError, match="0 to 1"):
+        CarterBattery(soc)

@@ -1,0 +1,124 @@
+"""The simulation around the robot: any robot, rate and start; people at their own rate, with bodies only nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import hypot
+from typing import Any
+
+import numpy as np
+import pybullet
+import pytest
+
+from sim_hil.crowd.people import UPDATE_HZ
+from sim_hil.scene.scene import Scene, load_scene
+from sim_hil.scene.terrain import Terrain
+from sim_hil.simulation.physics import Simulation, SportAction
+from tests.support.benchmark.benchmark_episodes import block, hall
+
+
+@contextmanager
+def simulated(scene: Scene, *, people: int = 0, **options: Any) -> Iterator[Simulation]:
+    simulation = Simulation(scene, people=people, seed=1, **options)
+    try:
+        yield simulation
+    finally:
+        simulation.close()
+
+
+def run(simulation: Simulation, seconds: float, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    for step in range(round(seconds * simulation.rate_hz)):
+        if step % (simulation.rate_hz // 10) == 0:
+            simulation.command(*velocity)
+        simulation.step()
+
+
+@pytest.mark.parametrize("robot", ["go2", "carter"])
+def test_any_robot_gets_ready_and_drives_as_commanded(robot: str) -> None:
+    with simulated(hall(), robot=robot, rate_hz=240) as simulation:
+        simulation.settle()
+        (x0, _, _), _ = simulation.pose()
+        run(simulation, 3.0, (0.6, 0.0, 0.0))
+        (x1, _, _), _ = simulation.pose()
+        assert 1.2 < x1 - x0 < 2.0
+        assert simulation.truth().commanded[0] == pytest.approx(0.6)
+
+
+def test_a_start_of_its_own_takes_the_place_of_the_scenes() -> None:
+    with simulated(hall(), start=(2.0, 1.0, 1.5)) as simulation:
+        (x, y, _), heading = simulation.pose()
+        assert (x, y, heading) == pytest.approx((2.0, 1.0, 1.5), abs=0.02)
+        assert simulation.scene.start == (2.0, 1.0, 1.5)
+
+
+def test_a_robot_that_starts_on_a_platform_stands_on_it() -> None:
+    platform = Terrain("platform", "platform", (-8.0, 0.0, 0.0), 0.0, (3.0, 3.0), 0.3, "concrete")
+    with simulated(replace(hall(), terrain=(platform,))) as simulation:
+        simulation.settle()
+        assert 0.5 < simulation.pose()[0][2] < 0.7
+
+
+def test_a_ramp_is_walked_up() -> None:
+    ramp = Terrain("ramp", "ramp", (-5.5, 0.0, 0.0), 0.0, (3.0, 2.0), 0.3, "concrete")
+    with simulated(replace(hall(), terrain=(ramp,)), rate_hz=240) as simulation:
+        simulation.settle()
+        low = simulation.pose()[0][2]
+        run(simulation, 5.0, (0.6, 0.0, 0.0))
+        assert simulation.pose()[0][2] > low + 0.1 and not simulation.fell
+
+
+def test_nobody_walks_while_the_robot_gets_ready() -> None:
+    with simulated(load_scene("corridor"), people=3) as simulation:
+        before = simulation.people()
+        simulation.settle()
+        assert np.array_equal(simulation.people(), before) and simulation.time_s > 0.5
+
+
+@pytest.mark.parametrize("rate_hz", [240, 500])
+def test_people_keep_their_own_rate(rate_hz: int) -> None:
+    with simulated(load_scene("corridor"), people=2, rate_hz=rate_hz) as simulation:
+        changes, before = 0, simulation.people()
+        for _ in range(rate_hz):
+            simulation.step()
+            changes += not np.array_equal(simulation.people(), before)
+            before = simulation.people()
+        assert changes == pytest.approx(UPDATE_HZ, abs=1)
+
+
+def test_only_people_near_the_robot_have_a_body() -> None:
+    with simulated(load_scene("corridor"), people=4) as simulation:
+        run(simulation, 4.0)
+        (x, y, _), _ = simulation.pose()
+        near = [(px, py) for px, py, _ in simulation.people() if hypot(px - x, py - y) < 2.0]
+        bodies = [
+            pybullet.getBasePositionAndOrientation(body, physicsClientId=simulation._client)[0][:2]
+            for body in simulation._person_bodies
+        ]
+        inside = [place for place in bodies if place[0] < 28.0]
+        assert len(inside) < 4 or len(near) == 4
+        for person in near:
+            assert min(hypot(person[0] - bx, person[1] - by) for bx, by in inside) < 1e-6
+
+
+def test_what_is_touched_is_forgotten_as_touching_but_not_as_collided() -> None:
+    with simulated(hall(block(-7.0, 0.0, 0.5, 2.0)), rate_hz=240) as simulation:
+        simulation.settle()
+        for _ in range(40):
+            if not simulation.touching:
+                run(simulation, 0.1, (0.6, 0.0, 0.0))
+        assert simulation.touching == {"block -7.0 0.0"}
+        run(simulation, 2.0, (-0.4, 0.0, 0.0))
+        assert simulation.touching == frozenset() and simulation.collided_with() == {"block -7.0 0.0"}
+
+
+@pytest.mark.parametrize("options", [{"robot": "spot"}, {"rate_hz": 30}])
+def test_an_unknown_robot_and_a_senseless_rate_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="simulation"):
+        Simulation(hall(), people=0, seed=1, **options)
+
+
+def test_sport_actions_are_the_go2s_alone() -> None:
+    with simulated(hall(), robot="carter") as simulation, pytest.raises(ValueError, match="Go2"):
+        simulation.sport(SportAction.STAND_UP)

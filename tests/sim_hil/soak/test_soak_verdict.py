@@ -1,0 +1,165 @@
+"""What a soak is judged by: slopes with intervals, budget lines, measures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_hil.soak import cli
+from sim_hil.soak.drive.schedule import SoakInputError
+from sim_hil.soak.report import write_report
+from sim_hil.soak.run import SoakFolder, SoakOptions, soak_result, verdict
+from sim_hil.soak.verdict import budget
+from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED, BudgetLine, Measure, judge, judge_line, load_budget
+from sim_hil.soak.verdict.measures import measures, names
+from sim_hil.soak.verdict.slopes import slope
+
+LIMIT = BudgetLine("x", "here", max=1.0)
+
+
+def grown(per_h: float, seconds: int = 1200, noise: float = 0.0) -> tuple[list[float], list[float]]:
+    times = [float(t) for t in range(seconds)]
+    rng = np.random.default_rng(5)
+    return times, [100.0 + per_h * t / 3600 + float(rng.normal(0, noise)) for t in times]
+
+
+def test_a_steady_growth_is_found_per_hour() -> None:
+    found = slope(*grown(12.0))
+    assert found is not None and found.per_h == pytest.approx(12.0, abs=1e-6)
+
+
+def test_what_does_not_grow_has_an_interval_around_zero() -> None:
+    found = slope(*grown(0.0, noise=0.5))
+    assert found is not None and found.low <= 0.0 <= found.high
+
+
+def test_the_warm_up_does_not_count() -> None:
+    times, values = grown(0.0)
+    values = [value + (0.0 if t > 290 else -50.0) for t, value in zip(times, values, strict=True)]
+    found = slope(times, values)
+    assert found is not None and found.per_h == pytest.approx(0.0, abs=1e-9)
+
+
+def test_spikes_do_not_move_a_slope() -> None:
+    times, values = grown(0.0)
+    found = slope(times, [value + (500.0 if t % 97 == 0 else 0.0) for t, value in zip(times, values, strict=True)])
+    assert found is not None and abs(found.per_h) < 1e-6
+
+
+def test_a_short_life_has_no_slope() -> None:
+    assert slope(*grown(12.0, seconds=500)) is None
+
+
+def test_within_the_limit_passes_and_beyond_it_fails() -> None:
+    assert judge_line(LIMIT, Measure(1.0, "", 5)).verdict == PASS
+    assert judge_line(LIMIT, Measure(1.1, "", 5)).verdict == FAIL
+
+
+def test_a_lower_limit_is_one_too() -> None:
+    line = BudgetLine("x", "here", min=0.98)
+    assert judge_line(line, Measure(0.99, "", 1)).verdict == PASS
+    assert judge_line(line, Measure(0.97, "", 1)).verdict == FAIL
+
+
+def test_growth_whose_interval_reaches_the_limit_is_undecided() -> None:
+    assert judge_line(LIMIT, Measure(2.0, "", 1, low=0.5, high=3.0)).verdict == UNDECIDED
+    assert judge_line(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0)).verdict == FAIL
+
+
+def test_what_was_not_measured_is_undecided_and_says_why() -> None:
+    found = judge_line(LIMIT, Measure(None, "", 0, note="too short"))
+    assert (found.verdict, found.why) == (UNDECIDED, "too short")
+
+
+def test_a_line_about_nothing_is_refused() -> None:
+    with pytest.raises(SoakInputError, match="no measure 'y'"):
+        judge([BudgetLine("y", "here", max=1.0)], {"x": Measure(1.0, "", 1)})
+
+
+def test_every_line_of_the_default_budget_is_measured() -> None:
+    lines = load_budget(budget.DEFAULT)
+    budget.check_names(lines, names())
+    assert {line.measure for line in lines} >= {"memory_slope_mib_per_h.edge-run", "bridge_jitter_ms.p999"}
+
+
+def test_a_soak_without_anything_fails_in_no_line() -> None:
+    assert all(found.verdict != FAIL for found in judge(load_budget(budget.DEFAULT), measures([], [])))
+
+
+def test_a_soak_without_anything_is_undecided_in_every_line() -> None:
+    found = judge(load_budget(budget.DEFAULT), measures([], []))
+    assert {line.verdict for line in found} == {UNDECIDED}
+    assert verdict(found) == UNDECIDED
+
+
+def test_one_line_without_data_makes_the_soak_undecided() -> None:
+    passed = judge_line(LIMIT, Measure(0.5, "", 5))
+    nothing = judge_line(LIMIT, Measure(None, "", 0))
+    failed = judge_line(LIMIT, Measure(2.0, "", 5))
+    assert verdict([passed]) == PASS
+    assert verdict([passed, nothing]) == UNDECIDED
+    assert verdict([passed, nothing, failed]) == FAIL
+
+
+def test_a_budget_without_lines_decides_nothing() -> None:
+    assert verdict([]) == UNDECIDED
+
+
+def test_a_soak_without_faults_is_not_judged_by_the_answers_to_them() -> None:
+    lines = load_budget(budget.DEFAULT)
+    left = budget.that_apply(lines, faults=False)
+    assert {line.measure for line in lines} - {line.measure for line in left} == {"faults_unanswered"}
+    assert budget.that_apply(lines, faults=True) == lines
+
+
+def empty_soak(tmp_path: Path) -> tuple[int, dict[str, Any], str]:
+    """A soak whose legs ended before anything was measured: exit code, result and page."""
+    options = SoakOptions(
+        tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "default"
+    )
+    soak = SoakFolder.create(tmp_path / "out", options)
+    result = soak_result(soak, options, load_budget(budget.DEFAULT), finished=True)
+    return cli.exit_code(result), result, write_report(soak, result).read_text(encoding="utf-8")
+
+
+def test_an_empty_soak_is_undecided_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, result, _ = empty_soak(tmp_path)
+    assert (code, result["verdict"]) == (1, UNDECIDED)
+    assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
+
+
+def test_the_page_of_an_empty_soak_says_undecided(tmp_path: Path) -> None:
+    page = empty_soak(tmp_path)[2]
+    assert '<span class="verdict bad">UNDECIDED</span>' in page
+    assert "no verdict: 12 of 12 budget lines are undecided" in page
+
+
+@pytest.mark.parametrize("lines", ["max = 1.0\nmin = 0.0", "", "max = nan", "most = 1.0"])
+def test_a_budget_that_is_wrong_is_refused(tmp_path: Path, lines: str) -> None:
+    path = tmp_path / "budget.toml"
+    path.write_text(f'format = 1\n[[budget]]\nmeasure = "x"\nsource = "here"\n{lines}\n', encoding="utf-8")
+    with pytest.raises(SoakInputError):
+        load_budget(path)
+
+
+def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
+    row = {"pid": pid, "cpu_percent": 10.0, "rss_bytes": rss_mib * 2**20, "fds": 14, "threads": 3}
+    return {"elapsed_s": t, "processes": {"edge-run": row}}
+
+
+def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
+    for growth, wanted in ((3.0, FAIL), (0.1, PASS)):
+        leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
+        found = {j.line.measure: j for j in judge(load_budget(budget.DEFAULT), measures([], [leg]))}
+        assert found["memory_slope_mib_per_h.edge-run"].verdict == wanted
+        assert found["descriptor_slope_per_h.edge-run"].verdict == PASS
+
+
+def test_every_process_has_a_life_of_its_own() -> None:
+    """A runner that is started anew at another size has not grown."""
+    leg = [sample(float(t), 250, 7) for t in range(1200)] + [sample(1200.0 + t, 300, 8) for t in range(1200)]
+    found = measures([], [leg])["memory_slope_mib_per_h.edge-run"]
+    assert found.value == pytest.approx(0.0, abs=1e-6) and found.count == 2

@@ -1,0 +1,61 @@
+"""Artifact directories written without the exporter's gate, for tests of what reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, seal
+from export.graphs.build import graph_contract, graph_names, write_graph
+from export.model.network import TicVla
+from export.model.tokenizers.nano import NANO_TOKENIZER
+from export.quantize.precision import Precision
+
+
+def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, precision: Precision | None = None) -> Path:
+    """The graphs of a model with nano's tokenizer, in one precision, and a manifest that lists them."""
+    config, graphs = model.config, {}
+    for name in graph_names(pair):
+        files = write_graph(model, name, precision or Precision("fp32"), "fused", directory)
+        session = {"provider": "CPUExecutionProvider", "options": {}, "threads": None, "engine": False}
+        graphs[name] = {
+            "file": files[0],
+            "data_files": files[1:],
+            **graph_contract(directory / files[0]),
+            "session": session,
+        }
+    (directory / "tokenizer.json").write_bytes(NANO_TOKENIZER.read_bytes())
+    files_section: dict[str, Any] = {
+        path.name: {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        for path in sorted(directory.iterdir())
+    }
+    language = config.language
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "target": "cpu",
+        "model": {"name": config.name, "trained": False},
+        "runtime": {
+            "image_px": config.vision.image_px,
+            "frame_tokens": config.frame_tokens,
+            "kv_dim": config.kv_dim,
+            "max_context": language.max_context,
+            "max_new_tokens": 48,
+            "prefill_chunk_tokens": 256,
+            "frame_offsets_s": [0.0, 3.0, 6.0, 9.0],
+            "tick_period_ms": 100,
+            "control_cores": [],
+            "reasoning_cores": [],
+            "control_priority": 0,
+            "step_s": config.action.step_s,
+            **{f"{n}_id": getattr(language, f"{n}_id") for n in ("im_start", "im_end", "img_start", "img_end")},
+            "img_context_id": language.img_context_id,
+        },
+        "graphs": graphs,
+        "files": files_section,
+        "plan": {},
+        "provenance": {},
+    }
+    (directory / MANIFEST_NAME).write_text(json.dumps(seal(manifest)))
+    return directory

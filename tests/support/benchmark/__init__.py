@@ -1,0 +1,1 @@
+"""Helpers for tests of the benchmark: small episodes and fake workers."""

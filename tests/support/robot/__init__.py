@@ -1,0 +1,1 @@
+"""Helpers for tests of the bridge and of simulated robots."""

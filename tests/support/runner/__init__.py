@@ -1,0 +1,1 @@
+"""Helpers for tests of the runner: benches for both loops, synthetic runs, floor pictures."""

@@ -1,0 +1,1 @@
+"""Helpers for tests of training: made-up drives, stages as one of several ranks."""

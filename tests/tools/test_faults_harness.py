@@ -1,0 +1,201 @@
+"""The fault harness's own judgement, without a process: what it takes for a stop, and what it lets pass."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from pathlib import Path
+
+import pytest
+
+from edge.core.geometry import SE2
+from edge.motion.controller import arc_to
+from edge.safety.faults.table import FAULTS
+from sim_hil.protocols.fault_client import FaultClient, FaultError
+from tools.faults import __main__ as command
+from tools.faults import circle
+from tools.faults.measure import Sample
+from tools.faults.received import Hearing, Tail, first_lasting, longest_gap_ms
+from tools.faults.report import RowResult
+from tools.faults.rows import NOT_INJECTED, Judge, Row, rows
+from tools.faults.switches import Switches
+
+MS = 1_000_000
+ZERO, SLOW, FAST = (0.0, 0.0, 0.0), (0.3, 0.0, 0.2), (0.7, 0.0, 0.7)
+
+
+def test_the_stop_is_the_first_zero_after_the_last_motion() -> None:
+    assert first_lasting([(1, FAST), (2, ZERO), (3, FAST), (4, ZERO), (5, ZERO)], ZERO) == 4
+
+
+def test_a_robot_that_moves_at_the_end_has_not_stopped() -> None:
+    assert first_lasting([(1, ZERO), (2, FAST)], ZERO) is None
+
+
+def test_a_limit_is_kept_from_the_first_slow_command_on() -> None:
+    limit = (0.4, math.inf, math.inf)
+    assert first_lasting([(1, FAST), (2, SLOW), (3, ZERO), (4, SLOW)], limit) == 2
+
+
+def test_a_gap_counts_from_the_beginning_and_to_the_end_of_the_window() -> None:
+    assert longest_gap_ms([(30 * MS, FAST), (50 * MS, FAST)], 0, 60 * MS) == 30.0
+    assert longest_gap_ms([(30 * MS, FAST)], 0, 100 * MS) == 70.0
+    assert longest_gap_ms([], 0, 100 * MS) == 100.0
+
+
+def row(bound: float = 300.0) -> Row:
+    return Row("test", None, lambda rig: 0, judge=Judge.ZERO, bound=bound)
+
+
+@pytest.mark.parametrize(
+    ("sample", "problem"),
+    [
+        (Sample(290.0, 0.0), None),
+        (Sample(310.0, 0.0), "p99.9 above 300 ms"),
+        (Sample(310.0, 20.0), None),
+        (Sample(340.0, 20.0), "p99.9 above 300 ms"),
+        (Sample(601.0, 0.0), "max above 600 ms"),
+        (Sample(None, 0.0), "1 never came"),
+        (Sample(10.0, 0.0, ["moved after SIGCONT"]), "moved after SIGCONT"),
+    ],
+)
+def test_a_row_passes_when_every_sample_is_within_the_bound(sample: Sample, problem: str | None) -> None:
+    problems = RowResult(row(), [Sample(100.0, 0.0)] * 5 + [sample]).problems
+    assert (problem is None and not problems) or problem in problems
+
+
+def test_on_a_disk_too_full_to_record_to_nothing_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("edge.flightlog.recorder._free", lambda _: (69 << 30, 1000 << 30))
+    monkeypatch.setattr(command, "Rig", lambda *_: pytest.fail("a rig was made"))
+    assert command.main(["--artifacts", str(tmp_path), "--out", str(tmp_path / "out"), "--domain", "1"]) == 1
+    assert "recording needs 71680 MiB" in capsys.readouterr().err
+
+
+def test_time_that_the_machine_stood_still_is_granted_and_counted() -> None:
+    result = RowResult(row(), [Sample(310.0, 20.0), Sample(100.0, 20.0)])
+    assert result.granted == 1 and result.as_json()["max_ms"] == 310.0
+
+
+def test_every_fault_of_the_table_is_injected_or_says_why_not() -> None:
+    injected = {one.fault for one in rows()}
+    movable = {name for name, fault in FAULTS.items() if fault.where != "start"}
+    assert movable - injected <= set(NOT_INJECTED)
+    assert not injected & set(NOT_INJECTED)
+
+
+def test_a_row_must_say_how_it_is_judged_and_name_a_known_fault() -> None:
+    with pytest.raises(ValueError, match="a judge"):
+        Row("test", None, lambda rig: 0)
+    with pytest.raises(ValueError, match="not in the fault table"):
+        Row("test", "meteorite", lambda rig: 0)
+
+
+def test_two_hundred_injections_are_made_by_default() -> None:
+    per_row = command.parser().parse_args([]).per_row
+    assert sum(command.count(one, per_row) for one in rows()) >= 200
+
+
+@pytest.mark.parametrize("start", [SE2(0.0, 0.0, 0.0), SE2(1.0, 0.0, -math.pi / 2), SE2(-1.3, 0.5, 0.4)])
+def test_the_plan_leads_onto_the_circle_and_stays_there(start: SE2) -> None:
+    pose, radii = start, []
+    for index in range(400):
+        x, y, theta = (float(v) for v in circle.plan(pose, 30, 0.1, 0.7 * index)[9])
+        speed, turn = arc_to(SE2(x, y, theta), 1.0)
+        pose = pose @ SE2(speed * 0.1 * math.cos(turn * 0.05), speed * 0.1 * math.sin(turn * 0.05), turn * 0.1)
+        radii.append(math.hypot(pose.x_m, pose.y_m))
+    assert max(radii) < 1.6 and all(0.7 < radius < 1.3 for radius in radii[200:])
+
+
+def test_the_plan_is_never_the_same_twice() -> None:
+    pose = SE2(circle.RADIUS_M, 0.0, math.pi / 2)
+    plans = {circle.plan(pose, 30, 0.1, 0.7 * index).tobytes() for index in range(20)}
+    assert len(plans) == 20
+
+
+def test_an_unfinished_line_waits_for_its_end(tmp_path: Path) -> None:
+    path, line = tmp_path / "t", b'{"a": 1}\n'
+    tail = Tail(path)
+    assert tail.lines() == []
+    path.write_bytes(line + b'{"b"')
+    assert tail.lines() == [{"a": 1}] and tail.lines() == []
+    path.write_bytes(line + b'{"b": 2}\n')
+    assert tail.lines() == [{"b": 2}]
+
+
+def test_a_stranger_on_the_bus_can_be_left_out(tmp_path: Path) -> None:
+    lines = [{"t_ns": t, "source": s, "api_id": 1008, "velocity": [0.1, 0, 0]} for t, s in ((1, 0), (2, 1), (3, 0))]
+    (tmp_path / "heard").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    hearing = Hearing(tmp_path / "heard")
+    assert hearing.sources() == {0, 1} and [one.t_ns for one in hearing.since(2)] == [2, 3]
+
+
+@pytest.fixture
+def switched(tmp_path: Path):
+    switches = Switches(tmp_path / "s", ["one", "two"])
+    with FaultClient(tmp_path / "s", tmp_path / "c") as client:
+        yield switches, client
+
+
+def test_a_fault_inside_strikes_when_its_code_runs(switched) -> None:
+    switches, client = switched
+    client.ask("one", seconds_s=2.0)
+    with pytest.raises(FaultError, match="no effect"):
+        client.effect_ns("one", 0.1)
+    assert switches.hit("two") is None and switches.hit("one") == {"seconds_s": 2.0}
+    assert client.effect_ns("one", 1.0) > 0
+    client.inject("one", on=False)
+    assert switches.hit("one") is None
+
+
+def test_the_third_time_may_be_what_counts(switched) -> None:
+    switches, client = switched
+    client.ask("one", after=3)
+    with pytest.raises(FaultError, match="no effect"):
+        client.effect_ns("one", 0.1)
+    hits = [switches.hit("one") for _ in range(3)]
+    assert hits == [{}] * 3 and client.effect_ns("one", 1.0) > 0
+
+
+def test_a_fault_that_nobody_makes_is_refused(switched) -> None:
+    with pytest.raises(FaultError, match="refused"):
+        switched[1].inject("three")
+
+
+def test_without_a_runner_there_is_nobody_to_ask(tmp_path: Path) -> None:
+    with FaultClient(tmp_path / "nobody", tmp_path / "c") as client, pytest.raises(FaultError, match="nobody takes"):
+        client.inject("one")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--rows", "rain", "--list"], ["--per-row", "0", "--list"], ["--artifacts", "nowhere"], []]
+)
+def test_bad_arguments_are_refused_in_one_line(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*arguments, "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+class Hindered:
+    """A rig whose robot does not drive on, the first `times`."""
+
+    def __init__(self, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.left = times
+        monkeypatch.setattr(command, "injection", self.injection)
+
+    def injection(self, *_: object) -> Sample:
+        self.left -= 1
+        return Sample(100.0, 0.0, hindered=["did not drive on"] if self.left >= 0 else [])
+
+
+@pytest.mark.parametrize(("times", "repeated", "passes"), [(0, 0, True), (1, 1, True), (2, 1, False)])
+def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
+    times: int, repeated: int, passes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Hindered(times, monkeypatch)
+    result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
+    assert result.repeated == repeated and (not result.problems) == passes
+    assert len(result.samples) == 1 + repeated

@@ -1,0 +1,85 @@
+"""Disturbances come in bursts and are told apart; in DAgger whole stretches are the expert's."""
+
+from __future__ import annotations
+
+import itertools
+from math import isclose
+
+import numpy as np
+import pytest
+
+from tools.train.collect.steering import NoiseLook, Shared, SteeringNoise, Velocity
+from tools.train.drives.drive import EXPERT, NOISE, POLICY
+
+WANTED: Velocity = (0.7, 0.0, 0.1)
+POLICYS: Velocity = (0.2, 0.0, -0.4)
+
+
+def _bursts(seed: int, ticks: int = 3000) -> list[tuple[Velocity, int]]:
+    noise = SteeringNoise(np.random.default_rng(seed))
+    return [noise.command(WANTED) for _ in range(ticks)]
+
+
+def _runs(by: list[int]) -> list[tuple[int, int]]:
+    """(who, ticks) of each stretch, without the first and the last, which are cut off."""
+    return [(who, len(list(group))) for who, group in itertools.groupby(by)][1:-1]
+
+
+def test_outside_a_burst_the_experts_command_is_not_touched() -> None:
+    assert all(command == WANTED for command, by in _bursts(1) if by == EXPERT)
+
+
+def test_bursts_and_pauses_last_as_long_as_they_should() -> None:
+    look = NoiseLook()
+    runs = _runs([by for _, by in _bursts(2)])
+    bursts, pauses = ([ticks / 10 for who, ticks in runs if who == kind] for kind in (NOISE, EXPERT))
+    assert len(bursts) > 20
+    assert look.burst_s[0] <= min(bursts) and max(bursts) <= look.burst_s[1]
+    assert look.pause_s[0] - 0.2 <= min(pauses) and max(pauses) <= look.pause_s[1]
+
+
+def test_a_burst_is_one_drifting_push_and_not_a_new_one_each_time() -> None:
+    pairs = [
+        (one[0][2] - 0.1, other[0][2] - 0.1)
+        for one, other in itertools.pairwise(_bursts(3))
+        if one[1] == other[1] == NOISE
+    ]
+    first, second = np.array(pairs).T
+    assert np.corrcoef(first, second)[0, 1] > 0.6
+    assert 0.3 < np.std(first) < 0.8
+
+
+def test_nothing_is_commanded_beyond_what_a_robot_may_do() -> None:
+    commands = [command for command, _ in _bursts(4)]
+    assert all(-0.3 <= vx <= 1.1 and abs(wz) <= 1.2 for vx, _, wz in commands)
+
+
+def test_the_same_seed_disturbs_alike_and_another_does_not() -> None:
+    assert _bursts(5) == _bursts(5) != _bursts(6)
+
+
+def _shared(beta: float, ticks: int = 4000) -> list[tuple[Velocity, int]]:
+    shared = Shared(np.random.default_rng(1), beta)
+    return [shared.command(WANTED, POLICYS) for _ in range(ticks)]
+
+
+def test_what_is_commanded_is_whose_it_is_said_to_be() -> None:
+    assert set(_shared(0.5)) == {(WANTED, EXPERT), (POLICYS, POLICY)}
+
+
+@pytest.mark.parametrize(("beta", "who"), [(0.0, POLICY), (1.0, EXPERT)])
+def test_with_the_chance_nought_or_one_only_one_drives(beta: float, who: int) -> None:
+    assert {by for _, by in _shared(beta)} == {who}
+
+
+def test_the_experts_share_is_about_its_chance() -> None:
+    assert isclose(np.mean([by == EXPERT for _, by in _shared(0.3, 20_000)]), 0.3, abs_tol=0.06)
+
+
+def test_nobody_drives_for_less_than_two_seconds() -> None:
+    assert min(ticks for _, ticks in _runs([by for _, by in _shared(0.5)])) >= 20
+
+
+def test_a_chance_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 to 1"):
+        Shared(np.random.default_rng(1), 1.5)

@@ -1,0 +1,128 @@
+"""Recipes: strict tables of numbers, settings on top of them, and the paper's variants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+
+from export.model.config import PRESETS
+from sim_hil.benchmark.conditions.variants import VARIANTS as BENCHMARK_VARIANTS
+from tools.train.config.collect import DaggerConfig
+from tools.train.config.recipe import Recipe, RecipeError, filled, load_recipe, recipe_names, recipe_of, stage_seed
+from tools.train.config.variants import VARIANTS
+
+NANO = PRESETS["nano"]
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_recipe_survives_being_written_down(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    path = tmp_path / "recipe.toml"
+    path.write_text(recipe.to_toml())
+    assert load_recipe(str(path)) == recipe
+
+
+def test_the_shipped_recipes_train_the_shipped_networks() -> None:
+    assert load_recipe("nano").model == NANO and load_recipe("1b").model == PRESETS["1b"]
+
+
+def test_a_setting_changes_one_number_of_a_stage_and_leaves_its_neighbours() -> None:
+    plain, changed = load_recipe("nano"), load_recipe("nano", ["sft.optim.lr=0.5", "seed=3", "dagger.rounds=0"])
+    assert plain.sft is not None and changed.sft is not None
+    assert changed.sft == replace(plain.sft, optim=replace(plain.sft.optim, lr=0.5))
+    assert changed.seed == 3 and changed.dagger.rounds == 0 and changed.rl == plain.rl
+
+
+def test_a_setting_may_change_the_network() -> None:
+    changed = load_recipe("nano", ["model.action.latency_aware=false"]).model
+    assert changed == replace(NANO, action=replace(NANO.action, latency_aware=False))
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("sft.epoch=3", "did you mean epochs"),
+        ("stf.epochs=3", "did you mean sft"),
+        ("sft.epochs=many", "a whole number"),
+        ("sft.epochs", "KEY=VALUE"),
+        ("sft=3", "STAGE.field"),
+        ("model.action.layer=3", "not a number of the model"),
+        ("sft.epochs=0", r"\[sft\]"),
+        ("seed=-1", "seed from 0"),
+    ],
+)
+def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says: str) -> None:
+    with pytest.raises(RecipeError, match=says) as caught:
+        load_recipe("nano", [setting])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("schema = 2", "schema = 1"),
+        ('schema = 1\nname = "a"\nseed = 1', "table \\[model\\]"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\nlayers = 3', "unknown key 'layers'"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sfd]', "unknown key 'sfd'"),
+        ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sft]\nepoch = 1', "unknown key 'epoch'"),
+        ('schema = 1\nname = "a"\nseed = "b"\n[model]\npreset = "nano"', "seed, a whole number"),
+        ("schema =", "recipe.toml"),
+    ],
+)
+def test_a_wrong_recipe_is_one_clear_line(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=says) as caught:
+        load_recipe(str(path))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["nono", "nowhere.toml", "recipe.json"])
+def test_a_recipe_that_is_not_there_is_said(name: str) -> None:
+    with pytest.raises(RecipeError, match=name):
+        load_recipe(name)
+
+
+@dataclass(frozen=True)
+class Inner:
+    a: int = 1
+    b: int = 2
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=lambda: Inner(a=5))
+    c: int = 3
+
+
+def test_a_nested_table_is_filled_with_its_own_defaults() -> None:
+    assert filled(Outer(), {"inner": {"b": 7}}) == {"inner": {"a": 5, "b": 7}, "c": 3}
+
+
+def test_stages_have_seeds_of_their_own_that_follow_from_the_runs() -> None:
+    recipe = Recipe("r", 1, NANO)
+    seeds = {stage_seed(recipe, stage) for stage in ("collect", "sft", "imitate")}
+    assert len(seeds) == 3 and stage_seed(replace(recipe, name="other"), "sft") in seeds
+    assert stage_seed(replace(recipe, seed=2), "sft") not in seeds
+
+
+def test_dagger_asks_for_something_that_can_be_done() -> None:
+    with pytest.raises(ValueError, match="rounds"):
+        DaggerConfig(rounds=-1)
+    with pytest.raises(RecipeError):
+        recipe_of({"schema": 1, "name": "", "seed": 1, "model": {"preset": "nano"}})
+
+
+def test_a_variant_of_the_benchmark_is_trained_as_the_benchmark_checks_it() -> None:
+    fields = {"head", "layers", "latency_aware", "motion_offset", "semantic_interface"}
+    for name, wanted in BENCHMARK_VARIANTS.items():
+        action = load_recipe("nano", VARIANTS[name]).model.action
+        assert {key: getattr(action, key) for key in fields} == {key: wanted[key] for key in fields}
+        assert action.steps * action.step_s == pytest.approx(wanted["horizon_s"])
+
+
+@pytest.mark.parametrize("name", sorted(set(VARIANTS) - {"full"}))
+def test_every_variant_changes_something(name: str) -> None:
+    assert load_recipe("nano", VARIANTS[name]) != load_recipe("nano")

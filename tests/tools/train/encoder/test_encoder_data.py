@@ -1,0 +1,216 @@
+"""Pictures are taken where no drive is recorded, are the same whenever they are made, and go on where they ended."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from export.core.typed import plain
+from sim_hil.layouts import is_reserved
+from tools.train.config.encoder import MOST_SCENES, FramesConfig
+from tools.train.encoder.data import (
+    FIRST_LAYOUT,
+    FramesError,
+    FrameSet,
+    Shard,
+    fill,
+    finish,
+    frames_sha256,
+    made,
+    path_of,
+    plan,
+)
+from tools.train.encoder.labels import CLASSES, LANDMARK, PERSON, label_shapes
+from tools.train.encoder.worker import render
+from tools.train.run.job import QuietProgress
+from tools.train.scenes import scenarios
+
+SMALL = FramesConfig(count=24, held=0, per_scene=12, kinds=("corridor",), people_indoors=8, moment=4, jobs=2)
+
+
+def never() -> bool:
+    return False
+
+
+class Counted(QuietProgress):
+    """Remembers how far it was."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[int, int]] = []
+
+    def update(self, done: int, total: int, **numbers: float) -> None:
+        self.seen.append((done, total))
+
+
+@pytest.fixture(scope="module")
+def shards() -> list[Shard]:
+    return [dataclasses.replace(shard, people=8) for shard in plan(SMALL, 3, 8)]
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory, shards: list[Shard]) -> Path:
+    """Two shards, made by two processes."""
+    folder = tmp_path_factory.mktemp("frames")
+    fill(folder, shards, 2, QuietProgress(), never)
+    return folder
+
+
+def test_a_plan_has_as_many_pictures_as_were_asked_for() -> None:
+    shards = plan(FramesConfig(count=2_500, held=700, per_scene=1_000), 1, 8)
+    assert sum(shard.frames for shard in shards if not shard.held) == 2_500
+    assert sum(shard.frames for shard in shards if shard.held) == 700
+    assert max(shard.frames for shard in shards) == 1_000
+
+
+def test_held_out_layouts_are_never_learned_from_however_often_one_is_tried_again() -> None:
+    shards = plan(FramesConfig(count=300_000, held=20_000), 4, 8)
+    tried: dict[bool, set[int]] = {False: set(), True: set()}
+    for shard in shards:
+        tried[shard.held] |= {shard.layout_seed + attempt * MOST_SCENES for attempt in range(8)}
+    assert tried[True] and tried[False] and not tried[True] & tried[False]
+
+
+def test_no_layout_is_the_benchmarks_or_one_that_drives_are_recorded_in() -> None:
+    highest = scenarios.RESERVED_BELOW + (scenarios.MAX_SEED + 1) * scenarios._LAYOUT_TRIES * scenarios._GROUPS
+    for seed in (0, 1, 999, 2**31 - 1):
+        for shard in plan(FramesConfig(count=3_000, held=500), seed, 8):
+            assert shard.layout_seed >= FIRST_LAYOUT > highest and not is_reserved(shard.layout_seed)
+
+
+def test_the_corridor_is_learned_from_as_it_is_and_changed_but_never_held_out() -> None:
+    shards = plan(FramesConfig(count=200_000, held=20_000), 1, 8)
+    corridors = [shard for shard in shards if shard.kind == "corridor"]
+    assert not any(shard.held for shard in corridors)
+    assert {shard.layout_seed % 2 for shard in corridors} == {0, 1}
+    assert {shard.kind for shard in shards if shard.held} == {"hospital", "office", "warehouse", "sidewalk"}
+
+
+def test_both_robots_and_crowds_of_all_sizes_are_in_every_kind_of_scene() -> None:
+    shards = plan(FramesConfig(), 1, 8)
+    for kind in ("hospital", "office", "warehouse", "sidewalk"):
+        own = [shard for shard in shards if shard.kind == kind and not shard.held]
+        robots = [shard.robot for shard in own]
+        assert abs(robots.count("go2") - robots.count("carter")) <= 1
+        assert max(shard.people for shard in own) > 40
+        assert min(shard.people for shard in own) < 50
+    assert all(shard.people >= 20 for shard in shards if shard.kind == "sidewalk")
+
+
+def test_a_plan_is_the_same_again_and_another_seed_gives_another() -> None:
+    config = FramesConfig(count=5_000, held=500)
+    assert plan(config, 1, 8) == plan(config, 1, 8)
+    assert plan(config, 1, 8) != plan(config, 2, 8)
+    assert plan(dataclasses.replace(config, jobs=7), 1, 8) == plan(config, 1, 8)
+
+
+def test_more_pictures_keep_those_that_are_there() -> None:
+    few, many = (plan(FramesConfig(count=count, held=0), 1, 8) for count in (4_200, 9_000))
+    assert many[: len(few)] == few
+
+
+def test_a_shards_key_changes_with_every_number(shards: list[Shard]) -> None:
+    first = shards[0]
+    others = [
+        dataclasses.replace(first, layout_seed=first.layout_seed + 1),
+        dataclasses.replace(first, robot="carter" if first.robot == "go2" else "go2"),
+        dataclasses.replace(first, people=first.people + 1),
+        dataclasses.replace(first, side=4),
+        dataclasses.replace(first, sharp_share=0.5),
+    ]
+    assert len({first.key, *(other.key for other in others)}) == 6
+    assert Shard.of_json(plain(first)) == first
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"count": -1}, {"per_scene": 0}, {"kinds": ()}, {"kinds": ("castle",)}, {"kinds": ("corridor",)},
+        {"sharp_share": 1.5}, {"jpeg_quality_min": 101}, {"people_outdoors": 5}, {"moment": 0}, {"jobs": -1},
+        {"count": 60_000, "per_scene": 1},
+    ],
+)  # fmt: skip
+def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError):
+        FramesConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_what_processes_have_made_can_be_read_as_one_list(filled: Path, shards: list[Shard]) -> None:
+    frames = FrameSet(filled, shards)
+    assert len(frames) == 24
+    for name, (kind, shape) in label_shapes(8).items():
+        assert frames.labels[name].shape == (24, *shape) and frames.labels[name].dtype == kind
+    pictures = np.array([frames.picture(index) for index in range(24)])
+    assert pictures.shape == (24, 128, 128, 3) and pictures.dtype == np.uint8
+    assert len({picture.tobytes() for picture in pictures}) == 24
+    with pytest.raises(IndexError):
+        frames.picture(24)
+
+
+def test_pictures_show_people_and_landmarks(filled: Path, shards: list[Shard]) -> None:
+    labels = FrameSet(filled, shards).labels
+    assert (labels["rank"] == LANDMARK).any()
+    assert (labels["thing"] == CLASSES.index("wall")).any()
+    assert (labels["thing"] == PERSON).any()
+
+
+def test_the_same_shard_comes_out_alike_in_another_process(filled: Path, shards: list[Shard], tmp_path: Path) -> None:
+    assert list(render(tmp_path, shards[0]))[-1] == 12
+    name = shards[0].name
+    assert path_of(tmp_path, name).read_bytes() == path_of(filled, name).read_bytes()
+    assert made(tmp_path, shards[0]) == made(filled, shards[0])
+
+
+def test_what_is_there_is_not_made_again(filled: Path, shards: list[Shard]) -> None:
+    stamps = [path_of(filled, shard.name).stat().st_mtime_ns for shard in shards]
+    fill(filled, shards, 2, QuietProgress(), never)
+    assert [path_of(filled, shard.name).stat().st_mtime_ns for shard in shards] == stamps
+
+
+def fake(folder: Path, shard: Shard) -> None:
+    """A file that nobody looks into."""
+    path_of(folder, shard.name).write_bytes(b"pictures")
+    finish(folder, shard)
+
+
+def test_only_a_whole_file_of_the_same_numbers_counts(tmp_path: Path, shards: list[Shard]) -> None:
+    shard = shards[0]
+    assert made(tmp_path, shard) is None
+    fake(tmp_path, shard)
+    assert made(tmp_path, shard) is not None
+    assert made(tmp_path, dataclasses.replace(shard, people=shard.people + 1)) is None
+    path_of(tmp_path, shard.name).write_bytes(b"half")
+    assert made(tmp_path, shard) is None
+
+
+def test_the_hash_of_all_is_of_every_file(tmp_path: Path, shards: list[Shard]) -> None:
+    for shard in shards:
+        fake(tmp_path, shard)
+    before = frames_sha256(tmp_path, shards)
+    path_of(tmp_path, shards[1].name).write_bytes(b"PICTURES")
+    finish(tmp_path, shards[1])
+    assert frames_sha256(tmp_path, shards) != before
+    path_of(tmp_path, shards[0].name).unlink()
+    with pytest.raises(FramesError, match="missing"):
+        frames_sha256(tmp_path, shards)
+
+
+def test_making_pictures_ends_when_it_is_told_to(tmp_path: Path, shards: list[Shard]) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, shards, 1, QuietProgress(), lambda: True)
+
+
+def test_what_is_there_counts_as_done(tmp_path: Path, shards: list[Shard]) -> None:
+    for shard in shards:
+        fake(tmp_path, shard)
+    progress = Counted()
+    fill(tmp_path, shards, 1, progress, never)
+    assert progress.seen == [(24, 24)]
+
+
+def test_a_file_that_is_not_of_pictures_is_refused(tmp_path: Path, shards: list[Shard]) -> None:
+    fake(tmp_path, shards[0])
+    with pytest.raises(FramesError, match="not readable"):
+        FrameSet(tmp_path, shards[:1])

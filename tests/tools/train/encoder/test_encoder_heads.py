@@ -1,0 +1,141 @@
+"""Heads tell labels from the tokens of their own cell or column; a loss is a mean over pictures, shared out or not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tools.train.encoder.heads import WEIGHTS, Balance, EncoderHeads, as_tensors, losses, total
+from tools.train.encoder.labels import CLASSES, COLUMNS, FREE_M, LANDMARK, NONE, OCTANTS, OPENINGS, label_shapes
+
+SIDE, DIM = 4, 16
+CELLS = ("main", "thing", "colour", "facing", "near_m", "thing_m")
+BY_COLUMN = ("free_m", "open_m", "open_kind")
+
+
+def some_labels(count: int, seed: int = 1, side: int = SIDE) -> dict[str, np.ndarray]:
+    """Labels that could be: a third of the cells has a thing with a colour, a third of the columns opens."""
+    rng = np.random.default_rng(seed)
+    found = {name: np.zeros((count, *shape), kind) for name, (kind, shape) in label_shapes(side).items()}
+    cells = (count, side, side)
+    there = rng.uniform(size=cells) < 1 / 3
+    found["main"][:] = rng.integers(0, 5, cells)
+    found["thing"][:] = np.where(there, rng.integers(5, len(CLASSES), cells), found["main"])
+    found["rank"][:] = np.where(there, LANDMARK, 0)
+    found["colour"][:] = np.where(there, rng.integers(0, 5, cells), NONE)
+    found["facing"][:] = np.where(rng.uniform(size=cells) < 0.1, rng.integers(0, OCTANTS, cells), NONE)
+    found["near_m"][:] = rng.uniform(0.2, 5.0, cells)
+    found["thing_m"][:] = found["near_m"] * 1.5
+    columns = (count, COLUMNS)
+    found["open_kind"][:] = np.where(rng.uniform(size=columns) < 1 / 3, rng.integers(1, len(OPENINGS), columns), 0)
+    found["free_m"][:] = rng.uniform(0.0, FREE_M, columns)
+    found["open_m"][:] = rng.uniform(0.5, FREE_M, columns)
+    found["place"][:] = rng.integers(0, len(OPENINGS), count)
+    return found
+
+
+def perfect(labels: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Predictions that are right and sure of it."""
+    sizes = {"main": len(CLASSES), "thing": len(CLASSES), "colour": 11, "facing": OCTANTS, "open_kind": len(OPENINGS)}
+    found = {}
+    for name, size in {**sizes, "place": len(OPENINGS)}.items():
+        wanted = labels[name].clone()
+        wanted[wanted == NONE] = 0
+        found[name] = 40.0 * torch.nn.functional.one_hot(wanted, size).float()
+    found |= {name: labels[name].log() for name in ("near_m", "thing_m")}
+    return found | {name: labels[name].log1p() for name in ("free_m", "open_m")}
+
+
+@pytest.fixture(scope="module")
+def heads() -> EncoderHeads:
+    made = EncoderHeads(DIM, SIDE)
+    made.initialise(torch.Generator().manual_seed(1))
+    return made
+
+
+def tokens(count: int = 3) -> torch.Tensor:
+    return torch.randn(count, SIDE * SIDE, DIM, generator=torch.Generator().manual_seed(2))
+
+
+def costs(heads: EncoderHeads, labels: Mapping[str, Any], seen: torch.Tensor) -> dict[str, torch.Tensor]:
+    return losses(heads(seen), as_tensors(labels, "cpu"), Balance.of(some_labels(40)))
+
+
+def test_there_is_a_prediction_of_every_label_that_is_learned(heads: EncoderHeads) -> None:
+    found = heads(tokens())
+    assert set(found) == set(WEIGHTS) == set(label_shapes(SIDE)) - {"rank"}
+    for name, tensor in found.items():
+        _, shape = label_shapes(SIDE)[name]
+        assert tensor.shape[1 : 1 + len(shape)] == shape, name
+
+
+def test_a_cell_is_told_from_its_own_token_and_a_column_from_its_own_column(heads: EncoderHeads) -> None:
+    before, row, column = tokens(1), 1, 2
+    after = before.clone()
+    after[0, row * SIDE + column] += torch.linspace(-1, 1, DIM)
+    one, other = heads(before), heads(after)
+    for name in CELLS:
+        moved = (one[name] != other[name]).reshape(SIDE, SIDE, -1).any(dim=-1)
+        assert moved.nonzero().tolist() == [[row, column]], name
+    for name in BY_COLUMN:
+        moved = (one[name] != other[name]).reshape(SIDE, COLUMNS // SIDE, -1).any(dim=-1).any(dim=-1)
+        assert moved.nonzero().tolist() == [[column]], name
+
+
+def test_being_right_costs_nothing_and_being_wrong_does() -> None:
+    labels = as_tensors(some_labels(5), "cpu")
+    balance = Balance.of(some_labels(5))
+    right = losses(perfect(labels), labels, balance)
+    wrong = losses(perfect(as_tensors(some_labels(5, seed=2), "cpu")), labels, balance)
+    for name in WEIGHTS:
+        assert right[name].max() < 1e-4, name
+        assert wrong[name].mean() > 0.1, name
+
+
+def test_a_batchs_loss_is_the_mean_of_its_pictures_losses(heads: EncoderHeads) -> None:
+    labels, seen = some_labels(6), tokens(6)
+    together = total(costs(heads, labels, seen))
+    for i in range(6):
+        alone = total(costs(heads, {name: array[i : i + 1] for name, array in labels.items()}, seen[i : i + 1]))
+        assert alone[0].item() == pytest.approx(together[i].item(), rel=1e-5)
+
+
+def test_what_has_no_colour_no_heading_no_thing_or_no_opening_teaches_nothing_of_it(heads: EncoderHeads) -> None:
+    labels = some_labels(2)
+    labels["colour"][:], labels["facing"][:], labels["rank"][:], labels["open_kind"][:] = NONE, NONE, 0, 0
+    found = costs(heads, labels, tokens(2))
+    assert all(found[name].detach().abs().max() == 0.0 for name in ("colour", "facing", "thing_m", "open_m"))
+
+
+def test_rare_classes_count_more_and_all_together_count_as_one() -> None:
+    labels = some_labels(40)
+    labels["thing"][:] = np.where(np.random.default_rng(1).uniform(size=labels["thing"].shape) < 0.02, 5, 1)
+    weights = Balance.of(labels).classes["thing"]
+    shares = np.bincount(labels["thing"].ravel(), minlength=len(CLASSES)) / labels["thing"].size
+    assert weights[5] > 2 * weights[1]
+    assert float(weights @ shares) == pytest.approx(1.0, abs=0.05)
+    assert np.isfinite(weights).all() and weights.max() <= 6.0
+
+
+def test_data_without_anything_rare_can_still_be_balanced() -> None:
+    labels = {name: np.zeros((3, *shape), kind) for name, (kind, shape) in label_shapes(SIDE).items()}
+    labels["colour"][:], labels["facing"][:] = NONE, NONE
+    balance = Balance.of(labels)
+    assert all(np.isfinite(weights).all() for weights in balance.classes.values())
+    assert all(share > 0 for share in balance.shares.values())
+
+
+def test_a_seed_names_the_weights() -> None:
+    one, same, other = EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE)
+    for made, seed in ((one, 1), (same, 1), (other, 2)):
+        made.initialise(torch.Generator().manual_seed(seed))
+    assert torch.equal(one.cells.weight, same.cells.weight) and not torch.equal(one.cells.weight, other.cells.weight)
+
+
+def test_columns_that_tokens_do_not_divide_are_refused() -> None:
+    with pytest.raises(ValueError, match="divides"):
+        EncoderHeads(DIM, 7)

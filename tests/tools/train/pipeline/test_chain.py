@@ -1,0 +1,519 @@
+"""`edge-train`: which steps a command does, in which order, once each; what it says, and what it leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from edge.inference.latency_profile import LatencyProfile
+from export.checkpoint.coverage import CheckpointError
+from export.checkpoint.shipped import shipped_weights
+from export.model.config import PRESETS
+from export.model.config_file import with_overrides
+from export.model.network import build
+from export.model.weights import WeightsInfo, save_weights
+from tools.train import cli
+from tools.train.collect.collection import CollectFailedError
+from tools.train.config.collect import DaggerConfig
+from tools.train.config.recipe import Recipe, load_recipe
+from tools.train.pipeline import chain
+from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
+from tools.train.pipeline.model_card import CardError, card, ship, write_card
+from tools.train.rl.vector_env import RolloutFailedError
+from tools.train.run.exported import ExportError, export_artifacts, model_argument
+from tools.train.run.job import StageJob
+from tools.train.run.network_file import (
+    NetworkFileError,
+    finish_network,
+    import_start,
+    read_network,
+    start_network,
+    weights_before,
+)
+from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.samples.delays import Delays
+
+TINY = load_recipe("tiny")
+SCORE = {
+    "episodes": 85, "sr": 61.2, "sr_ci95": [50.0, 71.0], "spl": 55.0, "spl_ci95": [45.0, 64.0], "cr": 12.9,
+    "cr_ci95": [6.0, 21.0], "ne_m": 6.1, "ne_m_ci95": None,
+}  # fmt: skip
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> RunDir:
+    return RunDir.open(tmp_path / "run", TINY)
+
+
+def job(run_dir: RunDir, **changed: Any) -> StageJob:
+    return StageJob(recipe=TINY, run_dir=run_dir, **changed)
+
+
+def stage_that(leaves: str) -> Callable[[str], Callable[[StageJob], dict[str, Any]]]:
+    """Stages that write a file and say their name."""
+
+    def stage(name: str) -> Callable[[StageJob], dict[str, Any]]:
+        def run(given: StageJob) -> dict[str, Any]:
+            (given.run_dir.stage(name) / leaves).touch()
+            return {"stage": name, "resumed": given.resume}
+
+        return run
+
+    return stage
+
+
+# The chain
+
+
+def test_all_goes_through_every_stage_with_imitation_again_after_each_round() -> None:
+    recipe = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1))
+    assert [step.name for step in steps_of("all", recipe)] == [
+        "collect", "encoder", "sft", "imitate",
+        "dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate",
+    ]  # fmt: skip
+    silent = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1, sft_rounds=0))
+    assert [step.name for step in steps_of("dagger", silent)] == ["dagger-1", "imitate-1", "dagger-2", "imitate-2"]
+    assert [step.name for step in steps_of("sft", recipe)] == ["sft"]
+
+
+def test_a_step_is_done_once_its_result_is_there(run_dir: RunDir) -> None:
+    assert not is_done(run_dir, Step("sft"))
+    run_step(job(run_dir), Step("sft"), stage_that("weights"))
+    assert is_done(run_dir, Step("sft")) and run_dir.result("sft") == {"stage": "sft", "resumed": False}
+
+
+def test_a_stage_that_was_begun_is_neither_written_over_nor_forgotten(run_dir: RunDir) -> None:
+    (run_dir.stage("sft") / "checkpoint").touch()
+    with pytest.raises(RunDirError, match="--resume"):
+        may_begin(run_dir, Step("sft"), resume=False)
+    may_begin(run_dir, Step("sft"), resume=True)
+
+
+def test_imitation_after_a_round_begins_anew_and_keeps_what_was_before(run_dir: RunDir) -> None:
+    run_step(job(run_dir), Step("imitate"), stage_that("before"))
+    again = Step("imitate", 1)
+    assert is_done(run_dir, Step("imitate")) and not is_done(run_dir, again)
+    may_begin(run_dir, again, resume=False)
+    run_step(job(run_dir, resume=True), again, stage_that("after"))
+    assert (run_dir.out / "imitate-0" / "before").exists() and (run_dir.out / "imitate" / "after").exists()
+    assert run_dir.result("imitate") == {"stage": "imitate", "resumed": False}
+    assert is_done(run_dir, Step("imitate")) and is_done(run_dir, again)
+
+
+def test_imitation_after_a_round_that_was_stopped_goes_on_where_it_was(run_dir: RunDir) -> None:
+    run_step(job(run_dir), Step("imitate"), stage_that("before"))
+    run_dir.retire("imitate", "imitate-0")
+    (run_dir.stage("imitate") / "checkpoint").touch()
+    again = Step("imitate", 1)
+    assert is_done(run_dir, Step("imitate")) and not is_done(run_dir, again)
+    run_step(job(run_dir, resume=True), again, stage_that("after"))
+    assert run_dir.result("imitate") == {"stage": "imitate", "resumed": True}
+
+
+def test_borrowed_drives_are_not_added_to(run_dir: RunDir, tmp_path: Path) -> None:
+    other = RunDir.open(tmp_path / "other", TINY)
+    run_dir.finish("collect", {})
+    other.borrow(run_dir, ("collect",), TINY)
+    with pytest.raises(RunDirError, match=r"dagger.rounds=0"):
+        may_begin(other, Step("dagger", 1), resume=False)
+
+
+def test_a_round_needs_a_policy(run_dir: RunDir) -> None:
+    with pytest.raises(RunDirError, match="run imitate first"):
+        run_step(job(run_dir), Step("dagger", 1))
+
+
+# The network between stages
+
+
+def test_a_stage_begins_with_what_the_one_before_it_left(run_dir: RunDir) -> None:
+    first = start_network(job(run_dir), "encoder")
+    assert weights_before(run_dir.out, "sft") is None
+    with torch.no_grad():
+        next(first.language.parameters()).fill_(0.5)
+    finish_network(job(run_dir), "encoder", first)
+    second = start_network(job(run_dir), "sft")
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    assert weights_before(run_dir.out, "imitate") == run_dir.out / "encoder" / "model.safetensors"
+    assert run_dir.model_path.read_bytes() == (run_dir.out / "encoder" / "model.safetensors").read_bytes()
+
+
+def test_an_ablation_keeps_encoder_and_language_model_and_its_action_expert_is_of_the_seed(run_dir: RunDir) -> None:
+    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
+    other = with_overrides(TINY.model, {"action.layers": "2"})
+    model, seeded = read_network(path, other, 9), build(other, 9)
+    trained = build(TINY.model, 5)
+    assert all(torch.equal(a, b) for a, b in zip(model.vision.parameters(), trained.vision.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), seeded.action.parameters(), strict=True))
+
+
+DEAF = ("action.latency_aware", "action.motion_offset")
+
+
+@pytest.mark.parametrize("to", DEAF)
+def test_an_ablation_of_what_is_heard_begins_with_the_weights_of_the_whole(run_dir: RunDir, to: str) -> None:
+    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
+    model, trained = read_network(path, with_overrides(TINY.model, {to: "false"}), 9), build(TINY.model, 5)
+    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), trained.action.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("to", DEAF)
+def test_an_ablation_of_what_is_heard_goes_on_from_weights_that_heard_it(
+    run_dir: RunDir, tmp_path: Path, to: str
+) -> None:
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    deaf = replace(TINY, model=with_overrides(TINY.model, {to: "false"}))
+    import_start(run_dir.out, deaf.model, [tmp_path / "w.safetensors"], 1)
+    begun, theirs = start_network(replace(job(run_dir), recipe=deaf), "imitate"), build(TINY.model, 7)
+    assert all(torch.equal(a, b) for a, b in zip(begun.action.parameters(), theirs.action.parameters(), strict=True))
+    assert begun.config == deaf.model
+
+
+def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir, tmp_path: Path) -> None:
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    with pytest.raises(CheckpointError, match=r"action\.layers is"):
+        import_start(run_dir.out, with_overrides(TINY.model, {"action.layers": "2"}), [tmp_path / "w.safetensors"], 1)
+
+
+def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
+    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
+    with pytest.raises(NetworkFileError, match="language is not the recipe's"):
+        read_network(path, with_overrides(TINY.model, {"language.layers": "2"}), 9)
+    path.write_bytes(b"nothing")
+    with pytest.raises(NetworkFileError, match="not weights of ours"):
+        read_network(path, TINY.model, 9)
+
+
+def test_a_run_may_begin_with_weights_that_were_there(run_dir: RunDir, tmp_path: Path) -> None:
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
+    begun, theirs = start_network(job(run_dir), "encoder"), build(TINY.model, 7)
+    assert all(
+        torch.equal(a, b) for a, b in zip(begun.language.parameters(), theirs.language.parameters(), strict=True)
+    )
+
+
+NEWEST = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1, newest_only=True))
+
+
+def adopted(run_dir: RunDir, tmp_path: Path, after: str) -> list[str]:
+    """The names of what is still to be done after adopting somebody's weights there."""
+    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
+    adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
+    return [step.name for step in steps_of("all", NEWEST) if not is_done(run_dir, step)]
+
+
+def test_a_run_goes_on_from_the_weights_that_imitation_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
+    left = adopted(run_dir, tmp_path, "imitate")
+    assert left == ["dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate"]
+    policy = weights_before(run_dir.out, "rl")
+    assert policy == run_dir.out / "imitate" / "model.safetensors"
+    assert policy.read_bytes() == run_dir.model_path.read_bytes()
+
+
+def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
+    assert adopted(run_dir, tmp_path, "imitate-1") == ["dagger-2", "imitate-2", "rl", "evaluate"]
+    assert (run_dir.retired("sft"), run_dir.retired("imitate")) == (1, 1)
+    run_step(job(run_dir), Step("imitate", 2), stage_that("after"))
+    assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and run_dir.retired("imitate") == 2
+
+
+@pytest.mark.parametrize(
+    ("after", "recipe", "says"),
+    [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
+)
+def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
+    with pytest.raises(RunDirError, match=says):
+        steps_until(after, recipe, steps_of("all", recipe))
+
+
+# Export in between
+
+
+def command(tmp_path: Path, code: int, says: str = "") -> list[str]:
+    """An `edge-export` that writes down what it is asked, and ends."""
+    script = tmp_path / "export.sh"
+    lines = (
+        f'echo "$@" >> {tmp_path}/asked',
+        f'echo "{says}"',
+        'mkdir -p "${@: -1}"',
+        'touch "${@: -1}/manifest.json"',
+        f"exit {code}",
+    )
+    script.write_text("\n".join(lines) + "\n")
+    return ["bash", str(script)]
+
+
+def test_weights_are_exported_once(tmp_path: Path) -> None:
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(b"1")
+    for content, times in ((b"1", 1), (b"1", 1), (b"2", 2)):
+        weights.write_bytes(content)
+        export_artifacts(weights, PRESETS["nano"], tmp_path / "a", command=command(tmp_path, 0))
+        asked = (tmp_path / "asked").read_text().splitlines()
+        assert len(asked) == times and f"--checkpoint {weights}" in asked[-1] and "--model nano" in asked[-1]
+
+
+def test_an_export_that_fails_says_its_last_line(tmp_path: Path) -> None:
+    (tmp_path / "w").write_bytes(b"1")
+    with pytest.raises(ExportError, match="ended with 1: cosine too low"):
+        export_artifacts(
+            tmp_path / "w", PRESETS["nano"], tmp_path / "a", command=command(tmp_path, 1, "cosine too low")
+        )
+    with pytest.raises(KeyboardInterrupt):
+        export_artifacts(tmp_path / "w", PRESETS["nano"], tmp_path / "a", command=command(tmp_path, 130))
+
+
+def test_a_network_without_a_name_is_exported_by_its_numbers(tmp_path: Path) -> None:
+    written = Path(model_argument(TINY.model, tmp_path / "artifacts"))
+    assert json.loads(written.read_text())["action"]["layers"] == TINY.model.action.layers
+
+
+# The command
+
+
+@pytest.fixture
+def stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages that do nothing but leave a file."""
+    monkeypatch.setattr(chain, "module_run", stage_that("file"))
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None, capsys: Any) -> None:
+    out = tmp_path / "run"
+    assert run("collect", "--preset", "tiny", "--out", out, "--json", tmp_path / "r.json") == EXIT_DONE
+    assert run("sft", "--out", out) == EXIT_DONE
+    assert json.loads((tmp_path / "r.json").read_text())["stages"]["collect"]["stage"] == "collect"
+    assert RunDir(out).result("sft") is not None and load_recipe(str(out / "recipe.toml")) == TINY
+    assert set(RunDir(out).timings()) == {"collect", "sft"}
+    assert run("sft", "--out", out) == EXIT_DONE
+    assert "sft: done before" in capsys.readouterr().err
+
+
+def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, capsys: Any) -> None:
+    assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
+    told = capsys.readouterr()
+    assert "dagger-1" in told.err and "in all" in told.err and not (tmp_path / "run").exists()
+    assert json.loads(told.out)["budget"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("sft",), "--out is missing"),
+        (("sft", "--preset", "nono", "--out", "x"), "expected one of 1b, nano, tiny"),
+        (("sft", "--recipe", "nano", "--out", "x"), "ends in .toml"),
+        (("sft", "--recipe", "nowhere.toml", "--out", "x"), "cannot be read"),
+        (("sft", "--preset", "tiny", "--device", "tpu", "--out", "x"), "expected cpu, cuda or cuda:N"),
+        (("sft", "--preset", "tiny", "--set", "sft.epoch=1", "--out", "x"), "did you mean epochs"),
+        (("sft", "--preset", "tiny", "--scores", "f.json", "--out", "x"), "belong to card"),
+        (("imitate", "--preset", "tiny", "--delay-profile", "no.json", "--out", "x"), "cannot be read"),
+        (("imitate", "--preset", "tiny", "--after", "imitate", "--out", "x"), "expected --checkpoint with it"),
+        (("card", "--out", "x"), "the folder of a run"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(
+    arguments: tuple[str, ...], says: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == EXIT_BAD_INPUT
+    told = capsys.readouterr().err
+    assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_reinforcement_learning_needs_no_drives_before_it() -> None:
+    assert steps_until("imitate", TINY, steps_of("rl", TINY))[-1] == Step("imitate")
+    with pytest.raises(RunDirError, match="newest_only"):
+        steps_until("imitate", TINY, steps_of("dagger", TINY))
+
+
+def test_a_devices_delays_are_those_of_every_stage_that_injects_any(tmp_path: Path) -> None:
+    profile = tmp_path / "orin.json"
+    profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
+    out = tmp_path / "out"
+    recipe = cli._recipe(cli.parser().parse_args(["all", "--out", str(out), "--delay-profile", str(profile)]))
+    assert recipe.imitate is not None and recipe.rl is not None
+    assert recipe.imitate.delays.profile == recipe.rl.delay_profile
+    assert Path(recipe.rl.delay_profile).parent == out
+
+
+def test_a_run_keeps_its_own_copy_of_a_devices_delays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    profile, out = tmp_path / "orin.json", tmp_path / "out"
+    monkeypatch.setattr(chain, "module_run", stage_that("weights"))
+    asked = ("imitate", "--preset", "tiny", "--out", out, "--delay-profile", profile)
+    profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
+    assert run(*asked) == EXIT_DONE
+    profile.write_text(json.dumps(LatencyProfile.constant(5.0).as_json()))
+    imitation = load_recipe(str(out / "recipe.toml")).imitate
+    assert imitation is not None and Delays.of(imitation.delays).mean_s == pytest.approx(3.0, abs=0.1)
+    assert run(*asked, "--resume") == EXIT_BAD_INPUT
+    assert "begun with other numbers (imitate.delays.profile" in capsys.readouterr().err
+
+
+def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[str, Any]]]:
+    def stage(_name: str) -> Callable[[StageJob], dict[str, Any]]:
+        def fail(_job: StageJob) -> dict[str, Any]:
+            raise error
+
+        return fail
+
+    return stage
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (KeyboardInterrupt(), EXIT_INTERRUPTED),
+        (ExportError("a gate failed"), EXIT_CHECK_FAILED),
+        (CollectFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (RolloutFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (RunDirError("no such drive"), EXIT_BAD_INPUT),
+        (OSError("the disk is full"), EXIT_BAD_INPUT),
+    ],
+)
+def test_a_stage_that_cannot_go_on_ends_with_its_code_and_a_line(
+    error: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(chain, "module_run", raising(error))
+    assert run("sft", "--preset", "tiny", "--out", tmp_path / "run") == code
+    assert "Traceback" not in capsys.readouterr().err and RunDir(tmp_path / "run").result("sft") is None
+
+
+def test_a_bug_is_not_dressed_up_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chain, "module_run", raising(ValueError("shapes do not match")))
+    with pytest.raises(ValueError, match="shapes"):
+        run("sft", "--preset", "tiny", "--out", tmp_path / "run")
+
+
+def test_torchrun_is_for_stages_that_share_batches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    from contextlib import nullcontext
+
+    from tools.train.run.distributed import Ranks
+
+    monkeypatch.setattr(cli, "ranks_of_environment", lambda _device: nullcontext(Ranks(0, 2)))
+    assert run("collect", "--preset", "tiny", "--out", tmp_path / "run") == EXIT_BAD_INPUT
+    assert "torchrun is for encoder, sft, imitate" in capsys.readouterr().err
+
+
+# Model card, and what is given away
+
+
+@pytest.fixture
+def trained(run_dir: RunDir) -> RunDir:
+    finish_network(job(run_dir), "imitate", build(TINY.model, 1))
+    run_dir.finish("imitate", {"loss": 0.25, "steps": 10})
+    run_dir.finish("collect", {"drives": 8, "sha256": "ab12"})
+    run_dir.finish("evaluate", {"latency_s": 2.0, "summary": {**SCORE, "episodes": 60}})
+    return run_dir
+
+
+def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, tmp_path: Path) -> None:
+    scores = tmp_path / "result.json"
+    conditions = {"clock": "lockstep", "mode": "async", "drift": "none"}
+    latency = {"profile": "2 s"}
+    content = {"suite": "dynanav", "conditions": conditions, "summary": SCORE, "latency": latency, "trained": True}
+    scores.write_text(json.dumps(content))
+    text = write_card(trained, TINY, [scores]).read_text()
+    for part in (
+        "SHA-256", "| language model |", "dynanav, lockstep, async, latency 2 s", "61.2 (50.0 to 71.0)", "| 60 |",
+        "* sha256: ab12", "* loss: 0.25", f"Seed {TINY.seed}", "## Limits", "Apache-2.0", "torch 2.",
+    ):  # fmt: skip
+        assert part in text
+    assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
+
+
+def test_without_weights_there_is_no_card(run_dir: RunDir) -> None:
+    with pytest.raises(CardError, match="train first"):
+        write_card(run_dir, TINY)
+
+
+def test_scores_of_something_else_are_refused(trained: RunDir, tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(CardError, match=r"result.json of edge-bench"):
+        write_card(trained, TINY, [tmp_path / "other.json"])
+
+
+def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_network(
+    trained: RunDir, tmp_path: Path
+) -> None:
+    path = ship(trained, TINY, tmp_path / "weights")
+    assert path.stat().st_size < 0.55 * trained.model_path.stat().st_size
+    assert shipped_weights(TINY.model, tmp_path / "weights") == path and path.with_suffix(".md").is_file()
+    assert shipped_weights(with_overrides(TINY.model, {"action.layers": "2"}), tmp_path / "weights") is None
+    assert shipped_weights(TINY.model, tmp_path / "nothing") is None
+
+
+def test_what_is_given_away_has_every_number_beside_it(trained: RunDir, tmp_path: Path) -> None:
+    path = ship(trained, TINY, tmp_path / "weights")
+    assert load_recipe(str(path.with_suffix(".recipe.toml"))) == TINY
+
+
+def test_the_card_of_an_ablation_says_that_it_is_one_of_another_run(trained: RunDir, tmp_path: Path) -> None:
+    ablation = RunDir.open(tmp_path / "ablation", TINY)
+    trained.finish("collect", {})
+    ablation.borrow(trained, ("collect",), TINY)
+    assert "--recipe recipe.toml --from RUN`" in card(ablation, TINY, trained.model_path)
+    assert "--from" not in card(trained, TINY, trained.model_path)
+
+
+def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
+    first = ship(trained, TINY, tmp_path / "weights")
+    for number, after in enumerate(("imitate", "imitate-1")):
+        run_dir = RunDir.open(tmp_path / f"more{number}", NEWEST)
+        import_start(run_dir.out, TINY.model, [first], 1)
+        adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
+        run_dir.finish("rl", {"iterations": 20 + number})
+        text = card(run_dir, NEWEST, run_dir.model_path)
+        first = ship(run_dir, NEWEST, tmp_path / f"weights{number}")
+    assert "--checkpoint WEIGHTS --after imitate-1`" in text and "adopted" not in text
+    assert text.count("ab12") == 1 and "No weights of anybody else are in it." in text
+    parts = (
+        "* iterations: 21",
+        "## What it went on from",
+        "* iterations: 20",
+        "### What it went on from",
+        "* loss: 0.25",
+    )
+    assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
+
+
+def test_a_runs_own_card_is_found_beside_its_weights(trained: RunDir, tmp_path: Path) -> None:
+    write_card(trained, TINY)
+    more = RunDir.open(tmp_path / "more", TINY)
+    import_start(more.out, TINY.model, [trained.model_path], 1)
+    text = card(more, TINY, more.out / "start" / "model.safetensors")
+    assert "## What it went on from" in text and "ab12" in text and "recipe.toml --checkpoint WEIGHTS`" in text
+
+
+@pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
+def test_weights_without_a_card_of_their_own_are_those_of_others(
+    run_dir: RunDir, tmp_path: Path, text: bytes | None
+) -> None:
+    if text is not None:
+        (tmp_path / "w.md").write_bytes(text)
+    adopted(run_dir, tmp_path, "imitate")
+    assert "weights of others" in card(run_dir, NEWEST, run_dir.model_path)
+
+
+def test_weights_of_others_stay_those_of_others(run_dir: RunDir, tmp_path: Path) -> None:
+    adopted(run_dir, tmp_path, "imitate")
+    run_dir.finish("imitate", {"loss": 0.5})
+    more = RunDir.open(tmp_path / "more", NEWEST)
+    import_start(more.out, TINY.model, [ship(run_dir, NEWEST, tmp_path / "weights")], 1)
+    text = card(more, NEWEST, more.out / "start" / "model.safetensors")
+    assert "weights of others" in text and "No weights of anybody else" not in text

@@ -1,0 +1,215 @@
+"""Only the end of the action expert is trained, and what is kept of its beginning gives the same commands."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from export.model.config import TicVlaConfig
+from export.model.network import TicVla, build
+from tests.support.train.train_drives import tiny_model
+from tools.train.config.rl import PpoConfig
+from tools.train.rl import rollout
+from tools.train.rl.action_tail import (
+    ActionTailError,
+    check_tail,
+    freeze_all_but_tail,
+    load_tail,
+    now_of,
+    padded,
+    prefix,
+    semantic_of,
+    tail,
+    tail_parameters,
+)
+from tools.train.rl.command_policy import CommandLimits, command_mean
+from tools.train.rl.learners import TailLearner
+from tools.train.rl.ppo import PpoOptimiser
+from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps
+
+LIMITS = CommandLimits(1.0, 1.0)
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _config() -> TicVlaConfig:
+    tiny = tiny_model()
+    return dataclasses.replace(tiny, action=dataclasses.replace(tiny.action, layers=3))
+
+
+def _network(seed: int = 0) -> TicVla:
+    network = build(_config(), seed).eval()
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():  # away from a head that says the same whatever it sees
+        network.action.out.weight.normal_(0.0, 0.05, generator=generator)
+    return network
+
+
+def _random(*shape: int, seed: int = 1) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _whole(network: TicVla, visual: torch.Tensor, state: torch.Tensor, latency: torch.Tensor, kv: torch.Tensor):
+    with torch.no_grad():
+        return network.action(visual, state, latency, *network.action.context(kv))
+
+
+def test_prefix_and_tail_are_the_whole_expert() -> None:
+    network = _network()
+    c = network.config
+    visual, kv = _random(1, c.vision.tokens, c.vision.token_dim), _random(1, 11, c.kv_dim, seed=2)
+    state, latency = _random(1, 3, seed=3), _random(1, 4, seed=4)
+    expert = network.action
+    now, semantic = now_of(expert, visual, state, latency), semantic_of(expert, kv)
+    with torch.no_grad():
+        found = tail(expert, prefix(expert, now, semantic), now, semantic)
+    assert torch.allclose(found, _whole(network, visual, state, latency, kv), atol=1e-5)
+
+
+def test_padding_changes_nothing() -> None:
+    network = _network()
+    c, expert = network.config, network.action
+    visual = _random(2, c.vision.tokens, c.vision.token_dim)
+    state, latency = _random(2, 3, seed=3), _random(2, 4, seed=4)
+    semantics = [semantic_of(expert, _random(1, length, c.kv_dim, seed=length))[0] for length in (5, 9)]
+    now = now_of(expert, visual, state, latency)
+    x = torch.cat([prefix(expert, now[i : i + 1], semantics[i][None]) for i in range(2)])
+    tokens, real = padded(semantics)
+    with torch.no_grad():
+        together = tail(expert, x, now, tokens, real)
+        alone = [tail(expert, x[i : i + 1], now[i : i + 1], semantics[i][None]) for i in range(2)]
+    assert torch.allclose(together, torch.cat(alone), atol=1e-5)
+
+
+def test_the_last_layer_and_the_head_alone_are_trained() -> None:
+    network = _network()
+    freeze_all_but_tail(network.action)
+    trained = {name for name, each in network.action.named_parameters() if each.requires_grad}
+    assert trained == set(tail_parameters(network.action))
+    assert all(name.startswith(("layers.2.", "key_values.2.", "norm.", "head.", "out.")) for name in trained)
+
+
+def test_another_networks_tail_is_refused() -> None:
+    network = _network()
+    tensors = {name: each.detach().clone() for name, each in tail_parameters(network.action).items()}
+    load_tail(network.action, tensors)
+    tensors.pop("out.bias")
+    with pytest.raises(ActionTailError, match=r"out\.bias is missing"):
+        load_tail(network.action, tensors)
+
+
+def test_an_expert_guided_by_waypoints_is_refused() -> None:
+    tiny = _config()
+    config = dataclasses.replace(tiny, action=dataclasses.replace(tiny.action, semantic_interface="waypoints"))
+    with pytest.raises(ActionTailError, match="waypoints"):
+        check_tail(build(config, 0).action)
+
+
+def _episode(network: TicVla, steps: int, seed: int, *, reward: float = 0.1) -> tuple[EpisodeSteps, EpisodeEnd]:
+    """Made-up steps whose frozen parts are the network's own; two generations of different lengths."""
+    c, expert = network.config, network.action
+    kept = EpisodeSteps()
+    kept.semantic = [
+        semantic_of(expert, _random(1, length, c.kv_dim, seed=seed + length))[0].numpy() for length in (4, 7)
+    ]
+    for step in range(steps):
+        visual = _random(1, c.vision.tokens, c.vision.token_dim, seed=1000 * seed + step)
+        state, latency, number = (0.5, 0.0, 0.1), (1.0, 0.2, 0.0, 0.1), int(step >= steps // 2)
+        now = now_of(expert, visual, torch.tensor([state]), torch.tensor([latency]))
+        kept.visual.append(visual[0].numpy())
+        kept.queries.append(prefix(expert, now, torch.from_numpy(kept.semantic[number])[None])[0].numpy())
+        kept.state.append(state)
+        kept.latency.append(latency)
+        kept.goal.append((0.5, 0.1))
+        kept.action.append((0.4, 0.05 * step))
+        kept.reward.append(reward * step)
+        kept.generation.append(number)
+    end = EpisodeEnd(f"e{seed}", "office", 0, steps, "timeout", False, False, False, 1.0, 0.0, 0.1 * steps)
+    return kept, end
+
+
+def _rollout(network: TicVla, folder: Path) -> rollout.Rollout:
+    empty = EpisodeSteps(), EpisodeEnd("none", "office", 0, 0, "stuck", False, False, False, 0.0, 0.0, 15.0)
+    rollout.save(folder / "0.safetensors", [_episode(network, 6, 1), empty])
+    rollout.save(folder / "1.safetensors", [_episode(network, 4, 2)])
+    return rollout.read([folder / "0.safetensors", folder / "1.safetensors"])
+
+
+def test_a_rollout_is_read_as_it_was_driven(tmp_path: Path) -> None:
+    network = _network()
+    found = _rollout(network, tmp_path)
+    assert [end.id for end in found.ends] == ["e1", "none", "e2"]
+    assert [(steps.start, steps.stop, number) for steps, number, _ in found.episodes()] == [(0, 6, 0), (6, 10, 1)]
+    assert found.arrays["generation"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3]
+    assert [len(each) for each in found.semantic] == [4, 7, 4, 7]
+    assert np.array_equal(found.arrays["visual"][6], _episode(network, 4, 2)[0].visual[0])
+
+
+def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "0.safetensors"
+    path.write_bytes(b"half")
+    with pytest.raises(rollout.RolloutError, match="not whole"):
+        rollout.read([path])
+
+
+def test_the_learner_commands_what_the_whole_expert_would(tmp_path: Path) -> None:
+    network = _network()
+    learner = TailLearner(network, LIMITS, (-1.0, -1.0))
+    found = _rollout(network, tmp_path)
+    learner.take(found)
+    rows = torch.tensor([0, 5, 9])
+    t = {name: torch.from_numpy(array)[rows] for name, array in found.arrays.items() if len(array) == found.steps}
+    expert = network.action
+    for i, row in enumerate(rows.tolist()):
+        semantic = torch.from_numpy(found.semantic[int(found.arrays["generation"][row])])[None]
+        now = now_of(expert, t["visual"][i : i + 1], t["state"][i : i + 1], t["latency"][i : i + 1])
+        with torch.no_grad():
+            whole = tail(expert, prefix(expert, now, semantic), now, semantic)
+            wanted = command_mean(whole, 0.1, LIMITS)
+            assert torch.allclose(learner.means(rows)[i], wanted[0], atol=1e-5)
+
+
+def test_an_update_moves_the_tail_and_the_value_and_nothing_else(tmp_path: Path) -> None:
+    network = _network()
+    before = {name: each.detach().clone() for name, each in network.named_parameters()}
+    learner = TailLearner(network, LIMITS, (-1.0, -1.0))
+    learner.take(_rollout(network, tmp_path))
+    found = learner.estimates(gamma=0.99, lam=0.95, reward_scale=1.0)
+    config = PpoConfig(batch=5, epochs=2, action_lr=1e-3)
+    generator = torch.Generator().manual_seed(0)
+    PpoOptimiser(learner, config).update(learner, found.advantages, found.returns, generator)
+    moved = {name for name, each in network.named_parameters() if not torch.equal(each, before[name])}
+    trained = {f"action.{name}" for name in tail_parameters(network.action)}
+    assert moved <= trained | {name for name in before if name.startswith("value.")}
+    assert {"action.out.weight", "value.head.0.weight"} <= moved
+
+
+def test_a_penalty_on_leaving_the_imitated_commands_is_zero_where_nothing_has_moved(tmp_path: Path) -> None:
+    network = _network()
+    learner = TailLearner(network, LIMITS, (-1.0, -1.0), imitation=1.0)
+    learner.take(_rollout(network, tmp_path))
+    assert float(learner.act(torch.arange(4))[2].detach()) == 0.0
+    with torch.no_grad():
+        network.action.out.bias += 0.01
+    assert float(learner.act(torch.arange(4))[2].detach()) > 0.0
+
+
+def test_a_plan_that_leaves_beyond_the_limits_pays_though_its_command_is_the_same(tmp_path: Path) -> None:
+    network = _network()
+    with torch.no_grad():  # straight ahead, faster than the robot can
+        network.action.out.weight.zero_()
+        network.action.out.bias.copy_(torch.tensor([0.3, 0.0, 0.0]).repeat(len(network.action.out.bias) // 3))
+    learner = TailLearner(network, LIMITS, (-1.0, -1.0), imitation=1.0)
+    learner.take(_rollout(network, tmp_path))
+    rows = torch.arange(4)
+    with torch.no_grad():
+        before, asked = learner.means(rows), learner.arcs(rows)
+        assert float(asked[:, 0].min()) > LIMITS.vx_max_mps
+        network.action.out.bias *= 2.0
+        assert torch.allclose(learner.means(rows), before, atol=1e-5)
+    assert float(learner.act(rows)[2].detach()) > 0.0

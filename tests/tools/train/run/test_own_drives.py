@@ -1,0 +1,133 @@
+"""A run that learns from drives recorded elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.train.training_drives import dataset, drive
+from tools.train import cli
+from tools.train.config.recipe import load_recipe
+from tools.train.drives.drive import Dataset, DriveError
+from tools.train.pipeline.model_card import card
+from tools.train.run import own_drives
+from tools.train.run.network_file import START, import_start
+from tools.train.run.own_drives import take_drives
+from tools.train.run.run_dir import RunDir, RunDirError
+
+TINY = load_recipe("tiny")
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Dataset:
+    return dataset(tmp_path / "theirs", drive("a"), drive("b"))
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> RunDir:
+    return RunDir.open(tmp_path / "run", TINY)
+
+
+def test_their_drives_are_the_runs_and_nothing_is_collected(run_dir: RunDir, theirs: Dataset) -> None:
+    take_drives(run_dir, theirs.folder)
+    assert Dataset.open(run_dir.out / "collect", verify=True).sha256 == theirs.sha256
+    assert run_dir.result("collect") is not None
+
+
+def test_their_folder_stays_as_it_is(run_dir: RunDir, theirs: Dataset) -> None:
+    before = {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()}
+    take_drives(run_dir, theirs.folder)
+    drive("a", 80).save(Dataset.open(run_dir.out / "collect").path("a"))
+    assert {path: path.read_bytes() for path in theirs.folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_second_call_changes_nothing(run_dir: RunDir, theirs: Dataset) -> None:
+    assert take_drives(run_dir, theirs.folder) == take_drives(run_dir, theirs.folder)
+
+
+def test_a_run_that_has_collected_takes_no_others(run_dir: RunDir, theirs: Dataset) -> None:
+    (run_dir.stage("collect") / "index.jsonl").write_text("")
+    with pytest.raises(RunDirError, match="has drives that are others"):
+        take_drives(run_dir, theirs.folder)
+
+
+def test_a_run_takes_one_data_set_only(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
+    take_drives(run_dir, theirs.folder)
+    with pytest.raises(RunDirError, match="has drives that are others"):
+        take_drives(run_dir, dataset(tmp_path / "more", drive("c")).folder)
+
+
+def test_an_interrupted_call_leaves_no_drives_and_can_be_repeated(
+    run_dir: RunDir, theirs: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(source: Path, target: Path) -> None:
+        if source.stem == "b":
+            raise KeyboardInterrupt
+        own_drives.shutil.copyfile(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(own_drives, "_link_or_copy", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            take_drives(run_dir, theirs.folder)
+    assert not run_dir.begun("collect")
+    take_drives(run_dir, theirs.folder)
+    assert Dataset.open(run_dir.out / "collect", verify=True).ids == ("a", "b")
+
+
+def test_links_among_their_files_are_followed(run_dir: RunDir, theirs: Dataset) -> None:
+    path = theirs.path("a")
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("elsewhere")
+    take_drives(run_dir, theirs.folder)
+    assert len(Dataset.open(run_dir.out / "collect", verify=True)) == 2
+
+
+def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
+    theirs.path("b").write_bytes(b"half")
+    with pytest.raises(DriveError, match="not the file that the index lists"):
+        take_drives(run_dir, theirs.folder)
+    assert not run_dir.begun("collect")
+
+
+def test_the_card_does_not_call_them_ours(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
+    from export.model.network import build
+    from export.model.weights import WeightsInfo, save_weights
+
+    save_weights(build(TINY.model, 1), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
+    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
+    take_drives(run_dir, theirs.folder)
+    text = card(run_dir, TINY, run_dir.out / START / "model.safetensors")
+    assert "recorded elsewhere" in text and "privileged expert" not in text
+
+
+def test_the_command_takes_them(tmp_path: Path, theirs: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    arguments = ["collect", "--preset", "tiny", "--drives", str(theirs.folder), "--out", str(out)]
+    assert cli.main(arguments) == 0 and "collect: done before" in capsys.readouterr().err
+    assert len(Dataset.open(out / "collect")) == 2
+
+
+def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["all", "--preset", "tiny", "--drives", str(theirs.folder), "--dry-run"]) == 0
+    told = capsys.readouterr().err
+    assert "sft" in told and "collect" not in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("sft", "--from", "b"), "both say where drives come from"),
+        (("all", "--checkpoint", "w", "--after", "imitate"), "goes on without drives"),
+        (("card",), "belongs to stages"),
+        (("sft",), "not the index of a data set"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str
+) -> None:
+    out = tmp_path / "c"
+    RunDir.open(out, TINY)
+    assert cli.main([*arguments, "--drives", str(tmp_path / "a"), "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert says in told and told.count("\n") == 1

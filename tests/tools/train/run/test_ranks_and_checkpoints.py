@@ -1,0 +1,364 @@
+"""Run folders, jobs, checkpoints, optimisers and ranks: what every stage of training stands on."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from export.model.config import PRESETS
+from tests.support.train import train_ranks
+from tools.train.config.optim import OptimConfig
+from tools.train.config.recipe import Recipe, load_recipe
+from tools.train.run import checkpoint
+from tools.train.run.distributed import SINGLE, BatchOrder, Ranks
+from tools.train.run.job import StageJob
+from tools.train.run.optim import Optimiser, autocast, computes_bf16, learning_rate
+from tools.train.run.run_dir import RunDir, RunDirError
+
+NANO = PRESETS["nano"]
+ROOT = Path(__file__).parents[4]
+
+
+# Run folders
+
+
+def run_dir(tmp_path: Path, **changed: object) -> RunDir:
+    return RunDir.open(tmp_path / "run", replace(load_recipe("tiny"), **changed))
+
+
+def test_a_run_says_what_it_was_made_with(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    assert load_recipe(str(made.recipe_path)) == load_recipe("tiny")
+    versions = json.loads((made.out / "versions.json").read_text())
+    assert versions["packages"]["numpy"] == np.__version__ and versions["python"]
+
+
+def test_a_run_that_goes_on_with_other_code_says_so_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run_dir(tmp_path)
+    first = json.loads((made.out / "versions.json").read_text())
+    run_dir(tmp_path)
+    assert json.loads((made.out / "versions.json").read_text()) == first
+    monkeypatch.setattr("tools.train.run.run_dir.code_sha256", lambda: "of tomorrow")
+    for _ in range(2):
+        run_dir(tmp_path)
+    versions = json.loads((made.out / "versions.json").read_text())
+    later = versions.pop("later")
+    assert versions == first and [each["code_sha256"]["simulation"] for each in later] == ["of tomorrow"]
+
+
+def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    (made.stage("collect") / "drive").touch()
+    later = load_recipe("tiny", ["sft.epochs=9"])
+    assert load_recipe(str(RunDir.open(made.out, later).recipe_path)) == later
+    (made.stage("sft") / "state").touch()
+    with pytest.raises(RunDirError, match=r"sft.epochs: 9 there, 8 asked for"):
+        RunDir.open(made.out, load_recipe("tiny", ["sft.epochs=8"]))
+
+
+@pytest.mark.parametrize("setting", ["seed=5", "model.action.latency_aware=false"])
+def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    RunDir.open(made.out, load_recipe("tiny", [setting]))
+    (made.stage("collect") / "drive").touch()
+    with pytest.raises(RunDirError, match="was begun with other numbers"):
+        RunDir.open(made.out, load_recipe("tiny"))
+
+
+def test_how_many_processes_work_on_it_may_always_change(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    (made.stage("collect") / "drive").touch()
+    RunDir.open(made.out, load_recipe("tiny", ["collect.jobs=7"]))
+
+
+def test_somebody_elses_folder_is_not_taken(tmp_path: Path) -> None:
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "to-mother.txt").touch()
+    with pytest.raises(RunDirError, match="new or empty directory"):
+        RunDir.open(tmp_path / "letters", load_recipe("tiny"))
+
+
+def test_a_resumed_stage_writes_its_lines_again_and_only_its_own(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    for step in (1, 2, 3):
+        made.log("sft", step, loss=1.0 / step)
+        made.log("imitate", step, loss=2.0)
+    made.rewind("sft", 1)
+    assert [(line["stage"], line["step"]) for line in made.lines()] == [
+        ("sft", 1), ("imitate", 1), ("imitate", 2), ("imitate", 3),
+    ]  # fmt: skip
+
+
+def test_half_a_line_of_a_killed_run_is_no_line(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    made.log("sft", 1, loss=1.0)
+    with made.log_path.open("a") as file:
+        file.write('{"stage": "sf')
+    assert len(list(made.lines())) == 1
+
+
+def test_what_a_stage_left_is_kept_under_another_name(tmp_path: Path) -> None:
+    made = run_dir(tmp_path)
+    made.finish("imitate", {"loss": 1.0})
+    made.log("imitate", 1, loss=1.0)
+    made.retire("imitate", "imitate-0")
+    assert made.result("imitate") is None and made.result("imitate-0") == {"loss": 1.0}
+    assert [line["stage"] for line in made.lines()] == ["imitate-0"]
+
+
+def test_another_runs_stages_are_used_where_they_would_be_the_same(tmp_path: Path) -> None:
+    base = run_dir(tmp_path)
+    for stage in ("collect", "encoder", "sft"):
+        base.finish(stage, {"of": stage})
+    recipe = load_recipe("tiny", ["model.action.latency_aware=false"])
+    ablation = RunDir.open(tmp_path / "ablation", recipe)
+    ablation.borrow(base, ("collect", "encoder", "sft"), recipe)
+    assert ablation.result("sft") == {"of": "sft"} and ablation.borrowed("sft")
+    for setting in ("sft.epochs=99", "model.language.mlp=64"):
+        with pytest.raises(RunDirError, match="--from"):
+            RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny", [setting]))
+
+
+def test_a_stage_that_has_not_finished_is_not_lent(tmp_path: Path) -> None:
+    base = run_dir(tmp_path)
+    with pytest.raises(RunDirError, match="sft has not finished"):
+        RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny"))
+
+
+# Jobs
+
+
+def test_a_jobs_generators_follow_from_seed_and_tag() -> None:
+    job = StageJob(Recipe("r", 1, NANO), RunDir(Path("none")), seed=4)
+    assert job.rng("a", 1).integers(1000) == job.rng("a", 1).integers(1000) != job.rng("a", 2).integers(1000)
+    draws = [torch.rand(1, generator=job.generator(tag)) for tag in ("a", "a", "b")]
+    assert draws[0] == draws[1] != draws[2]
+
+
+# Checkpoints
+
+
+def learn(steps: int, path: Path | None = None, stop_at: int | None = None) -> tuple[torch.Tensor, list[float]]:
+    """Weights and losses of a small training with dropout, stopped into `path` at a step or gone on from there."""
+    model = torch.nn.Linear(6, 3)
+    torch.nn.init.constant_(model.weight, 0.1)
+    torch.nn.init.zeros_(model.bias)
+    optimiser = Optimiser(model.parameters(), OptimConfig(lr=0.01, warmup_steps=5), 20)
+    generator, rng = torch.Generator().manual_seed(3), np.random.default_rng(3)
+    if path is not None and stop_at is None:
+        tensors, meta = checkpoint.load(path)
+        model.load_state_dict(checkpoint.under("model", tensors))
+        optimiser.restore(checkpoint.under("optimiser", tensors))
+        checkpoint.restore_generator(generator, tensors["generator"])
+        checkpoint.restore_rng(rng, meta["rng"])
+    losses = []
+    while optimiser.step_count < (steps if stop_at is None else stop_at):
+        x = torch.randn(8, 6, generator=generator) * float(rng.uniform(0.5, 1.5))
+        loss = (model(x) - 1).pow(2).mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    if path is not None and stop_at is not None:
+        tensors = {
+            **checkpoint.with_prefix("model", model.state_dict()),
+            **checkpoint.with_prefix("optimiser", optimiser.tensors()),
+            "generator": checkpoint.generator_tensor(generator),
+        }
+        checkpoint.save(path, tensors, {"rng": checkpoint.rng_meta(rng)})
+    return model.weight.detach().clone(), losses
+
+
+def test_training_that_was_stopped_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    whole, losses = learn(20)
+    path = tmp_path / "checkpoint.safetensors"
+    _, first = learn(20, path, stop_at=7)
+    resumed, rest = learn(20, path)
+    assert torch.equal(whole, resumed) and first + rest == losses
+
+
+def test_a_checkpoint_holds_tensors_of_every_kind_and_tied_ones(tmp_path: Path) -> None:
+    shared = torch.arange(6.0)
+    tensors = {"a": shared, "b": shared, "half": torch.ones(2, dtype=torch.bfloat16), "count": torch.tensor(3)}
+    checkpoint.save(tmp_path / "c", tensors, {"epoch": 2, "words": ["x"]})
+    read, meta = checkpoint.load(tmp_path / "c")
+    assert meta == {"epoch": 2, "words": ["x"]}
+    assert all(torch.equal(read[name], tensor) and read[name].dtype == tensor.dtype for name, tensor in tensors.items())
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    checkpoint.save(path, {"a": torch.ones(1)}, {})
+    with pytest.raises(TypeError):
+        checkpoint.save(path, {"a": torch.zeros(1)}, {"no JSON": object()})
+    assert checkpoint.load(path)[0]["a"] == 1 and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 40, b"not tensors at all"])
+def test_a_damaged_checkpoint_is_one_clear_line(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    path.write_bytes(content)
+    with pytest.raises(checkpoint.CheckpointFileError, match="delete it to begin anew") as caught:
+        checkpoint.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_are_no_checkpoint(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.ones(1)}, str(tmp_path / "c"))
+    with pytest.raises(checkpoint.CheckpointFileError, match="expected format"):
+        checkpoint.load(tmp_path / "c")
+
+
+# Optimisers
+
+
+def test_the_learning_rate_warms_up_and_falls_like_a_cosine() -> None:
+    config = OptimConfig(lr=1.0 - 1e-9, warmup_steps=10, final_lr_share=0.1)
+    rates = [learning_rate(config, step, 110) for step in range(110)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == pytest.approx(1.0) and rates[10] == pytest.approx(1.0)
+    assert rates[60] == pytest.approx(0.55) and rates[-1] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_short_run_warms_up_for_a_tenth_of_it() -> None:
+    assert learning_rate(OptimConfig(lr=0.1, warmup_steps=1000), 5, 50) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("has", "kind"),
+    [({"avx2": True}, torch.float32), ({"avx512_bf16": True}, torch.bfloat16), ({"amx_bf16": True}, torch.bfloat16)],
+)
+def test_a_processor_computes_in_bfloat16_only_with_instructions_for_it(
+    has: dict[str, bool], kind: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: has)
+    computes_bf16.cache_clear()
+    try:
+        with autocast("cpu", bf16=True):
+            assert torch.nn.functional.linear(torch.ones(1, 2), torch.ones(1, 2)).dtype is kind
+        assert computes_bf16("cuda")
+    finally:
+        computes_bf16.cache_clear()
+
+
+def test_gradients_are_clipped_by_their_norm() -> None:
+    weight = torch.nn.Parameter(torch.zeros(2, 2))
+    optimiser = Optimiser([weight], OptimConfig(clip=0.5), 10)
+    weight.grad = torch.full((2, 2), 3.0)
+    assert optimiser.step() == pytest.approx(6.0) and weight.grad is None
+
+
+def test_a_step_that_is_not_finite_changes_nothing_and_is_counted() -> None:
+    weight = torch.nn.Parameter(torch.ones(2, 2))
+    optimiser = Optimiser([weight], OptimConfig(), 10)
+    weight.grad = torch.full((2, 2), float("nan"))
+    assert np.isnan(optimiser.step()) and torch.equal(weight, torch.ones(2, 2)) and optimiser.step_count == 1
+
+
+def test_gains_and_biases_do_not_decay() -> None:
+    gain, weight = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(3, 3))
+    optimiser = Optimiser([gain, weight], OptimConfig(lr=0.1, weight_decay=0.5, warmup_steps=0), 10)
+    for each in (gain, weight):
+        each.grad = torch.zeros_like(each)
+    optimiser.step()
+    assert torch.equal(gain, torch.ones(3)) and float(weight.detach().max()) < 1
+
+
+# Ranks
+
+
+@pytest.mark.parametrize("world", [1, 2, 3])
+def test_ranks_share_every_batch_without_loss_or_overlap(world: int) -> None:
+    order = BatchOrder(count=23, batch=8, epochs=2, seed=1)
+    for step in range(order.steps):
+        shares = [Ranks(rank, world).share(order.indices(step)) for rank in range(world)]
+        assert sorted(np.concatenate(shares)) == sorted(order.indices(step))
+
+
+def test_every_epoch_shows_every_sample_once_in_an_order_of_its_own() -> None:
+    order = BatchOrder(count=23, batch=8, epochs=2, seed=1)
+    epochs = [np.concatenate([order.indices(e * 3 + s) for s in range(3)]) for e in range(2)]
+    assert all(sorted(epoch) == list(range(23)) for epoch in epochs) and list(epochs[0]) != list(epochs[1])
+
+
+def two_ranks(module: str, *arguments: str) -> list[tuple[int, str]]:
+    """Exit codes and standard errors of a module that is run as torchrun runs it, in two processes."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    ranks = []
+    for rank in range(2):
+        env = {**os.environ, "RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank), "LOCAL_WORLD_SIZE": "2",
+               "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
+               "PYTHONPATH": str(ROOT)}  # fmt: skip
+        command = [sys.executable, "-m", module, *arguments]
+        ranks.append(subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True))
+    try:
+        said = [process.communicate(timeout=120)[1] for process in ranks]
+    finally:
+        for process in ranks:
+            process.kill()
+    sys.stderr.writelines(said)  # shown where a test fails
+    return [(process.returncode, text) for process, text in zip(ranks, said, strict=True)]
+
+
+def codes(ended: list[tuple[int, str]]) -> list[int]:
+    return [code for code, _ in ended]
+
+
+def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
+    alone = train_ranks.train(SINGLE)
+    assert codes(two_ranks("tests.support.train.train_ranks", str(tmp_path))) == [0, 0]
+    together = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
+    assert together[0] == together[1]
+    assert together[0] == pytest.approx(alone, rel=1e-4) and alone[-1] < alone[0]
+
+
+def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_the_others_alone(tmp_path: Path) -> None:
+    assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "done")) == [0, 0]
+    steps = ["collect", "encoder", "sft", "imitate", "dagger", "sft", "imitate", "rl", "evaluate"]
+    shared = {"encoder", "sft", "imitate"}
+    done = [(tmp_path / f"{rank}.txt").read_text().splitlines() for rank in range(2)]
+    # Whoever works alone has the threads of both.
+    assert done[0] == [f"{step} 0/2 1" if step in shared else f"{step} 0/1 2" for step in steps]
+    assert done[1] == [f"{step} 1/2 1" for step in steps if step in shared]
+    assert (tmp_path / "run" / "imitate-0").is_dir() and (tmp_path / "run" / "evaluate" / "result.json").is_file()
+
+
+def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_path: Path) -> None:
+    assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
+    before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
+    assert before[0][-3] == before[1][-3] == "encoder"
+    ended = two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "done")
+    assert codes(ended) == [0, 0] and "encoder: done before" in ended[0][1]
+    assert (tmp_path / "1.txt").read_text().split().count("encoder") == 1
+
+
+@pytest.mark.parametrize("failing", ["collect", "dagger", "set-up"])
+def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tmp_path: Path, failing: str) -> None:
+    line = f"{failing} has failed"
+    if failing == "set-up":
+        other = RunDir.open(tmp_path / "run", load_recipe("tiny", ["seed=5"]))
+        (other.stage("collect") / "begun").touch()
+        line = "begun with other numbers (seed: 5 there, 1 asked for)"
+    (code, said), (others, heard) = two_ranks("tests.support.train.train_chain_rank", str(tmp_path), failing)
+    assert (code, others) == (EXIT_BAD_INPUT, EXIT_BAD_INPUT)
+    assert line in said and "edge-train: the first process has ended early" in heard
+    assert "Traceback" not in said + heard
+
+
+def test_run_as_a_module_it_says_what_is_wrong_in_one_line() -> None:
+    command = [sys.executable, "-m", "tools.train.cli", "all", "--preset", "nope", "--out", "never"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == EXIT_BAD_INPUT
+    assert "edge-train: --preset nope: expected one of" in ended.stderr and "Traceback" not in ended.stderr

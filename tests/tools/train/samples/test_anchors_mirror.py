@@ -1,0 +1,96 @@
+"""In the mirror left and right change places, in pictures, words and numbers, and nothing else does."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.state.frame import fit_frame
+from edge.state.reasoning_text import parse_progress, parse_waypoints
+from export.model.network import build
+from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.drives.drive import Drive
+from tools.train.samples.anchors import anchors_of
+from tools.train.samples.mirror import SecondsDataset, Views, mirrored, mirrored_text
+from tools.train.samples.tokens import TokenCache, encode
+from tools.train.scenes import trace_sentences as trace_words
+
+
+@pytest.mark.parametrize(
+    ("text", "other"),
+    [
+        ("Take the second left, then turn right.", "Take the second right, then turn left."),
+        ("All right, keep to the left side", "All right, keep to the right side"),
+        ("all right, turn right", "all right, turn left"),
+        ("Left at the desk", "Right at the desk"),
+        ("Motion: person ahead 2 m crossing left.", "Motion: person ahead 2 m crossing right."),
+        ("the handrail and the copyright sign", "the handrail and the copyright sign"),
+    ],
+)
+def test_sides_are_exchanged_and_no_other_word(text: str, other: str) -> None:
+    assert mirrored_text(text) == other
+    assert mirrored_text(other) == text
+
+
+def test_every_sentence_of_the_traces_has_a_mirror_image() -> None:
+    for text in itertools.islice(trace_words.corpus(), 0, None, 7):
+        assert mirrored_text(mirrored_text(text)) == text
+        assert (mirrored_text(text) != text) == ("left" in text or "right" in text)
+
+
+def test_an_anchor_in_the_mirror_tells_the_same_story_on_the_other_side() -> None:
+    for anchor in anchors_of(made_up_drive("a")):
+        other = mirrored(anchor)
+        assert mirrored(other) == anchor
+        assert [x for x, _ in other.way] == [x for x, _ in anchor.way]
+        assert [y for _, y in other.way] == [-y for _, y in anchor.way]
+        assert parse_waypoints(other.reasoning) == pytest.approx(np.round(anchor.points, 1) * (1, -1))
+        assert parse_progress(other.reasoning) == anchor.progress
+        assert (other.earlier, other.frames) == (anchor.earlier, anchor.frames)
+        assert ("turn right into the room" in other.reasoning) == ("turn left into the room" in anchor.reasoning)
+    assert "-0.0" not in "".join(mirrored(anchor).reasoning for anchor in anchors_of(made_up_drive("a")))
+
+
+def half_white(drive_id: str, frames: int) -> Drive:
+    """White on the left, the right getting lighter from frame to frame."""
+    pieces = []
+    for k in range(frames):
+        picture = np.full((128, 128, 3), 255, np.uint8)
+        picture[:, 64:] = 4 * k
+        pieces.append(cv2.imencode(".jpg", picture)[1].reshape(-1))
+    plain = made_up_drive(drive_id, frames)
+    return dataclasses.replace(
+        plain, jpeg=np.concatenate(pieces), jpeg_end=np.cumsum([len(piece) for piece in pieces], dtype=np.int64)
+    )
+
+
+def test_tokens_of_the_mirrored_drive_are_of_one_mirrored_picture_a_second(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path, [half_white("a", 32)])
+    vision = build(tiny_model(), 1).vision
+    other = SecondsDataset.of(dataset, mirrored=True)
+    drive = other.load("a")
+    assert len(drive) == 4
+    shown = drive.frame(3)
+    np.testing.assert_array_equal(shown, dataset.load("a").frame(30)[:, ::-1])
+    assert shown[0, 0, 0] < 140 and shown[0, -1, 0] > 240
+    cache = TokenCache(other, vision, tmp_path / "mirrored")
+    cache.build()
+    expected = encode(vision, fit_frame(np.ascontiguousarray(dataset.load("a").frame(30)[:, ::-1]), 32))
+    np.testing.assert_allclose(cache.frames("a")[3], expected[0], atol=4e-3)
+    assert cache.frames("a").shape == (4, 4, 32)
+
+
+def test_an_anchors_view_is_of_its_own_frames_on_either_side() -> None:
+    views = Views(MadeUpTokens(), MadeUpTokens(10))
+    anchor = anchors_of(made_up_drive("a"))[-1]
+    for plain, other in zip(views.of(anchor), views.of(anchor, in_mirror=True), strict=True):
+        np.testing.assert_array_equal(plain, other)
+    with pytest.raises(ValueError, match="mirror image"):
+        Views(MadeUpTokens()).of(anchor, in_mirror=True)
+    with pytest.raises(ValueError, match="mirror image"):
+        views.of(dataclasses.replace(anchor, frames=(25, 55)), in_mirror=True)

@@ -1,0 +1,134 @@
+"""What the language model says is held against what is true, also where it hears only itself."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edge.reasoning.decoding_rules import BACK, Known
+from edge.reasoning.progress_rules import EITHER_WAY, FREE, ONWARD
+from edge.state.reasoning_text import Progress, format_progress
+from tests.support.train.train_drives import WORDINGS, made_up_drive
+from tools.train.config.sft import EvalConfig
+from tools.train.samples.anchors import Anchor, Drawn, anchors_of
+from tools.train.sft.language_eval import Score, closed_loop, landmarks_of, side_of
+
+
+@pytest.fixture(scope="module")
+def anchors() -> list[Anchor]:
+    return anchors_of(made_up_drive("a"))
+
+
+def test_the_truth_is_right_in_everything(anchors: list[Anchor]) -> None:
+    score = Score(2.0)
+    for anchor in anchors:
+        score.add(anchor.reasoning, anchor)
+    numbers = score.numbers()
+    assert numbers["answers"] == len(anchors) == 13
+    shares = ("waypoints_parsable", "progress_parsable", "progress_right", "change_right", "side_right")
+    assert all(numbers[key] == 1.0 for key in (*shares, "landmark_precision", "landmark_recall"))
+    assert numbers["sides"] == 9
+    assert max(numbers["waypoint_error_m"]) < 0.08
+
+
+def test_changes_are_where_repeating_what_was_said_is_wrong(anchors: list[Anchor]) -> None:
+    score = Score(2.0)
+    for anchor in anchors:
+        repeated = anchor.before(2.0) or anchor.progress
+        truth = format_progress(anchor.progress)
+        score.add(anchor.reasoning.replace(truth, format_progress(repeated)), anchor)
+    numbers = score.numbers()
+    # passed grows at frames 30 and 60, the turn is done at 90; each is news at two of the anchors.
+    assert numbers["changes"] == 6
+    assert numbers["change_right"] == 0.0
+    assert numbers["progress_right"] == pytest.approx(7 / 13)
+
+
+def test_nothing_is_right_about_a_text_of_another_form(anchors: list[Anchor]) -> None:
+    score = Score(2.0)
+    score.add("I see a desk on the left.", anchors[3])
+    numbers = score.numbers()
+    shares = ("waypoints_parsable", "progress_parsable", "progress_right", "side_right", "landmark_recall")
+    assert all(numbers[key] == 0.0 for key in shares)
+    assert numbers["landmark_precision"] is None and numbers["waypoint_error_m"] is None
+
+
+def test_errors_are_distances_at_three_six_and_nine_seconds(anchors: list[Anchor]) -> None:
+    score = Score(2.0)
+    score.add("waypoints: (1.5, 0.3) (3.0, 0.0) (3.0, 0.5)", anchors[0])
+    assert score.points()["waypoint_error_m"] == pytest.approx([0.3, 0.0, 1.0])
+
+
+def test_landmarks_are_counted_by_name(anchors: list[Anchor]) -> None:
+    score = Score(2.0)
+    wrong = anchors[0].reasoning.replace("red chair right", "desk ahead")
+    assert landmarks_of(wrong) == Counter({"desk": 2})
+    assert landmarks_of(anchors[0].reasoning) == Counter({"desk": 1, "red chair": 1})
+    assert landmarks_of(anchors[-1].reasoning) == Counter()
+    score.add(wrong, anchors[0])
+    assert score.numbers()["landmark_precision"] == score.numbers()["landmark_recall"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("plan", "side"),
+    [
+        ("turn left into the room in 3 m", "left"),
+        ("wait, then turn right into the aisle now", "right"),
+        ("go straight to the lobby in 4 m", None),
+        ("stop in 6 m", None),
+    ],
+)
+def test_the_side_is_that_of_the_planned_turn(plan: str, side: str | None) -> None:
+    assert side_of(f"Objects: desk right 3 m.\nPlan: {plan}.\nwaypoints: …") == side
+
+
+class Parrot:
+    """Says one text at every anchor, and remembers what it was told."""
+
+    def __init__(self, texts: Sequence[str]) -> None:
+        self.texts = list(texts)
+        self.told: list[tuple[str, int, Progress | None]] = []
+        self.guided: list[tuple[Progress | None, str]] = []
+
+    def guide(self, known: Known) -> SimpleNamespace:
+        """One whose first answer would go back."""
+        self.guided.append((known.before, known.follow))
+        return SimpleNamespace(wanted=BACK if len(self.guided) == 1 else None)
+
+    def say(self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[object]) -> list[str]:
+        assert len(guides) == len(questions)
+        self.told += [(anchor.drive_id, anchor.k, drawn.before) for anchor, drawn in questions]
+        assert all(drawn.wording in WORDINGS and not drawn.waypoints_only for _, drawn in questions)
+        return [self.texts.pop(0) for _ in questions]
+
+
+def test_along_a_drive_the_model_hears_what_it_said_itself_last() -> None:
+    anchors = [*anchors_of(made_up_drive("a", 60)), *anchors_of(made_up_drive("b", 25))]
+    says = [
+        "Progress: turn 1 of 1, passed 4.",
+        "nothing of that form",
+        "nor this",
+        "Progress: last leg of 1, passed 0.",
+    ]
+    parrot = Parrot([*says, "Progress: turn 1 of 1, passed 9."])
+    numbers = closed_loop(parrot, anchors, 2.0, np.random.default_rng(0))  # type: ignore[arg-type]
+    assert parrot.told == [
+        ("a", 0, None),
+        ("b", 0, None),
+        ("a", 20, Progress(1, 1, 4)),
+        ("b", 20, None),
+        ("a", 40, Progress(1, 1, 4)),
+    ]
+    assert numbers["answers"] == 5 and numbers["progress_parsable"] == 0.6
+    assert parrot.guided == [
+        (None, FREE), (None, FREE), (Progress(1, 1, 4), EITHER_WAY), (None, FREE), (Progress(1, 1, 4), ONWARD),
+    ]  # fmt: skip
+
+
+def test_a_gap_that_is_no_whole_second_is_refused() -> None:
+    with pytest.raises(ValueError, match="whole seconds"):
+        EvalConfig(gap_s=1.5)

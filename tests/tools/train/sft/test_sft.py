@@ -1,0 +1,216 @@
+"""Supervised fine-tuning learns what is said, touches nothing but the language model, and is exact when ended."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from tokenizers import Tokenizer
+
+from export.model.network import build
+from export.model.tokenizers.nano import NANO_TOKENIZER
+from tests.support.train.train_drives import MadeUpTokens, made_up_drive, small_dataset, tiny_model, write_dataset
+from tests.support.train.train_sft_rank import CONFIG, sft_job, trained
+from tests.support.train.train_stage_contract import Run, StageContract
+from tests.support.train.training_scenarios import drive_along, scenarios
+from tools.train.config.collect import CollectConfig, TourConfig
+from tools.train.config.optim import OptimConfig
+from tools.train.config.recipe import load_recipe
+from tools.train.config.sft import RetellConfig, SftConfig
+from tools.train.drives.drive import Dataset
+from tools.train.pipeline.budget import budget_of
+from tools.train.pipeline.chain import Step, run_step
+from tools.train.run import optim
+from tools.train.run.job import StageJob
+from tools.train.run.network_file import stage_weights
+from tools.train.samples.anchors import Prompts, anchors_of
+from tools.train.samples.mirror import Views
+from tools.train.sft.sft import Samples, SftError, budget, run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def as_on_the_command_line() -> Iterator[None]:
+    """`edge-train` asks torch for deterministic algorithms: one that is not would raise. Tiny layers: one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return small_dataset(tmp_path_factory.mktemp("collect"))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, dataset: Dataset) -> Run:
+    """A run that nobody ended."""
+    return run_of(dataset, sft_job(tmp_path_factory.mktemp("whole")))
+
+
+def run_of(dataset: Dataset, job: StageJob) -> Run:
+    network, result = trained(dataset, job)
+    return Run(network.state_dict(), list(job.run_dir.lines()), result)
+
+
+def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Path, dataset: Dataset) -> None:
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=12, optim=OptimConfig(lr=1e-2, warmup_steps=0)))
+    _, result = trained(dataset, job)
+    lines = list(job.run_dir.lines())
+    held = [line["held_loss"] for line in lines if "held_loss" in line]
+    assert result["steps"] == len(lines) == 36 and result["held_anchors"] == 7 and len(held) == 12
+    assert lines[0]["loss"] > 6.5
+    assert result["loss"] < 0.5 * lines[0]["loss"]
+    assert held[-1] < 0.7 * held[0]
+
+
+def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
+    whole: Run,
+) -> None:
+    before = build(tiny_model(), 1).state_dict()
+    moved = {name for name, tensor in whole.weights.items() if not torch.equal(tensor, before[name])}
+    assert {name.split(".")[0] for name in moved} == {"language"}
+    assert {"language.merge.1.weight", "language.embed.weight", "language.lm_head.weight"} <= moved
+
+
+class TestStage(StageContract):
+    rank = "tests.support.train.train_sft_rank"
+    error = SftError
+    other = dataclasses.replace(CONFIG, batch=7)
+
+    @pytest.fixture(autouse=True)
+    def _drives(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+
+    def prepare(self, out: Path) -> list[str]:
+        return [str(self._dataset.folder)]
+
+    def train(self, out: Path, config: SftConfig | None = None, **options: Any) -> Run:
+        return run_of(self._dataset, sft_job(out, config or CONFIG, **options))
+
+
+def test_bfloat16_gives_about_the_same_losses(
+    tmp_path: Path, dataset: Dataset, whole: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
+    half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
+    job = sft_job(tmp_path, half)
+    trained(dataset, job)
+    losses = [line["loss"] for line in job.run_dir.lines()]
+    assert losses == pytest.approx([line["loss"] for line in whole.lines], rel=0.02)
+    assert losses != [line["loss"] for line in whole.lines]
+
+
+def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
+    silent = write_dataset(tmp_path / "collect", [made_up_drive("a", 20, traces=())])
+    with pytest.raises(SftError, match="no anchors"):
+        trained(silent, sft_job(tmp_path))
+
+
+def test_the_stage_reads_the_runs_drives_and_leaves_the_runs_network(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    few = dataclasses.replace(CONFIG.evaluate, anchors=2, epoch_anchors=1, drives=1, max_new_tokens=3)
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=1, evaluate=few))
+    result = run(job)
+    assert result["steps"] == 3 and np.isfinite(result["held_loss"])
+    assert result["held_out"]["taught"]["answers"] == 2 and result["held_out"]["own"]["answers"] == 4
+    assert [line["progress_share"] for line in job.run_dir.lines() if "progress_share" in line] == [0.0]
+    assert (tmp_path / "sft" / "model.safetensors").read_bytes() == job.run_dir.model_path.read_bytes()
+
+
+def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=2, evaluate=silent, go_on_share=0.5, go_on_lr_share=0.1))
+    steps = run_step(job, Step("sft"))["steps"]
+    assert run_step(job, Step("sft", 1))["steps"] == steps / 2
+    before, after = (load_file(stage_weights(tmp_path, name)) for name in ("sft-0", "sft"))
+    name = "language.layers.0.down.weight"
+    assert 0 < (after[name] - before[name]).abs().max() < steps * CONFIG.optim.lr * 0.1
+
+
+def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "collect", [drive_along(scenarios("corridor")[0]), made_up_drive("b")])
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    config = dataclasses.replace(CONFIG, epochs=1, evaluate=silent)
+    plain = run(sft_job(tmp_path, config))
+    shutil.rmtree(tmp_path / "sft")
+    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RetellConfig(ways=2, tries=24))))
+    assert plain["more_anchors"] == 0 < more["more_anchors"] == more["anchors"] - plain["anchors"]
+
+
+def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> None:
+    anchors = [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in anchors_of(drive)]
+    prompts = Prompts(Tokenizer.from_file(str(NANO_TOKENIZER)), tiny_model())
+    samples = Samples(anchors, prompts, Views(MadeUpTokens()), CONFIG.words, deciding=3)
+    shown = Counter(sample.anchor for sample in samples.draw(np.random.default_rng(0)))
+    assert {anchors[i].decides for i in shown} == {True, False}
+    assert all(count == (3 if anchors[i].decides else 1) for i, count in shown.items()) and len(shown) == len(anchors)
+
+
+def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
+    recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.tours.count=0"])
+
+    def lines(**changed: Any) -> list[tuple[str, int, str]]:
+        sft = dataclasses.replace(recipe.sft or SftConfig(), **changed)
+        return budget(dataclasses.replace(recipe, sft=sft))
+
+    def anchors(**changed: Any) -> int:
+        return sum(count for _, count, key in lines(**changed) if key == "sft")
+
+    assert anchors() == 10 * 30 * 2
+    assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RetellConfig(ways=2))
+    assert anchors(tours=TourConfig(count=4)) == anchors() + 4 * 45 * 2
+    assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
+
+
+def test_after_a_round_of_dagger_a_share_of_the_tours_is_learned_again_and_none_is_made(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    tours = TourConfig(count=2, per_layout=2, people_most=0)
+    numbers = dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.0, tours=tours, tours_again=0.5)
+    job = sft_job(tmp_path, numbers)
+    recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
+    job = dataclasses.replace(job, recipe=recipe)
+    first = run_step(job, Step("sft"))
+    made = sorted((tmp_path / "collect" / "tours").glob("*/drives/*"))
+    again = run_step(job, Step("sft", 1))
+    assert 0 < again["more_anchors"] < first["more_anchors"]
+    assert sorted((tmp_path / "collect" / "tours").glob("*/drives/*")) == made
+
+
+def test_the_budget_of_a_round_has_no_tours_to_make() -> None:
+    recipe = load_recipe("nano", ["sft.tours.count=100", "sft.tours_again=0.1", "dagger.rounds=1"])
+    lines = {line.what: line.samples for line in budget_of(recipe, [Step("sft")], "cpu")}
+    later = {line.what: line.samples for line in budget_of(recipe, [Step("sft", 1)], "cpu")}
+    assert lines["tours: made"] == 100 and not {"tours: made", "tours: frames encoded"} & set(later)
+    share = (recipe.sft or SftConfig()).go_on_share
+    assert later["tours: anchors learned"] == round(lines["tours: anchors learned"] * share * 0.1)
+
+
+def test_the_recipes_numbers_are_checked() -> None:
+    with pytest.raises(ValueError, match="from 1 on"):
+        SftConfig(batch=0)
+
+
+def test_tours_are_made_and_learned_from_beside_the_drives(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    tours = TourConfig(count=2, per_layout=2, people_most=0)
+    job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.5, tours=tours))
+    recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
+    result = run(dataclasses.replace(job, recipe=recipe))
+    made = Dataset.open(next((tmp_path / "collect" / "tours").iterdir()))
+    assert 0 < result["more_anchors"] <= sum(entry.frames // 10 + 1 for entry in made.entries)
+    assert {entry.driver for entry in made.entries} == {"tour"}
+    assert not set(made.ids) & set(Dataset.open(tmp_path / "collect").ids)

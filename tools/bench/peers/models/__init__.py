@@ -1,0 +1,1 @@
+"""The shared weights in every peer's own format."""

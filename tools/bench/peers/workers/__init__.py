@@ -1,0 +1,1 @@
+"""One worker process for each runtime that is compared."""

@@ -1,0 +1,97 @@
+"""PyTorch and transformers, eager: our encoder and unsplit action expert, and Qwen2ForCausalLM."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from transformers import DynamicCache, Qwen2ForCausalLM
+
+from tools.bench.peers.models.unsplit import load_action, load_vision
+from tools.bench.peers.workers.serve import Load, Task, action_task, encoder_task, language_task, serve, tick_task
+from tools.bench.peers.workload import DECODE_STEPS, Workload
+
+FORMS = ("fp32", "bf16", "int8")
+
+
+def in_form(module: nn.Module, form: str) -> nn.Module:
+    """The module in bf16, or with dynamically quantised linear layers."""
+    if form not in FORMS:
+        raise ValueError(f"form {form!r}: expected one of {FORMS}")
+    if form == "int8":
+        from torch.ao.quantization import quantize_dynamic
+
+        quantised: nn.Module = quantize_dynamic(module, {nn.Linear}, dtype=torch.qint8)
+        return quantised
+    return module.to(torch.bfloat16) if form == "bf16" else module
+
+
+class Decoder:
+    """Greedy decoding with transformers' own cache."""
+
+    def __init__(self, load: Load, form: str) -> None:
+        folder = load.cache / load.model / "reference" / ("language-bf16" if form == "bf16" else "language")
+        dtype = torch.bfloat16 if form == "bf16" else torch.float32
+        model = Qwen2ForCausalLM.from_pretrained(folder, dtype=dtype, attn_implementation="sdpa")
+        self._model = in_form(model.eval(), form)
+        self._cache = DynamicCache(config=model.config)
+
+    def _next(self, ids: Tensor) -> int:
+        with torch.inference_mode():
+            out = self._model(input_ids=ids, past_key_values=self._cache, use_cache=True, logits_to_keep=1)
+        return int(out.logits[0, -1].argmax())
+
+    def prefill(self, ids: np.ndarray) -> int:
+        """Start over with a prompt [1, S]; returns the next token."""
+        self._cache = DynamicCache(config=self._model.config)
+        return self._next(torch.from_numpy(ids))
+
+    def step(self, token: int) -> int:
+        """Feed one token; returns the next."""
+        return self._next(torch.tensor([[token]]))
+
+
+def load(request: Load) -> Mapping[str, Task]:
+    """Open the parts asked for."""
+    torch.set_num_threads(request.threads)
+    workload, reference = Workload(request.model), request.cache / request.model / "reference"
+    form = {part: request.options.get(f"{part}.form", "bf16") for part in request.parts}
+    tasks: dict[str, Task] = {}
+    if "encoder" in request.parts:
+        vision = in_form(load_vision(workload.config, reference), form["encoder"])
+        frame = torch.from_numpy(workload.frame())
+
+        def encode() -> Tensor:
+            with torch.inference_mode():
+                tokens: Tensor = vision(frame)
+            return tokens
+
+        tasks["encoder"] = encoder_task(encode)
+    if "action" in request.parts:
+        action = in_form(load_action(workload.config, reference), form["action"])
+        kind = torch.bfloat16 if form["action"] == "bf16" else torch.float32
+        given = (workload.state(), workload.latency(), workload.last_layer_kv())
+        rest = [torch.from_numpy(x).to(kind) for x in given]
+        shape = (1, workload.config.vision.tokens, workload.config.vision.token_dim)
+        visual = torch.from_numpy(np.random.default_rng(2).standard_normal(shape)).to(kind)
+
+        def act(tokens: Tensor) -> Tensor:
+            with torch.inference_mode():
+                trajectory: Tensor = action(tokens, *rest)
+            return trajectory
+
+        tasks["action"] = action_task(lambda: act(visual))
+        if "encoder" in request.parts:
+            tasks["tick"] = tick_task(lambda: act(encode().to(kind)))
+    if "language" in request.parts:
+        decoder = Decoder(request, form["language"])
+        ids = workload.text_ids(workload.prompt_tokens)[None]
+        tasks["language"] = language_task(lambda: decoder.prefill(ids), decoder.step, DECODE_STEPS)
+    return tasks
+
+
+if __name__ == "__main__":
+    sys.exit(serve(load, ("torch", "transformers")))

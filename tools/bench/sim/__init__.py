@@ -1,0 +1,1 @@
+"""Benchmarks of the simulation, and the courses that robots are measured on."""

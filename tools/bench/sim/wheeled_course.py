@@ -1,0 +1,76 @@
+"""A floor with boxes and ramps, and a Carter on it: for the benchmark of the wheeled base and for its tests."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pybullet
+
+from sim_hil.robots.carter.body import Carter, CarterTruth
+from sim_hil.robots.carter.wheel_odometry import WheelCalibration
+from sim_hil.robots.go2.gait import GRAVITY_MPS2
+
+Vec3 = tuple[float, float, float]
+
+
+class World:
+    """A floor, boxes on it, and a Carter at the origin."""
+
+    def __init__(self, folder: Path, rate_hz: int = 240, calibration: WheelCalibration | None = None) -> None:
+        """`folder`: for files that are read while building only."""
+        self.client = pybullet.connect(pybullet.DIRECT)
+        self.dt_s = 1.0 / rate_hz
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=self.dt_s, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=self.client
+        )
+        pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=self.client)
+        self.box((0, 0, -0.5), (60, 60, 1))
+        self.robot = Carter(self.client, folder, (0.0, 0.0, 0.0), self.dt_s, calibration=calibration)
+        self.steps = 0
+
+    def box(self, centre: Vec3, size: Vec3, pitch_rad: float = 0.0, grip: float = 0.9) -> None:
+        """Something solid; `pitch_rad` turns it about y."""
+        half = [extent / 2 for extent in size]
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
+        turn = pybullet.getQuaternionFromEuler((0, pitch_rad, 0))
+        body = pybullet.createMultiBody(0, shape, -1, centre, turn, physicsClientId=self.client)
+        pybullet.changeDynamics(body, -1, lateralFriction=grip, physicsClientId=self.client)
+
+    def ramp(self, start_x: float, degrees: float, length_m: float) -> None:
+        """Rises along x from the floor at `start_x`."""
+        a = math.radians(degrees)
+        x, z = length_m / 2 * math.cos(a) + 0.5 * math.sin(a), length_m / 2 * math.sin(a) - 0.5 * math.cos(a)
+        self.box((start_x + x, 0, z), (length_m, 6, 1), -a)
+
+    def close(self) -> None:
+        """Release the physics client."""
+        pybullet.disconnect(physicsClientId=self.client)
+
+    def run(self, seconds: float, v: float | None = None, w: float = 0.0) -> CarterTruth:
+        """Let time pass, with a command every 0.1 s when `v` is given; the truth at its end."""
+        for step in range(round(seconds / self.dt_s)):
+            if v is not None and step % round(0.1 / self.dt_s) == 0:
+                self.robot.command(v, 0.0, w)
+            self.robot.drive()
+            pybullet.stepSimulation(physicsClientId=self.client)
+            self.robot.observe()
+            self.steps += 1
+        return self.truth()
+
+    def truth(self) -> CarterTruth:
+        """Ground truth now."""
+        return self.robot.truth(self.steps * self.dt_s)
+
+    def go(self) -> World:
+        """Let it settle, and power it."""
+        self.run(0.2)
+        self.robot.stand()
+        return self
+
+
+def forward_mps(truth: CarterTruth) -> float:
+    """Speed along the heading."""
+    heading = float(truth.rpy_rad[2])
+    vx, vy, _ = truth.velocity_world_mps
+    return float(math.cos(heading) * vx + math.sin(heading) * vy)

@@ -1,0 +1,123 @@
+"""The folder of models that `tools.findings` compares: exported from a training run and from its ablations."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from tools.findings.rows import AFTER, BEFORE
+from tools.train.config.recipe import Recipe, RecipeError, load_recipe
+from tools.train.run.exported import COMMAND, ExportError, export_artifacts
+from tools.train.run.network_file import stage_weights
+
+EXAMPLES: Final = """examples:
+  edge-train all --preset nano --out out/run
+  edge-train imitate --from out/run --variant full --out out/ablations/full    # what ablations are compared with
+  edge-train imitate --from out/run --variant no-latency --out out/ablations/no-latency
+  edge-train imitate --from out/run --variant no-motion-offset --out out/ablations/no-motion-offset
+  edge-train imitate --from out/run --variant no-reasoning --out out/ablations/no-reasoning
+  python -m tools.findings.models --run out/run --ablations out/ablations --out out/models
+  python -m tools.findings --artifacts out/models --out out/findings --jobs 2
+exit codes: 0 done, 1 an export failed, 2 bad arguments or input, 130 interrupted
+"""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is exported as `name`: a stage's weights of a run."""
+
+    name: str
+    weights: Path
+    recipe: Recipe
+
+
+def models_of(run: Path, ablations: Path | None) -> Iterator[Model]:
+    """`rl` and `no-rl` of the run, and every ablation by its folder's name; raises RecipeError for what is no run.
+
+    Where reinforcement learning has left no policy of its own, `rl` is imitation's: that is what is shipped.
+    """
+    recipe = _recipe(run)
+    before, after = (stage_weights(run, stage) for stage in ("imitate", "rl"))
+    if before.is_file():
+        yield Model(BEFORE, before, recipe)
+    if after.is_file() and not (before.is_file() and same_policy(before, after)):
+        yield Model(AFTER, after, recipe)
+    elif before.is_file():
+        yield Model(AFTER, before, recipe)
+    for folder in sorted(path for path in (ablations.iterdir() if ablations is not None else ()) if path.is_dir()):
+        own = _recipe(folder)
+        if (weights := stage_weights(folder, "imitate")).is_file():
+            yield Model(folder.name, weights, own)
+
+
+def same_policy(one: Path, other: Path) -> bool:
+    """Whether two files of weights drive alike: all but the value network is the same. Raises RecipeError."""
+    try:
+        with safe_open(str(one), framework="np") as first, safe_open(str(other), framework="np") as second:
+            names = [{name for name in file.keys() if not name.startswith("value.")} for file in (first, second)]  # noqa: SIM118 - not a mapping
+            return names[0] == names[1] and all(
+                np.array_equal(first.get_tensor(name), second.get_tensor(name)) for name in names[0]
+            )
+    except SafetensorError as error:
+        raise RecipeError(f"{one} or {other}: not weights ({error})") from error
+
+
+def _recipe(run: Path) -> Recipe:
+    path = run / "recipe.toml"
+    if not path.is_file():
+        raise RecipeError(f"{run}: holds no run of edge-train")
+    return load_recipe(str(path))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    p = argparse.ArgumentParser(
+        "python -m tools.findings.models", description=__doc__, epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    p.add_argument("--run", type=Path, required=True, metavar="DIR", help="run of edge-train")
+    p.add_argument("--ablations", type=Path, metavar="DIR", help="a run a variant, named like it")
+    p.add_argument("--out", type=Path, required=True, metavar="ROOT", help="folder of the models")
+    return p
+
+
+def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    try:
+        models = list(models_of(args.run, args.ablations))
+        if not models:
+            raise RecipeError(f"{args.run}: has no weights yet; run edge-train imitate first")
+        for model in models:
+            _say(f"{model.name}: {model.weights}")
+            if model.name == AFTER and model.weights == stage_weights(args.run, "imitate"):
+                _say(f"{AFTER}: reinforcement learning has left no policy of its own; this is imitation's")
+            export_artifacts(model.weights, model.recipe.model, args.out / model.name, command=command)
+    except ExportError as error:
+        return _fail(EXIT_CHECK_FAILED, str(error))
+    except (RecipeError, OSError) as error:
+        return _fail(EXIT_BAD_INPUT, str(error))
+    except KeyboardInterrupt:
+        return _fail(EXIT_INTERRUPTED, "interrupted; run it again to go on")
+    return EXIT_DONE
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(f"findings-models: {line}\n")
+
+
+def _fail(code: int, line: str) -> int:
+    _say(line)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

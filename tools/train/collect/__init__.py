@@ -1,0 +1,1 @@
+"""Records drives: the expert's, rounds of DAgger, and tours for the language model."""

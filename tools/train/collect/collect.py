@@ -1,0 +1,29 @@
+"""The first stage: the expert drives through training scenes, and every frame is recorded with what it did next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tools.train.collect.collection import CollectError, Collection, fill, job_count, result_of
+from tools.train.config.collect import CollectConfig
+from tools.train.config.recipe import Recipe
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.run.job import StageJob
+
+PREFIX = "e"
+
+
+def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
+    """What is to be done: drives, by the throughput of all processes together."""
+    return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "drive")]
+
+
+def run(job: StageJob) -> dict[str, Any]:
+    """Record the recipe's drives into `collect/`; goes on where a run before was ended. Raises CollectError."""
+    config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
+    if job.ranks.world > 1:
+        raise CollectError("collect starts processes of its own (collect.jobs): run it without torchrun")
+    collection = Collection(PREFIX, config.episodes, job.seed, 0, config)
+    with DatasetWriter(job.run_dir.stage("collect")) as writer:
+        fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
+        return result_of(writer, PREFIX)

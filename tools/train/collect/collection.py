@@ -1,0 +1,145 @@
+"""Drives of many scenarios, recorded by worker processes into one data set: what `collect` and `dagger` share."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sim_hil.benchmark.workers.worker_pool import Told, Workers
+from tools.train.collect.dagger_driver import PolicyOptions
+from tools.train.collect.worker import MODULE, Order
+from tools.train.config.collect import CollectConfig, TourConfig
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.drives.drive import Entry
+from tools.train.run.job import StageFailedError
+from tools.train.scenes.scenarios import KEPT_SEEDS, MAX_SEED
+
+WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
+_POLL_S: Final = 0.5
+_TAG: Final = 0xC0
+_MOST_DROPPED: Final = 0.5  # of the drives: with more, something is wrong that no further drive mends
+
+
+class CollectError(Exception):
+    """A collection that cannot begin; one line: what, and what to do."""
+
+
+class CollectFailedError(StageFailedError):
+    """A collection that cannot go on; one line: what."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """`count` drives, their ids beginning with `prefix`; `seed` of the run's stage, `turn` of the collection in it."""
+
+    prefix: str
+    count: int
+    seed: int
+    turn: int
+    config: CollectConfig
+    policy: PolicyOptions | None = None
+    tour: TourConfig | None = None
+
+    def orders(self, folder: Path, has: Callable[[str], bool]) -> list[Order]:
+        """One order a layout, of those that lack a drive."""
+        rng = np.random.default_rng((self.seed, self.turn, _TAG))
+        scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
+        if scenario_seed in KEPT_SEEDS:
+            scenario_seed -= len(KEPT_SEEDS)
+        # Jobs are no part of an order: it must not matter how many there are.
+        config = replace(self.config, jobs=0)
+        orders, size = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
+        for start in range(0, self.count, size):
+            # A whole layout always, so that the same tasks are found in it whatever the count.
+            order = Order(
+                str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy, self.tour
+            )
+            ids = [order.id(number) for number in range(start, start + size)]
+            wanted = [drive_id for drive_id in ids[: self.count - start] if not has(drive_id)]
+            if wanted:
+                orders.append(replace(order, skip=tuple(drive_id for drive_id in ids if drive_id not in wanted)))
+        return orders
+
+
+def fill(
+    writer: DatasetWriter,
+    collection: Collection,
+    jobs: int,
+    *,
+    update: Callable[[int, int], None] = lambda done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+    command: Sequence[str] = WORKER,
+) -> None:
+    """Record what the data set lacks. Raises CollectFailedError, OSError, and KeyboardInterrupt when `stopped`."""
+    waiting = deque(collection.orders(writer.folder, writer.has))
+    under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
+    logs = writer.folder / "logs"
+    logs.mkdir(exist_ok=True)
+    workers = Workers(command, jobs)
+    try:
+        while waiting or under_way:
+            if stopped():
+                raise KeyboardInterrupt
+            while waiting and workers.free():
+                order = waiting.popleft()
+                key = order.id(order.start)
+                under_way[key] = (order, "")
+                workers.start(key, order.as_json(), logs / f"{key}.log")
+            for told in workers.wait(_POLL_S):
+                _take(told, writer, under_way, waiting)
+            done, dropped = len(writer.entries(collection.prefix)), len(writer.dropped(collection.prefix))
+            update(done + dropped, collection.count)
+            if dropped > max(16, _MOST_DROPPED * (done + dropped)):
+                last = writer.dropped(collection.prefix)[-1].why
+                raise CollectFailedError(
+                    f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}"
+                )
+    finally:
+        workers.close()
+
+
+def _take(told: Told, writer: DatasetWriter, under_way: dict[str, tuple[Order, str]], waiting: deque[Order]) -> None:
+    order, begun = under_way[told.key]
+    message = told.message
+    if message is None:
+        del under_way[told.key]
+        if told.why:
+            _again(order, begun, told.why, writer, waiting)
+    elif "begun" in message:
+        under_way[told.key] = (order, str(message["begun"]))
+    elif "drive" in message:
+        writer.add(Entry(**message["drive"]))
+    elif "dropped" in message:
+        if message["dropped"] not in order.skip:
+            writer.drop(str(message["dropped"]), str(message["why"]))
+    else:
+        raise CollectFailedError(str(message.get("refused", f"a worker said {message}")))
+
+
+def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: deque[Order]) -> None:
+    """A process has died: the drive that it had begun is given up, and the rest of its layout is tried again."""
+    if not begun:
+        raise CollectFailedError(f"the process of drive {order.id(order.start)} and those after it {why}")
+    if not writer.has(begun):
+        writer.drop(begun, f"its process {why.split(':')[0]}")
+    ids = [order.id(number) for number in range(order.start, order.start + order.count)]
+    skip = tuple(drive_id for drive_id in ids if drive_id in order.skip or writer.has(drive_id))
+    if len(skip) < len(ids):
+        waiting.append(replace(order, skip=skip))
+
+
+def job_count(asked: int) -> int:
+    """Processes to run at a time: as asked, or one a core that this process may use."""
+    return asked if asked else len(os.sched_getaffinity(0))
+
+
+def result_of(writer: DatasetWriter, prefix: str) -> dict[str, Any]:
+    """Counts of a collection and the hash of the whole data set."""
+    return {**writer.summary(prefix), "sha256": writer.finish().sha256}

@@ -1,0 +1,248 @@
+"""The process that records drives: some scenarios of one layout, one after the other, each in fresh physics.
+
+What is drawn for a drive depends on the collection's seed and the drive's number alone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.artifacts.files import ArtifactError
+from edge.reasoning.prompt import InstructionError
+from export.core.typed import build, plain
+from sim_hil.benchmark.env.observation import Observation
+from sim_hil.benchmark.env.world import EpisodeWorld
+from sim_hil.benchmark.policies.expert import ExpertPolicy
+from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.scene.scene import SceneError
+from tools.train.collect.dagger_driver import PolicyDriver, PolicyOptions
+from tools.train.collect.detour import draw_detour
+from tools.train.collect.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
+from tools.train.collect.steering import SteeringNoise, Velocity
+from tools.train.collect.tour_world import Carriage, carried
+from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
+from tools.train.config.scenes import SHARES
+from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
+from tools.train.scenes.scenarios import Scenario, ScenarioError, training_episodes
+from tools.train.scenes.traces import Tracer
+
+MODULE: Final = "tools.train.collect.worker"
+_TAG: Final = 0xC011
+_PLAN_STEP: Final = 3 * RATE_HZ - 1  # of a future: where the robot means to be in 3 s
+
+
+@dataclass(frozen=True)
+class Order:
+    """What one process is told: drives `start` to `start + count - 1` into `folder`, but for those in `skip`.
+
+    `policy`: the artifacts that drive, and how; None where the expert does. `tour`: nobody drives, it is carried.
+    """
+
+    folder: str
+    prefix: str
+    seed: int
+    scenario_seed: int
+    start: int
+    count: int
+    skip: tuple[str, ...]
+    config: CollectConfig
+    policy: PolicyOptions | None = None
+    tour: TourConfig | None = None
+
+    def id(self, number: int) -> str:
+        """Of a drive of this collection."""
+        return f"{self.prefix}{number:05d}"
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        return dict(plain(self))
+
+    @staticmethod
+    def of_json(content: Mapping[str, Any]) -> Order:
+        """An order that `as_json` has written; raises FieldError."""
+        return build(Order, content, "order")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What is drawn for one drive beside its scenario."""
+
+    noise: bool
+    look: Look
+    drift: str
+    linger_s: float
+    strays: bool
+
+    @staticmethod
+    def of(config: CollectConfig, seed: int, number: int) -> Draw:
+        """The same for the same numbers, whoever asks."""
+        rng = np.random.default_rng((seed, number, _TAG))
+        noise, sharp, drift = (float(value) for value in rng.uniform(size=3))
+        quality = int(rng.integers(config.jpeg_quality_min, config.jpeg_quality_max + 1))
+        linger, strays = (float(value) for value in rng.uniform(size=2))
+        severe, typical = config.severe_drift_share, config.typical_drift_share
+        return Draw(
+            noise=noise < config.noise_share,
+            look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
+            drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
+            linger_s=(1.0 + linger) / 2 * config.linger_s,
+            strays=strays < config.stray_share,
+        )
+
+
+def messages(job: Message) -> Iterator[Mapping[str, Any]]:
+    """What comes of an order: `{"begun": id}`, then `{"drive": entry}` or `{"dropped": id, "why": …}`, for each drive.
+
+    `{"refused": …}` ends it: the policy's artifacts cannot be used.
+    """
+    order = Order.of_json(job)
+    numbers = range(order.start, order.start + order.count)
+    size = order.tour.per_layout if order.tour is not None else order.config.drives_per_layout
+    kinds = order.config.kinds or SHARES
+    if order.start // size != numbers[-1] // size:
+        raise ValueError("an order is of one layout")
+    try:
+        scenarios = list(
+            training_episodes(order.scenario_seed, order.count, kinds, start=order.start, tasks_per_scene=size)
+        )
+    except ScenarioError:
+        for number in numbers:
+            yield {"dropped": order.id(number), "why": "no such layout"}
+        return
+    with ExitStack() as stack:
+        carriages: dict[int, Carriage] = {}
+        for number, scenario in zip(numbers, scenarios, strict=True):
+            drive_id = order.id(number)
+            if drive_id in order.skip:
+                continue
+            yield {"begun": drive_id}
+            try:
+                if order.tour is None:
+                    entry = _drive(order, number, scenario)
+                else:
+                    seed = scenario.layout_seed
+                    if seed not in carriages:
+                        carriages[seed] = _carriage(order.tour, scenario, scenarios)
+                        stack.callback(carriages[seed].close)
+                    entry = _tour(order, order.tour, number, scenario, carriages[seed])
+                yield {"drive": asdict(entry)}
+            except (NothingToLearnError, SceneError) as error:
+                yield {"dropped": drive_id, "why": str(error)}
+            except InstructionError:
+                yield {"dropped": drive_id, "why": "its instruction is too long for the model"}
+            except ArtifactError as error:
+                yield {"refused": str(error)}
+                return
+
+
+def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
+    config = order.config
+    draw = Draw.of(config, order.seed, number)
+    threshold_m = scenario.episode.threshold_m
+    episode = replace(scenario.episode, id=order.id(number), threshold_m=config.arrive_share * threshold_m)
+    detour = None
+    if draw.strays and order.policy is None:
+        way_rng = np.random.default_rng((order.seed, number, _TAG, 3))
+        detour = draw_detour(scenario.site, episode.robot, scenario.task, config.stray_m, way_rng)
+    plan = DrivePlan(
+        episode=episode,
+        scene=scenario.scene,
+        path=np.array(scenario.task.path, np.float64),
+        look=draw.look,
+        drift=draw.drift,
+        pupil=order.policy is not None,
+        linger_s=draw.linger_s,
+        detour=detour,
+        off_m=DrivePlan.off_m + (0.0 if detour is None else detour.for_m),
+    )
+    rng = np.random.default_rng((order.seed, number, _TAG, 1))
+    # Whoever drives away from the goal is not stuck before somebody, and no more is a pupil.
+    expert = ExpertPolicy(
+        margin_m=config.margin_m,
+        speed_mps=config.speed_mps,
+        told=scenario.task.path,
+        patient=plan.pupil or detour is not None,
+        rests=True,
+        wall_m=config.wall_m,
+    )
+    if order.policy is not None:
+        with PolicyDriver(order.policy, episode, rng) as policy:
+            recorded, driver = record(plan, expert, policy.steer, _teller(scenario)), policy.name
+    else:
+        steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _as_wanted
+        recorded, driver = record(plan, expert, steer, _teller(scenario)), "expert-noise" if draw.noise else "expert"
+    return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
+
+
+def _carriage(tour: TourConfig, scenario: Scenario, scenarios: Sequence[Scenario]) -> Carriage:
+    """Of a scenario's layout; the first one there says how many people there are, whoever is asked for first."""
+    first = next(each for each in scenarios if each.layout_seed == scenario.layout_seed)
+    return Carriage(scenario.site, min(first.episode.people, tour.people_most))
+
+
+def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, carriage: Carriage) -> Entry:
+    draw = Draw.of(order.config, order.seed, number)
+    rng = np.random.default_rng((order.seed, number, _TAG, 2))
+    recorded = carried(scenario, carriage, tour, draw.look, draw.drift, order.config, rng)
+    about = replace(_about(scenario, order.id(number), recorded, TOUR_DRIVER, draw), people=carriage.count)
+    return _saved(order, Drive(about, **recorded.arrays))
+
+
+def _saved(order: Order, drive: Drive) -> Entry:
+    path = Path(order.folder) / DRIVES / f"{drive.id}.safetensors"
+    drive.save(path)
+    return Entry.of(drive, path)
+
+
+def _as_wanted(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+    return wanted, EXPERT
+
+
+def _noisy(noise: SteeringNoise, _: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+    return noise.command(wanted)
+
+
+def _teller(scenario: Scenario) -> Tell:
+    tracer = Tracer(scenario)
+
+    def tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
+        means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
+        return tracer.trace(world.pose(), world.people(), world.people_velocities(), means).to_json()
+
+    return tell
+
+
+def _about(scenario: Scenario, drive_id: str, recorded: Recorded, driver: str, draw: Draw) -> About:
+    episode = scenario.episode
+    traces = tuple({"k": TRACE_EVERY * i, **trace} for i, trace in enumerate(recorded.traces))
+    return About(
+        id=drive_id,
+        kind=scenario.kind,
+        layout_seed=scenario.layout_seed,
+        scene=scenario.scene.name,
+        robot=episode.robot,
+        people=episode.people,
+        seed=episode.seed,
+        driver=driver,
+        drift=draw.drift,
+        goal_xy=episode.goal_xy,
+        threshold_m=episode.threshold_m,
+        outcome=recorded.outcome,
+        collided=recorded.collided,
+        wordings=scenario.wordings,
+        told=tuple(scenario.told_json()),
+        traces=traces,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(worker_main(f"python -m {MODULE}", messages))

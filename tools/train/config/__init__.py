@@ -1,0 +1,1 @@
+"""What a training run is made of: the recipe, the configuration of every stage, and named variants."""

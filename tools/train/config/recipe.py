@@ -1,0 +1,203 @@
+"""What a training run is made of: a network, a seed and one table of numbers a stage, read strictly from TOML."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+from zlib import crc32
+
+import numpy as np
+
+from export.core.settings import MODEL_PREFIX, model_settings
+from export.core.typed import FieldError, build, field_types, from_text, near, plain
+from export.model.config import ModelConfigError, TicVlaConfig
+from export.model.config_file import config_for, config_from_dict, with_overrides
+from reporting.toml_text import toml_text
+from tools.train.config.collect import CollectConfig, DaggerConfig
+from tools.train.config.encoder import EncoderConfig
+from tools.train.config.evaluate import EvaluateConfig
+from tools.train.config.imitate import ImitateConfig
+from tools.train.config.rl import RlConfig
+from tools.train.config.sft import SftConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SCHEMA: Final = 1
+FOLDER: Final = Path(__file__).parent / "recipes"
+STAGES: Final[Mapping[str, type]] = {
+    "collect": CollectConfig,
+    "encoder": EncoderConfig,
+    "sft": SftConfig,
+    "imitate": ImitateConfig,
+    "rl": RlConfig,
+    "evaluate": EvaluateConfig,
+}
+"""Name of a stage and the dataclass of its numbers."""
+MAX_RECIPE_BYTES: Final = 1 << 20
+
+
+class RecipeError(ValueError):
+    """A recipe that cannot be used; one line: what, expected, found."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One training run. A stage's numbers are None where a caller that runs other stages alone leaves them out."""
+
+    name: str
+    seed: int
+    model: TicVlaConfig
+    collect: CollectConfig | None = None
+    encoder: EncoderConfig | None = None
+    sft: SftConfig | None = None
+    imitate: ImitateConfig | None = None
+    rl: RlConfig | None = None
+    evaluate: EvaluateConfig | None = None
+    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+
+    def __post_init__(self) -> None:
+        if not self.name or not 0 <= self.seed < 2**31:
+            raise RecipeError(f"expected a name and a seed from 0 to 2^31 - 1, found {self.name!r} and {self.seed}")
+
+    def to_tables(self) -> dict[str, Any]:
+        """Every number of the run, defaults included, as plain tables."""
+        stages = {name: plain(getattr(self, name)) for name in STAGES if getattr(self, name) is not None}
+        dagger = plain(self.dagger)
+        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed}
+        return {**head, "model": self.model.to_dict(), **stages, "dagger": dagger}
+
+    def to_toml(self) -> str:
+        """The same for people; `resolved` reads it back."""
+        return toml_text(self.to_tables())
+
+
+def recipe_names() -> list[str]:
+    """The shipped recipes."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
+    """A shipped recipe or a `.toml` file, with `--set KEY=VALUE` applied; raises RecipeError.
+
+    KEY is `seed`, `STAGE.field` or `model.SECTION.field`. A file names a preset and what it changes of it
+    (`[model] preset`, `[model.set] "action.layers"`), or is what `Recipe.to_toml` wrote.
+    """
+    path = FOLDER / f"{name_or_path}.toml" if name_or_path in recipe_names() else Path(name_or_path)
+    if path.suffix != ".toml":
+        raise RecipeError(f"recipe {name_or_path!r}: expected one of {', '.join(recipe_names())}, or a .toml file")
+    try:
+        if path.stat().st_size > MAX_RECIPE_BYTES:
+            raise RecipeError(f"recipe {path}: more than {MAX_RECIPE_BYTES} bytes, which is no recipe")
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecipeError(f"recipe {path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, RecipeError):
+            raise
+        raise RecipeError(f"recipe {path}: {error}") from error
+    try:
+        return recipe_of(tables, overrides)
+    except (FieldError, ModelConfigError, RecipeError) as error:
+        raise RecipeError(f"recipe {path}: {error}") from error
+
+
+def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+    """A recipe from its tables; raises RecipeError, FieldError, ModelConfigError."""
+    known = ("schema", "name", "seed", "model", "dagger", *STAGES)
+    for key in tables:
+        if key not in known:
+            raise RecipeError(f"unknown key {key!r}; {near(key, known)}")
+    if tables.get("schema") != SCHEMA:
+        raise RecipeError(f"expected schema = {SCHEMA}, found {tables.get('schema')!r}")
+    content: dict[str, Any] = {
+        key: dict(value) if isinstance(value, Mapping) else value for key, value in tables.items()
+    }
+    kinds = {**STAGES, "dagger": DaggerConfig}
+    for setting in overrides:
+        _set(content, kinds, setting)
+    stages: dict[str, Any] = {
+        name: build(kind, filled(kind(), content.get(name, {})), f"[{name}]") for name, kind in kinds.items()
+    }
+    model = with_overrides(_model(content.get("model")), model_settings(overrides))
+    name, seed = content.get("name"), content.get("seed")
+    if not isinstance(name, str) or type(seed) is not int:
+        raise RecipeError(f"expected name, a text, and seed, a whole number; found {name!r} and {seed!r}")
+    return Recipe(name, seed, model, **stages)
+
+
+def filled(default: object, table: object) -> object:
+    """A table over the numbers of `default`, nested tables too: `optim.lr` alone changes nothing else."""
+    if not isinstance(table, Mapping):
+        return table
+    whole = {**plain(default), **table}
+    for name, value in table.items():
+        own = getattr(default, str(name), None)
+        if dataclasses.is_dataclass(own):
+            whole[name] = filled(own, value)
+    return whole
+
+
+def stage_seed(recipe: Recipe, stage: str) -> int:
+    """The seed of a stage's job: of the run's seed, another one for every stage."""
+    return int(np.random.default_rng((recipe.seed, crc32(stage.encode()))).integers(2**31))
+
+
+def _model(table: object) -> TicVlaConfig:
+    """A preset with changes, or every number of a network."""
+    if not isinstance(table, Mapping):
+        raise RecipeError("expected a table [model] with preset")
+    if "preset" not in table:
+        return config_from_dict(dict(table))
+    if extra := sorted(set(table) - {"preset", "set"}):
+        raise RecipeError(f"[model]: unknown key {extra[0]!r}; expected preset and set")
+    changes = table.get("set", {})
+    if not isinstance(table["preset"], str) or not isinstance(changes, Mapping):
+        raise RecipeError('[model]: expected preset = "NAME" and a table [model.set]')
+    texts = {str(key): _as_text(value) for key, value in changes.items()}
+    return with_overrides(config_for(table["preset"]), texts)
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> None:
+    """Put one `KEY=VALUE` into the tables as a value of its field's type."""
+    key, equals, text = (part.strip() for part in setting.partition("="))
+    where = f"--set {setting}"
+    if not equals:
+        raise RecipeError(f"{where}: expected KEY=VALUE")
+    if key.startswith(MODEL_PREFIX):
+        return
+    if key in ("seed", "name"):
+        content[key] = from_text(int if key == "seed" else str, text, where)
+        return
+    section, *path = key.split(".")
+    if section not in kinds or not path:
+        raise RecipeError(f"{where}: unknown key; {near(section, [*kinds, 'seed', 'model'])} as STAGE.field")
+    kind: object = kinds[section]
+    table = content.setdefault(section, {})
+    if not isinstance(table, dict):
+        raise RecipeError(f"[{section}]: expected a table, found {table!r}")
+    for name in path[:-1]:
+        kind = _fields_of(kind).get(name)
+        table[name] = dict(table.get(name, {}))
+        table = table[name]
+    known = _fields_of(kind)
+    if path[-1] not in known:
+        raise RecipeError(f"{where}: unknown key {path[-1]!r}; {near(path[-1], known)}")
+    table[path[-1]] = from_text(known[path[-1]], text, where)
+
+
+def _fields_of(kind: object) -> dict[str, Any]:
+    """Types of a dataclass's fields; none of another type."""
+    return field_types(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}

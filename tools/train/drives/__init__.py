@@ -1,0 +1,1 @@
+"""Recorded drives on disk: one file a drive, data sets, windows and future poses."""

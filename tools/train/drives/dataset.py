@@ -1,0 +1,143 @@
+"""The writing half of a data set: drives come one by one, in any order, and a run that was killed goes on.
+
+`index.jsonl` gets a line as each drive comes, or as one is given up; `dataset.json` is the index made of it at the end,
+sorted, so that the same drives give the same file whatever the order.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any, Final
+
+from edge.core.cli import write_whole
+from tools.train.drives.drive import DRIVES, FORMAT, INDEX, Dataset, DriveError, Entry, intact
+
+LINES: Final = "index.jsonl"
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A drive that was given up: nothing of it is in the data set but that it was."""
+
+    id: str
+    why: str
+
+
+class DatasetWriter:
+    """One writer at a time; methods raise OSError when the disk fails."""
+
+    def __init__(self, folder: Path) -> None:
+        """Make a data set, or go on with one, less drives whose file is not whole. Raises DriveError."""
+        (folder / DRIVES).mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self._lock = _locked(folder)
+        self._entries: dict[str, Entry] = {}
+        self._dropped: dict[str, Dropped] = {}
+        for partial in (folder / DRIVES).glob("*.partial"):
+            partial.unlink()
+        for entry in _read(folder / LINES):
+            if isinstance(entry, Dropped):
+                self._dropped[entry.id] = entry
+            elif intact(self.path(entry.id), entry):
+                self._entries[entry.id] = entry
+        self._rewrite()
+
+    def path(self, drive_id: str) -> Path:
+        """Where a drive's file belongs."""
+        return self.folder / DRIVES / f"{drive_id}.safetensors"
+
+    def has(self, drive_id: str) -> bool:
+        """Whether that drive is there, or was given up."""
+        return drive_id in self._entries or drive_id in self._dropped
+
+    def entries(self, prefix: str = "") -> list[Entry]:
+        """Drives that are there, sorted, of those whose id begins so."""
+        return [entry for key, entry in sorted(self._entries.items()) if key.startswith(prefix)]
+
+    def dropped(self, prefix: str = "") -> list[Dropped]:
+        """Drives that were given up, likewise."""
+        return [dropped for key, dropped in sorted(self._dropped.items()) if key.startswith(prefix)]
+
+    def add(self, entry: Entry) -> None:
+        """Take in a drive whose file has been written."""
+        self._entries[entry.id] = entry
+        self._append({"drive": asdict(entry)})
+
+    def drop(self, drive_id: str, why: str) -> None:
+        """Take note that there will be no such drive."""
+        self._dropped[drive_id] = Dropped(drive_id, why)
+        self._append({"dropped": asdict(self._dropped[drive_id])})
+
+    def finish(self) -> Dataset:
+        """Write the index of what there is, and open it."""
+        drives = [asdict(entry) for entry in self.entries()]
+        dropped = [asdict(each) for each in self.dropped()]
+        content = {"format": FORMAT, "drives": drives, "dropped": dropped}
+        write_whole(self.folder / INDEX, json.dumps(content, indent=1, sort_keys=True) + "\n")
+        return Dataset.open(self.folder)
+
+    def summary(self, prefix: str = "") -> dict[str, Any]:
+        """Counts, for a result: drives, frames, bytes, collisions, outcomes, kinds, why others were given up."""
+        entries, dropped = self.entries(prefix), self.dropped(prefix)
+        return {
+            "drives": len(entries),
+            "frames": sum(entry.frames for entry in entries),
+            "bytes": sum(entry.bytes for entry in entries),
+            "val_drives": sum(entry.val for entry in entries),
+            "collided": sum(entry.collided for entry in entries),
+            "outcomes": dict(sorted(Counter(entry.outcome for entry in entries).items())),
+            "kinds": dict(sorted(Counter(entry.kind for entry in entries).items())),
+            "dropped": dict(sorted(Counter(each.why for each in dropped).items())),
+        }
+
+    def close(self) -> None:
+        """Let other writers in."""
+        self._lock.close()
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _append(self, content: Mapping[str, Any]) -> None:
+        with (self.folder / LINES).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(content) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _rewrite(self) -> None:
+        """Without torn lines, and without drives whose files have gone."""
+        lines = [{"drive": asdict(entry)} for entry in self.entries()]
+        lines += [{"dropped": asdict(each)} for each in self.dropped()]
+        write_whole(self.folder / LINES, "".join(json.dumps(line) + "\n" for line in lines))
+
+
+def _read(path: Path) -> list[Entry | Dropped]:
+    """What was noted; the last line may be torn."""
+    if not path.exists():
+        return []
+    found: list[Entry | Dropped] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            content = json.loads(line)
+            found.append(Entry(**content["drive"]) if "drive" in content else Dropped(**content["dropped"]))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return found
+
+
+def _locked(folder: Path) -> IO[bytes]:
+    lock = (folder / ".lock").open("wb")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        raise DriveError(f"{folder}: another process writes this data set; wait for it, or end it") from error
+    return lock

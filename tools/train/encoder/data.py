@@ -1,0 +1,248 @@
+"""Training pictures of the encoder on disk: shards of one scene each, with labels, each keyed by what it was made with.
+
+A shard is `NAME.safetensors` and, written after it, `NAME.json` with its key and hash: a file without its JSON, or of
+another key, is made again. `fill` makes what is missing in processes of their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from edge.core.cli import write_whole
+from export.core.typed import build, plain
+from sim_hil.benchmark.suite.episode import ROBOTS
+from sim_hil.benchmark.workers.worker_pool import Told, Workers
+from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
+from tools.train.config.scenes import CORRIDOR, OUTDOORS
+from tools.train.drives.drive import file_sha256
+from tools.train.encoder.labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
+from tools.train.run.job import StageProgress
+from tools.train.samples.augment import Picture, decoded
+
+FORMAT: Final = 2
+WORKER: Final = "tools.train.encoder.worker"
+FIRST_LAYOUT: Final = 10_000_000_000
+"""Of layouts that pictures are taken in: above every seed that drives are recorded in
+(`tools.train.scenes.scenarios`)."""
+_OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts
+_TAG: Final = 0xE0C0
+_POLL_S: Final = 0.5
+_CORRIDOR_MOST: Final = 12
+_LEAST_HELD: Final = 32  # pictures of a scene, which takes seconds to build
+_EMPTY_SHARE: Final = 0.12  # of scenes indoors
+
+
+class FramesError(ValueError):
+    """Training pictures that cannot be made or read; one line."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One scene's pictures: where, which robot, how many people and pictures. `side`: of the tokens' square."""
+
+    name: str
+    kind: str
+    layout_seed: int
+    robot: str
+    people: int
+    frames: int
+    seed: int
+    side: int
+    held: bool
+    moment: int
+    moment_s: float
+    sharp_share: float
+    jpeg_quality_min: int
+    jpeg_quality_max: int
+
+    @property
+    def key(self) -> str:
+        """Hash of all that decides what is in it, apart from the code that draws."""
+        made = {
+            "format": FORMAT,
+            "shard": plain(self),
+            "classes": CLASSES,
+            "colours": COLOUR_WORDS,
+            "openings": OPENINGS,
+            "pixels": PIXELS,
+        }
+        return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
+
+    @staticmethod
+    def of_json(content: dict[str, Any]) -> Shard:
+        """What `plain` has written; raises FieldError."""
+        return build(Shard, content, "shard")
+
+
+@dataclass(frozen=True)
+class Made:
+    """A shard that is there."""
+
+    name: str
+    key: str
+    sha256: str
+    bytes: int
+
+
+def plan(config: FramesConfig, seed: int, side: int) -> list[Shard]:
+    """All shards of a stage: those to learn from, then the held-out ones. The same arguments give the same."""
+    return _planned(config, seed, side, held=False) + _planned(config, seed, side, held=True)
+
+
+def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[Shard]:
+    kinds = [kind for kind in config.kinds if not (held and kind == CORRIDOR)]
+    left = config.held if held else config.count
+    # Held-out pictures come from many layouts: they tell more about new ones than many pictures of one.
+    per_scene = config.per_scene
+    if held and left:
+        per_scene = min(per_scene, max(_LEAST_HELD, -(-left // (4 * len(set(kinds))))))
+    shards: list[Shard] = []
+    while left > 0:
+        number = len(shards)
+        rng = np.random.default_rng((seed, _TAG, int(held), number))
+        kind = kinds[(number + number // len(kinds)) % len(kinds)]
+        layout_seed = FIRST_LAYOUT + seed % 1_000 * _OF_A_SEED + (_HELD_FROM if held else 0) + number
+        frames = min(per_scene, left)
+        # In turn within each kind: by chance one would have most of the scenes of one kind.
+        robot = ROBOTS[sum(shard.kind == kind for shard in shards) % len(ROBOTS)]
+        people = _people(config, kind, rng)
+        name = f"{'held' if held else 'train'}-{number:04d}-{kind}-{robot}"
+        shards.append(
+            Shard(
+                name, kind, layout_seed, robot, people, frames, int(rng.integers(2**31)), side, held,
+                config.moment, config.moment_s, config.sharp_share, config.jpeg_quality_min, config.jpeg_quality_max,
+            )
+        )  # fmt: skip
+        left -= frames
+    return shards
+
+
+def _people(config: FramesConfig, kind: str, rng: np.random.Generator) -> int:
+    if kind in OUTDOORS:
+        return int(rng.integers(OUTDOORS_LEAST, config.people_outdoors + 1))
+    most = min(config.people_indoors, _CORRIDOR_MOST) if kind == CORRIDOR else config.people_indoors
+    return 0 if rng.uniform() < _EMPTY_SHARE else int(rng.integers(0, most + 1))
+
+
+def made(folder: Path, shard: Shard) -> Made | None:
+    """What the folder has of a shard: None unless it was made with the same numbers and is whole."""
+    try:
+        content = Made(**json.loads((folder / f"{shard.name}.json").read_text(encoding="utf-8")))
+        whole = path_of(folder, shard.name).stat().st_size == content.bytes
+    except (OSError, ValueError, TypeError):
+        return None
+    return content if whole and content.key == shard.key else None
+
+
+def path_of(folder: Path, name: str) -> Path:
+    """Where a shard's pictures and labels lie."""
+    return folder / f"{name}.safetensors"
+
+
+def fill(
+    folder: Path, shards: Sequence[Shard], jobs: int, progress: StageProgress, should_stop: Callable[[], bool]
+) -> None:
+    """Make the shards that the folder lacks. Raises FramesError, OSError; KeyboardInterrupt when told to stop."""
+    logs = folder / "logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    for partial in folder.glob("*.partial"):
+        partial.unlink()
+    missing = [shard for shard in shards if made(folder, shard) is None]
+    total = sum(shard.frames for shard in shards)
+    before = total - sum(shard.frames for shard in missing)
+    taken: dict[str, int] = {}
+    progress.update(before, total)
+    # The slowest first, so that no core idles at the end.
+    waiting = sorted(missing, key=lambda shard: (shard.people * shard.frames, shard.name))
+    workers = Workers([sys.executable, "-m", WORKER], jobs or len(os.sched_getaffinity(0)))
+    try:
+        while waiting or workers.running():
+            if should_stop():
+                raise KeyboardInterrupt
+            while waiting and workers.free():
+                shard = waiting.pop()
+                job = {"folder": str(folder), "shard": plain(shard)}
+                workers.start(shard.name, job, logs / f"{shard.name}.log")
+            for told in workers.wait(_POLL_S):
+                _note(told, taken)
+            progress.update(before + sum(taken.values()), total)
+    finally:
+        workers.close()
+    with suppress(OSError):  # logs of processes that failed stay
+        logs.rmdir()
+
+
+def _note(told: Told, taken: dict[str, int]) -> None:
+    if told.message is not None:
+        taken[told.key] = int(told.message["frames"])
+    elif told.why:
+        raise FramesError(f"pictures of {told.key}: their process {told.why}; go on with --resume")
+
+
+def frames_sha256(folder: Path, shards: Sequence[Shard]) -> str:
+    """Of all shards: the same pictures give the same, in whatever order they were made. Raises FramesError."""
+    lines = []
+    for shard in shards:
+        there = made(folder, shard)
+        if there is None:
+            raise FramesError(f"{path_of(folder, shard.name)}: missing, or made with other numbers")
+        lines.append(f"{there.name} {there.sha256}\n")
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+class FrameSet:
+    """Pictures of some shards as one list; labels are in memory, pictures are read as they are asked for."""
+
+    def __init__(self, folder: Path, shards: Sequence[Shard]) -> None:
+        """Opens all shards, which must be there. Raises FramesError."""
+        self._files: list[Any] = []
+        self._ends: list[NDArray[np.int64]] = []
+        parts: dict[str, list[NDArray[np.generic]]] = {}
+        for shard in shards:
+            path = path_of(folder, shard.name)
+            try:
+                file = safe_open(path, framework="numpy")
+                labels = {name: file.get_tensor(name) for name in label_shapes(shard.side)}
+                ends = file.get_tensor("jpeg_end")
+            except (OSError, SafetensorError) as error:
+                raise FramesError(f"{path}: not readable ({error}); delete it and go on with --resume") from error
+            for name, (kind, shape) in label_shapes(shard.side).items():
+                if labels[name].shape != (shard.frames, *shape) or labels[name].dtype != kind:
+                    raise FramesError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
+                parts.setdefault(name, []).append(labels[name])
+            self._files.append(file.get_slice("jpeg"))
+            self._ends.append(ends)
+        self.labels = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+        self._starts = np.cumsum([0, *(len(ends) for ends in self._ends)])
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def picture(self, index: int) -> Picture:
+        """Picture number `index`, uint8 RGB [px, px, 3]."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"pictures: expected a number of 0 to {len(self) - 1}, found {index}")
+        shard = int(np.searchsorted(self._starts, index, side="right")) - 1
+        k, ends = index - int(self._starts[shard]), self._ends[shard]
+        start = int(ends[k - 1]) if k else 0
+        return decoded(np.asarray(self._files[shard][start : int(ends[k])], np.uint8))
+
+
+def finish(folder: Path, shard: Shard) -> Made:
+    """Say that a shard's file has been written as a whole; what `made` then finds. Raises OSError."""
+    path = path_of(folder, shard.name)
+    done = Made(shard.name, shard.key, file_sha256(path), path.stat().st_size)
+    write_whole(folder / f"{shard.name}.json", json.dumps(asdict(done), sort_keys=True) + "\n")
+    return done

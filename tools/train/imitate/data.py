@@ -1,0 +1,257 @@
+"""Samples of imitation under delay (paper, Algorithm 1): a frame, an older semantic state, and how far apart they are.
+
+Frame k is drawn by weight, the age Δt from its distribution, and the state is that of frame k - 10 Δt: one that has a
+state, so that Δt and the motion offset are exact. Before a drive's first frame the robot stood there: an age that
+reaches beyond it meets the first state, as every instruction's first generation does. Frames that act on one state are
+drawn together, because they share its keys and values.
+
+A sample's inputs are of frame k and before; only its label is of the future.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import radians
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.core.geometry import SE2
+from edge.motion.guidance import waypoints_now
+from edge.state.reasoning_text import Waypoints
+from export.model.config import TicVlaConfig
+from tools.train.config.collect import RATE_HZ
+from tools.train.config.imitate import SampleConfig
+from tools.train.samples.action_batch import Around, Group
+from tools.train.samples.delays import Delays
+from tools.train.samples.drive_frames import DriveFrames
+from tools.train.samples.kv_cache import CachedState
+from tools.train.samples.language_batch import FrameTokens
+from tools.train.scenes.walls import nothing_near
+
+Array = NDArray[np.float64]
+
+
+class SampleError(ValueError):
+    """Drives that give no samples, or a network that cannot learn from them; one line."""
+
+
+class States(Protocol):
+    """Semantic states of drives, as `KvCache` has them."""
+
+    draws: int
+    """States of each anchor."""
+
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """Frames that have a state, evenly spaced."""
+        ...
+
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The state of a generation whose newest frame is k."""
+        ...
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Frames `ks` of drive number `drive` that act on the state of frame `anchor`, `ages` tenths of a second old."""
+
+    drive: int
+    anchor: int
+    ks: tuple[int, ...]
+    ages: tuple[int, ...]
+
+
+class Samples:
+    """Draws groups of samples; all that is random comes from the generator that is given, and in a fixed order."""
+
+    def __init__(
+        self,
+        drives: Iterable[DriveFrames],
+        tokens: FrameTokens,
+        states: States,
+        delays: Delays,
+        config: SampleConfig,
+        model: TicVlaConfig,
+        *,
+        drop: bool = True,
+    ) -> None:
+        """`drop`: with the network's dropouts of K‖V and state. Raises SampleError where there is nothing to draw."""
+        if round(model.action.step_s * RATE_HZ, 6) != 1:
+            raise SampleError(f"action.step_s: labels are 0.1 s apart, found {model.action.step_s:g}")
+        self.drives = tuple(drives)
+        self.config = config
+        self._tokens, self._states, self._delays = tokens, states, delays
+        self._by_waypoints = model.action.semantic_interface == "waypoints"
+        self._near_walls = any(drive.walls is not None for drive in self.drives)
+        self._drop_kv, self._drop_state = (model.action.kv_dropout, model.action.state_dropout) if drop else (0.0, 0.0)
+        # Frames of one state that are all the same age are all the same frame.
+        self.group = config.group if np.count_nonzero(delays.mass) > 1 else 1
+        self._share: list[Array] = []
+        places: list[tuple[int, int, bool]] = []
+        chances: list[float] = []
+        for index, drive in enumerate(self.drives):
+            share, of_anchor, standing = self._chances(drive)
+            self._share.append(share)
+            for anchor, chance in of_anchor.items():
+                places.append((index, anchor, False))
+                chances.append(chance)
+            if standing > 0:
+                places.append((index, 0, True))
+                chances.append(standing)
+        self._places = places
+        self._upto = np.cumsum(chances)
+        if not chances or self._upto[-1] <= 0:
+            raise SampleError("no frame has both a label and a semantic state that is as old as it should be")
+
+    def _anchors(self, drive_id: str) -> tuple[int, ...]:
+        """Frames with states that can guide: a text without waypoints cannot, where they are the guidance."""
+        anchors = self._states.anchors(drive_id)
+        if not self._by_waypoints:
+            return anchors
+        draws = range(self._states.draws)
+        return tuple(
+            k for k in anchors if all(self._states.at(drive_id, k, draw).waypoints is not None for draw in draws)
+        )
+
+    def _chances(self, drive: DriveFrames) -> tuple[Array, dict[int, float], float]:
+        """Each frame's weight by all chances to meet a state of it; chance of each state; that of standing starts."""
+        mass, beyond = self._delays.mass, self._delays.beyond
+        anchors = self._anchors(drive.id)
+        if not anchors:
+            return np.zeros(len(drive)), {}, 0.0
+        # One state stands for as many tenths of a second as there are up to the next one.
+        every = int(np.diff(anchors).min()) if len(anchors) > 1 else RATE_HZ
+        met = np.zeros(len(drive))
+        for anchor in anchors:
+            span = met[anchor : anchor + len(mass)]
+            span += every * mass[: len(span)]
+        standing = np.zeros(len(drive))
+        if drive.stood and anchors[0] == 0:
+            upto = min(len(beyond), len(drive))
+            standing[:upto] = self.config.standing_start * beyond[:upto]
+        whole = met + standing
+        share = np.divide(drive.weight, whole, out=np.zeros(len(drive)), where=whole > 0)
+        of_anchor: dict[int, float] = {}
+        for anchor in anchors:
+            span = share[anchor : anchor + len(mass)]
+            of_anchor[anchor] = float(every * (span @ mass[: len(span)]))
+        return share, of_anchor, float(share @ standing)
+
+    def choose(self, rng: np.random.Generator) -> Chosen:
+        """A state by its chance, then frames that act on it by theirs."""
+        index, anchor, stood = self._places[_pick(self._upto, rng.uniform())]
+        share, mass, beyond = self._share[index], self._delays.mass, self._delays.beyond
+        if not stood:
+            span = share[anchor : anchor + len(mass)]
+            upto = np.cumsum(span * mass[: len(span)])
+            ages = [_pick(upto, u) for u in rng.uniform(size=self.group)]
+            return Chosen(index, anchor, tuple(anchor + age for age in ages), tuple(ages))
+        span = share[: len(beyond)]
+        upto = np.cumsum(span * beyond[: len(span)])
+        ks = [_pick(upto, u) for u in rng.uniform(size=self.group)]
+        older = [
+            k + 1 + _pick(np.cumsum(mass[k + 1 :]), u) for k, u in zip(ks, rng.uniform(size=self.group), strict=True)
+        ]
+        return Chosen(index, 0, tuple(ks), tuple(older))
+
+    def take(self, chosen: Chosen, rng: np.random.Generator) -> Group:
+        """What the network is given of a choice, and the labels."""
+        drive, count = self.drives[chosen.drive], len(chosen.ks)
+        which, cut, end = rng.uniform(size=3)
+        noise = rng.standard_normal((count, 3))
+        keep_state = rng.uniform(size=count) >= self._drop_state
+        state = self._states.at(drive.id, chosen.anchor, int(which * self._states.draws))
+        ks = list(chosen.ks)
+        offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
+        told_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
+        latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(told_s, offsets, strict=True)]
+        guidance: NDArray[np.floating]
+        if self._by_waypoints:
+            guidance = self._waypoints(state, offsets)
+            keep = np.ones(guidance.shape[:2], bool)
+        else:
+            rows = state.kv[: self._length(state, cut, end)]
+            guidance = np.array(rows)[None]
+            keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
+            if self.config.reasoning and self._text_alone(cut):
+                keep[:, : state.prompt_tokens] = False
+        frames = self._tokens.frames(drive.id)
+        visual = np.stack([frames[k] for k in ks])
+        if self.config.blind:
+            visual[rng.uniform(size=count) < self.config.blind] = 0
+        return Group(
+            visual_tokens=visual,
+            state=drive.state[ks],
+            latency=np.array(latency, np.float32),
+            guidance=guidance,
+            goal=drive.goal[ks],
+            keep_guidance=keep,
+            keep_state=keep_state,
+            target=drive.target[ks],
+            known=np.arange(drive.target.shape[1]) < drive.known[ks][:, None],
+            around=self._around(drive, ks) if self._near_walls else None,
+        )
+
+    @staticmethod
+    def _around(drive: DriveFrames, ks: list[int]) -> Around:
+        """Walls around the robot in some frames."""
+        if drive.walls is None:
+            return Around(nothing_near(len(ks)), np.zeros((len(ks), 2), np.float32))
+        body = drive.walls.body
+        return Around(drive.walls.patches(ks), np.full((len(ks), 2), (body.reach_m, body.radius_m), np.float32))
+
+    def said(self, chosen: Chosen) -> Waypoints | None:
+        """Waypoints of the state that a choice acts on, m in the anchor's robot frame; None where it has none."""
+        return self._states.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
+
+    def draw(self, rng: np.random.Generator) -> Group:
+        """Choose and take."""
+        return self.take(self.choose(rng), rng)
+
+    def _length(self, state: CachedState, cut: float, end: float) -> int:
+        """Tokens of a state that the policy is given."""
+        said = len(state.kv) - state.prompt_tokens
+        if not self.config.reasoning or cut >= 1 - self.config.prompt_only:
+            return state.prompt_tokens
+        return state.prompt_tokens + (int(end * (said + 1)) if cut < self.config.cut_text else said)
+
+    def _text_alone(self, cut: float) -> bool:
+        """Whether a state is given without its prompt; `cut` is what `_length` is given."""
+        return self.config.cut_text <= cut < self.config.cut_text + self.config.text_only
+
+    def _offset(self, drive: DriveFrames, anchor: int, k: int, noise: Array) -> SE2:
+        way_m = float(drive.way_m[k] - drive.way_m[anchor])
+        shift, turn = self.config.offset_noise_m_per_m * way_m, radians(self.config.offset_noise_deg_per_m) * way_m
+        exact = drive.offset(anchor, k)
+        return SE2(exact.x_m + shift * noise[0], exact.y_m + shift * noise[1], exact.theta_rad + turn * noise[2])
+
+    def _waypoints(self, state: CachedState, offsets: Sequence[SE2]) -> NDArray[np.float32]:
+        points = state.waypoints
+        assert points is not None  # `_anchors` has left the others out
+        return np.concatenate([waypoints_now(points, offset) for offset in offsets])
+
+
+def _pick(upto: Array, uniform: float) -> int:
+    """Index drawn by cumulated chances; `uniform` in [0, 1). One that has no chance is never drawn."""
+    return int(np.searchsorted(upto, uniform * upto[-1], side="right"))
+
+
+class NoStates:
+    """In a cache's place for a policy that is told nothing: every frame has a state, of one token without content."""
+
+    draws = 1
+
+    def __init__(self, frames: Mapping[str, int], width: int) -> None:
+        """`frames`: how many each drive has."""
+        self._frames = frames
+        self._state = CachedState(np.zeros((1, width), np.float16), 1, "", own=False)
+
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """All frames."""
+        return tuple(range(self._frames[drive_id]))
+
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The same for every frame."""
+        return self._state

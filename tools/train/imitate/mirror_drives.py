@@ -1,0 +1,150 @@
+"""Whole drives as a mirror shows them, to learn to drive in twice as many places as were recorded.
+
+Frames' tokens are those that fine-tuning has made of the mirrored pictures, one a second: what is driven there is
+learned at whole seconds alone, which is enough, for neighbouring frames hardly differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.train.config.collect import TRACE_EVERY
+from tools.train.drives.drive import Dataset, Drive
+from tools.train.imitate.data import States
+from tools.train.samples.drive_frames import DriveFrames
+from tools.train.samples.kv_cache import CachedState
+from tools.train.samples.language_batch import FrameRows, FrameTokens, Halves
+from tools.train.samples.mirror import mirrored_text
+
+MIRROR: Final = "mirror-of-"
+"""Before the id of a drive: the drive in the mirror."""
+STATES: Final = "kv-mirrored"
+"""Folder of the mirrored drives' semantic states, beside the drives."""
+
+
+def mirrored_drive(drive: Drive) -> Drive:
+    """The drive in the mirror, without pictures."""
+    about = drive.about
+    x_m, y_m = about.goal_xy
+    return replace(
+        drive,
+        about=replace(
+            about,
+            goal_xy=(x_m, 0.0 - y_m),
+            wordings=tuple(mirrored_text(wording) for wording in about.wordings),
+            traces=tuple(_mirrored_trace(trace) for trace in about.traces),
+        ),
+        jpeg=np.zeros(0, np.uint8),
+        pose=_flipped(drive.pose, 1, 2),
+        pose_odom=_flipped(drive.pose_odom, 1, 2),
+        state=_flipped(drive.state, 1, 2),
+        future=_flipped(drive.future, 1, 2),
+        plan_xy=_flipped(drive.plan_xy, 1),
+    )
+
+
+def _flipped(array: NDArray[Any], *axes: int) -> NDArray[Any]:
+    """With another sign in some places of the last axis; zeros stay without one."""
+    array = array.copy()
+    for axis in axes:
+        array[..., axis] = 0.0 - array[..., axis]
+    return array
+
+
+def _mirrored_trace(trace: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: mirrored_text(value) if isinstance(value, str) else value for key, value in trace.items()}
+
+
+class MirroredDrives(Dataset):
+    """A data set whose drives are in the mirror; ids are the same."""
+
+    @staticmethod
+    def of(dataset: Dataset) -> MirroredDrives:  # type: ignore[override]  # makes one; the parent's picks drives
+        """The mirror of a data set."""
+        return MirroredDrives(dataset.folder, dataset.entries)
+
+    def load(self, drive_id: str, *, pictures: bool = False) -> Drive:
+        """One drive, always without pictures. Raises DriveError."""
+        return mirrored_drive(super().load(drive_id, pictures=False))
+
+
+def mirrored_frames(drive: DriveFrames) -> DriveFrames:
+    """What samples need of a mirrored drive: its id says so, and only whole seconds can be drawn."""
+    weight = np.where(np.arange(len(drive)) % TRACE_EVERY == 0, drive.weight, 0.0)
+    return replace(drive, id=MIRROR + drive.id, weight=weight)
+
+
+class Seconds:
+    """Tokens of whole seconds, by the number of the frame. Raises IndexError for another frame."""
+
+    def __init__(self, rows: FrameRows) -> None:
+        self._rows = rows
+
+    def __getitem__(self, k: int) -> Halves:
+        if k % TRACE_EVERY:
+            raise IndexError(f"frame {k}: of the mirror there are whole seconds alone")
+        return self._rows[k // TRACE_EVERY]
+
+
+class MirrorTokens:
+    """Tokens of mirrored drives as those of others are asked for."""
+
+    def __init__(self, seconds: FrameTokens) -> None:
+        self._seconds = seconds
+
+    def frames(self, drive_id: str) -> Seconds:
+        """Indexed by frame."""
+        return Seconds(self._seconds.frames(drive_id))
+
+
+class BothTokens:
+    """Tokens of drives, and under MIRROR those of their mirror images."""
+
+    def __init__(self, plain: FrameTokens, mirror: MirrorTokens) -> None:
+        self._plain, self._mirror = plain, mirror
+
+    def frames(self, drive_id: str) -> FrameRows:
+        """Indexed by frame."""
+        of_mirror = drive_id.startswith(MIRROR)
+        return self._mirror.frames(drive_id.removeprefix(MIRROR)) if of_mirror else self._plain.frames(drive_id)
+
+
+class BothStates:
+    """Semantic states of drives, and under MIRROR those of their mirror images; as many draws of each."""
+
+    def __init__(self, plain: States, mirror: States) -> None:
+        self._plain, self._mirror = plain, mirror
+        self.draws = plain.draws
+
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """Frames that have a state."""
+        return self._of(drive_id).anchors(drive_id.removeprefix(MIRROR))
+
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The state of a generation whose newest frame is k."""
+        return self._of(drive_id).at(drive_id.removeprefix(MIRROR), k, draw)
+
+    def _of(self, drive_id: str) -> States:
+        return self._mirror if drive_id.startswith(MIRROR) else self._plain
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Where tokens and states of the mirrored drives come from, by the ids of the drives."""
+
+    tokens: MirrorTokens
+    states: States
+
+
+def balanced(plain: list[DriveFrames], mirror: list[DriveFrames], share: float) -> list[DriveFrames]:
+    """All drives, the mirrored ones weighted so that `share` of what is drawn is theirs."""
+    own, others = (sum(float(drive.weight.sum()) for drive in drives) for drives in (plain, mirror))
+    if not share or not own or not others:
+        return plain
+    factor = share / (1 - share) * own / others
+    return plain + [replace(drive, weight=factor * drive.weight) for drive in mirror]

@@ -1,0 +1,1 @@
+"""The steps of a training run in their order: plan, chain of stages, evaluation, model card."""

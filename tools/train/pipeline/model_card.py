@@ -1,0 +1,244 @@
+"""The model card: what the weights are, what they were made of, how well they do, and what they are not for.
+
+A run that went on from weights with a card has that card's data and training at its end: nothing of a chain is lost.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from safetensors import safe_open
+
+from edge.core.cli import write_whole
+from export.model.network import PARTS
+from export.model.weights import WeightsInfo, save_weights
+from reporting.build_progress import duration
+from tools.train.config.recipe import STAGES, Recipe
+from tools.train.drives.drive import file_sha256
+from tools.train.pipeline.chain import ADOPTED, GO_ON
+from tools.train.run.network_file import CARD, START, START_CARD, read_network, stage_weights
+from tools.train.run.own_drives import IMPORTED
+from tools.train.run.run_dir import VERSIONS, RunDir
+
+_HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # there are six levels
+_THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
+_BEFORE: Final = "## What it went on from"
+_OUR_DRIVES: Final = (
+    "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
+    "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
+    "which a test holds. No recording of a person or a place is in it.",
+)
+_OTHERS_DRIVES: Final = (
+    "Drives that were recorded elsewhere and imported (`--drives`); whose they are, this run cannot know.",
+)
+_LIMITS_HERE: Final = """\
+* It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
+  does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
+"""
+_LIMITS_ELSEWHERE: Final = """\
+* It was measured in simulated scenes with simulated people, if at all. Nothing here says how it does where its drives
+  were recorded.
+"""
+LIMITS: Final = """\
+* It knows the words of its instruction grammar and of its landmarks, in English. Others it may ignore.
+* It is no safety function. Fences, the emergency stop and a person who watches are; so are the supervisor's limits and
+  the bridge's deadman, which hold whatever it does.
+* Speeds, camera height and field of view are those of the simulated Go2 and Carter.
+"""
+
+
+class CardError(ValueError):
+    """Nothing to write a card about; one line."""
+
+
+def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> Path:
+    """Write the card beside the run's weights. `scores` are results of edge-bench. Raises CardError, OSError."""
+    if not run_dir.model_path.is_file():
+        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+    path = run_dir.out / CARD
+    write_whole(path, card(run_dir, recipe, run_dir.model_path, [score(each) for each in scores]))
+    return path
+
+
+def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
+    """Write the run's weights as they are given away, with card and recipe: float16, without what only training needs.
+
+    Returns the weights' path. Raises CardError, NetworkFileError, OSError.
+    """
+    if not run_dir.model_path.is_file():
+        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+    with safe_open(str(run_dir.model_path), framework="pt") as file:
+        said = file.metadata()
+    model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
+    path = folder / f"{recipe.model.name}.safetensors"
+    info = WeightsInfo(trained=said["trained"] == "true", origin=f"{said['origin']}, float16")
+    save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
+    write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
+    write_whole(path.with_suffix(".recipe.toml"), run_dir.recipe_path.read_text(encoding="utf-8"))
+    return path
+
+
+def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, Any]] = ()) -> str:
+    """The card's text; the same run gives the same text."""
+    found = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
+    results = {name: result for name, result in found.items() if ADOPTED not in result}
+    after = next((str(result.get("after")) for result in found.values() if ADOPTED in result), None)
+    before, imported = _card_before(run_dir), results.get("collect", {}).get(IMPORTED) is True
+    blocks = [
+        f"# {recipe.name}: weights for tic-vla-edge\n",
+        _network(weights, recipe, _licence(run_dir.begun(START), before)),
+        "## Scores\n\n" + _scores(results.get("evaluate"), scores),
+        "## Data\n\n" + _data(run_dir, results.get("collect")),
+        "## Training\n\n" + _training(run_dir, recipe, results, after),
+        "## Limits\n\n" + (_LIMITS_ELSEWHERE if imported else _LIMITS_HERE) + LIMITS,
+        *([] if before is None else [f"{_BEFORE}\n\n{_history(before)}"]),
+    ]
+    return "\n".join(blocks)
+
+
+def _card_before(run_dir: RunDir) -> str | None:
+    """The card of the weights that the run began with; None where they had none."""
+    path = stage_weights(run_dir.out, START).with_name(START_CARD)
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def _history(text: str) -> str:
+    """Data and training of a card, and of what it went on from itself, one level of headings further down."""
+    sections = [f"## {section.rstrip()}\n" for section in text.split("\n## ")[1:]]
+    kept = [each for each in sections if each.startswith(("## Data\n", "## Training\n", f"{_BEFORE}\n"))]
+    lines = (line for each in kept for line in each.split("\n"))
+    return "\n".join(line.replace("## ", "### ", 1) if line.startswith(_HEADINGS) else line for line in lines)
+
+
+def _licence(begun_with_weights: bool, before: str | None) -> str:
+    if begun_with_weights and (before is None or _THEIRS in before):
+        return _THEIRS
+    return "Licence: Apache-2.0, as the repository. No weights of anybody else are in it."
+
+
+def score(path: Path) -> dict[str, Any]:
+    """Conditions and summary of a benchmark's result file; raises CardError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CardError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
+
+
+def parameters(weights: Path) -> dict[str, int]:
+    """Number of weights of each part of the network."""
+    counts = dict.fromkeys(PARTS, 0)
+    with safe_open(str(weights), framework="pt") as file:
+        for name in file.keys():  # noqa: SIM118 — not a mapping
+            shape = file.get_slice(name).get_shape()
+            count = 1
+            for size in shape:
+                count *= size
+            counts[name.split(".")[0]] += count
+    return counts
+
+
+def _network(weights: Path, recipe: Recipe, licence: str) -> str:
+    counts, size = parameters(weights), weights.stat().st_size
+    named = {
+        "vision": "vision encoder",
+        "language": "language model",
+        "action": "action expert",
+        "value": "value network",
+    }
+    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
+    return (
+        f"Network `{recipe.model.name}`: camera pictures, odometry and an instruction in plain words become motion.\n"
+        f"{licence}\n\n"
+        f"`{weights.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(weights)}`\n\n"
+        f"| part | weights |\n|---|---:|\n{rows}\n| all | {sum(counts.values()):,} |\n"
+    )
+
+
+def _scores(evaluation: Mapping[str, Any] | None, scores: Sequence[Mapping[str, Any]]) -> str:
+    rows = []
+    for each in scores:
+        told = each["conditions"]
+        latency = each["latency"].get("profile") or "none"
+        where = f"{Path(each['suite']).stem}, {told['clock']}, {told['mode']}, latency {latency}, drift {told['drift']}"
+        rows.append(_row(where, each["summary"]))
+    if evaluation is not None:
+        where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
+        rows.append(_row(where, evaluation["summary"]))
+    if not rows:
+        return "Not measured yet.\n"
+    head = "| episodes of | n | SR % | SPL % | CR % | NE m |\n|---|---:|---:|---:|---:|---:|\n"
+    note = "\nMeasured; in brackets bootstrap intervals of 95 % over tasks and their episodes.\n"
+    return head + "\n".join(rows) + "\n" + note
+
+
+def _row(where: str, summary: Mapping[str, Any]) -> str:
+    cells = [where, str(summary["episodes"])]
+    for name in ("sr", "spl", "cr", "ne_m"):
+        interval = summary.get(f"{name}_ci95")
+        shown = "" if interval is None else f" ({interval[0]:.1f} to {interval[1]:.1f})"
+        cells.append(f"{summary[name]:.1f}{shown}" if summary[name] is not None else "–")
+    return f"| {' | '.join(cells)} |"
+
+
+def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
+    rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
+    own = [result for result in rounds if result is not None and ADOPTED not in result]
+    lines: list[str] = []
+    if collected is not None:
+        lines += [*(_OTHERS_DRIVES if collected.get(IMPORTED) is True else _OUR_DRIVES), "", *_facts(collected)]
+    else:
+        lines += [*(_OUR_DRIVES if own else ()), "The expert's drives were not collected by this run."]
+    for number, result in enumerate(rounds, 1):
+        if result is not None and ADOPTED not in result:
+            lines += [
+                "",
+                f"Round {number} of DAgger, driven by the policy, relabelled by the expert:",
+                "",
+                *_facts(result),
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None) -> str:
+    versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
+    packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
+    went_on = " --checkpoint WEIGHTS" if run_dir.begun(START) else ""
+    went_on += "" if after is None else f" --after {after}"
+    if results.get("collect", {}).get(IMPORTED) is True:
+        went_on += " --drives DATASET"
+    if run_dir.borrowed("collect"):
+        went_on += " --from RUN"
+    lines = [
+        f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
+        f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
+    ]
+    if later := versions.get("later"):
+        lines.append(f"It went on with other code, versions or machines {len(later)} times: `{VERSIONS}`.")
+    if timings := run_dir.timings():
+        each = ", ".join(f"{step} {duration(seconds)}" for step, seconds in timings.items())
+        lines.append(
+            f"It took {duration(sum(timings.values()))} on {versions['cpus']} cores ({versions['machine']}): {each}."
+        )
+    for name in ("encoder", "sft", "imitate", "rl"):
+        if name in results:
+            again = run_dir.retired(name) if name in GO_ON else 0
+            after = f" (after {again} rounds of DAgger)" if again else ""
+            lines += ["", f"### {name}{after}", "", *_facts(results[name])]
+    return "\n".join(lines) + "\n"
+
+
+def _facts(result: Mapping[str, Any], under: str = "") -> list[str]:
+    """One line a number; long lists are left out."""
+    lines = []
+    for key, value in sorted(result.items()):
+        if isinstance(value, Mapping):
+            lines += _facts(value, f"{under}{key}.")
+        elif isinstance(value, float):
+            lines.append(f"* {under}{key}: {value:.6g}")
+        elif isinstance(value, str | int) or value is None:
+            lines.append(f"* {under}{key}: {'–' if value is None else value}")
+    return lines

@@ -1,0 +1,61 @@
+"""Artifacts of a run's weights, made by `edge-export` in a process of its own: it is what a robot would be given."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from edge.artifacts.files import MANIFEST_NAME
+from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
+from export.model.config import PRESETS, TicVlaConfig
+from tools.train.drives.drive import file_sha256
+
+TARGET: Final = "cpu"
+COMMAND: Final[Sequence[str]] = (sys.executable, "-m", "export.cli")
+_TAIL_CHARS: Final = 500
+
+
+class ExportError(RuntimeError):
+    """Weights that could not be exported; one line."""
+
+
+def export_artifacts(
+    weights: Path,
+    config: TicVlaConfig,
+    out: Path,
+    say: Callable[[str], None] = lambda line: None,
+    command: Sequence[str] = COMMAND,
+) -> Path:
+    """Export into `out` unless it holds these weights already; raises ExportError, KeyboardInterrupt."""
+    digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
+    if (out / MANIFEST_NAME).is_file() and mark.is_file():
+        if json.loads(mark.read_text(encoding="utf-8")).get("weights_sha256") == digest:
+            return out
+        mark.unlink()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
+    say(f"exporting {weights.parent.name} to drive with it")
+    log = out.with_name(out.name + ".log")
+    with log.open("wb") as output:
+        code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
+    if code.returncode == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+    if code.returncode != EXIT_DONE:
+        said = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:].strip().splitlines()
+        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {said[-1] if said else f'see {log}'}")
+    write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
+    return out
+
+
+def model_argument(config: TicVlaConfig, out: Path) -> str:
+    """What `--model` names the network by: a preset, or a file written beside `out`."""
+    for name, preset in PRESETS.items():
+        if preset == config:
+            return name
+    path = out.with_name(out.name + ".model.json")
+    write_whole(path, json.dumps(config.to_dict(), indent=1) + "\n")
+    return str(path)

@@ -1,0 +1,65 @@
+"""Which drives a run learns from: all of its own or those of the newest round, or another data set's instead."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any, Final
+
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.drives.drive import Dataset
+from tools.train.run.job import StageJob
+from tools.train.run.run_dir import RunDir, RunDirError
+
+_PARTIAL: Final = "collect.partial"
+IMPORTED: Final = "imported"
+"""In the result of `collect`: the drives are not this repository's expert's."""
+
+
+def prefixes_of(round_number: int) -> tuple[str, str]:
+    """How the ids of a round's drives begin, the policy's and the expert's; rounds count from 1."""
+    return f"d{round_number}-", f"n{round_number}-"
+
+
+def drives_after(job: StageJob, stage: str) -> Dataset:
+    """The drives that a stage learns from: all, or those of the newest round (`dagger.newest_only`). Raises DriveError.
+
+    Before the first round those are the same.
+    """
+    dataset, rounds = Dataset.open(job.run_dir.stage("collect")), job.run_dir.retired(stage)
+    if rounds and job.recipe.dagger.newest_only:
+        return dataset.of(*prefixes_of(rounds))
+    return dataset
+
+
+def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
+    """Make the data set in `folder` the run's own, and its stage `collect` done; files are linked where they can be.
+
+    All or nothing: an interrupted call leaves no drives. Raises DriveError for a data set that is not whole,
+    RunDirError where the run has other drives.
+    """
+    dataset = Dataset.open(folder)
+    done = run_dir.result("collect")
+    if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
+        return done
+    if run_dir.begun("collect"):
+        raise RunDirError(f"--drives {folder}: {run_dir.out} has drives that are others; name another --out")
+    Dataset.open(folder, verify=True)
+    partial = run_dir.out / _PARTIAL
+    shutil.rmtree(partial, ignore_errors=True)
+    with DatasetWriter(partial) as writer:
+        for entry in dataset.entries:
+            _link_or_copy(dataset.path(entry.id).resolve(), writer.path(entry.id))
+            writer.add(entry)
+        result = {IMPORTED: True, **writer.summary(""), "sha256": writer.finish().sha256}
+    run_dir.finish(_PARTIAL, result)
+    partial.replace(run_dir.out / "collect")
+    return result
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or one without links
+        shutil.copyfile(source, target)

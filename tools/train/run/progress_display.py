@@ -1,0 +1,77 @@
+"""How far a stage is, on standard error: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import AbstractContextManager
+from typing import TextIO
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from tools.train.run.job import PlainProgress, QuietProgress, StageProgress
+
+
+class StageBar(AbstractContextManager["StageBar"]):
+    """A bar with the newest numbers behind it; a `StageProgress`."""
+
+    def __init__(self, stage: str, console: Console) -> None:
+        self._stage, self._console = stage, console
+        self._bar = Progress(
+            TextColumn(f"[bold]edge-train[/bold] {stage}"), BarColumn(bar_width=24), MofNCompleteColumn(),
+            TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False), console=console,
+        )  # fmt: skip
+        self._task: TaskID | None = None
+        self._total = 0
+
+    def __enter__(self) -> StageBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(self, done: int, total: int, **numbers: float) -> None:
+        """Move the bar."""
+        if self._task is None:
+            self._task, self._total = self._bar.add_task("", total=total, completed=done), total
+        if total != self._total:  # a stage may do one thing after another
+            self._bar.reset(self._task, total=total)
+            self._total = total
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=done, total=total, description=shown)
+
+    def say(self, line: str) -> None:
+        """A line above the bar."""
+        self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
+
+
+class _Lines(AbstractContextManager[StageProgress]):
+    """Something that needs no end, where one is expected."""
+
+    def __init__(self, progress: StageProgress) -> None:
+        self._progress = progress
+
+    def __enter__(self) -> StageProgress:
+        return self._progress
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def progress_for(
+    stage: str, *, quiet: bool = False, stream: TextIO | None = None
+) -> AbstractContextManager[StageProgress]:
+    """The progress of a stage as this standard error can show it; quiet on all ranks but the first."""
+    if quiet:
+        return _Lines(QuietProgress())
+    console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)
+    return StageBar(stage, console) if console.is_terminal else _Lines(PlainProgress(stage))

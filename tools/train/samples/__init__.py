@@ -1,0 +1,1 @@
+"""From recorded drives to training samples: anchors, batches, cached tokens and semantic states."""

@@ -1,0 +1,170 @@
+"""Semantic states on disk: the frozen language model's last-layer K‖V at every anchor (paper, Algorithm 1, line 5).
+
+A folder has `kv.json` (what it was made with) and, for each drive, `ID.npy` f16 [tokens, kv_dim] with all its states
+one after another and `ID.json` with where each begins. Both are written by rename, so a run that was ended goes on with
+the next drive, and drives that are added later (DAgger) cost only themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge.core.cli import write_whole
+from edge.state.reasoning_text import Waypoints, parse_waypoints
+from tools.train.samples.language_batch import Halves
+
+FORMAT: Final = 1
+INDEX: Final = "kv.json"
+_MAX_OPEN: Final = 256  # a mapped file takes one of a process's descriptors, of which there may be 1024
+
+
+class KvCacheError(ValueError):
+    """A cache that cannot be used; one line: what, expected, found, what to do."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A state before it is written; `kv` f16 [T, kv_dim]."""
+
+    k: int
+    draw: int
+    kv: Halves
+    prompt_tokens: int
+    own: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class CachedState:
+    """What one generation leaves: K‖V of prompt and text, read-only and mapped from the file."""
+
+    kv: Halves
+    """[T, kv_dim]; the first `prompt_tokens` rows are what a model that says nothing would leave."""
+    prompt_tokens: int
+    text: str
+    own: bool
+    """Whether the model said the text itself; else it is the label's."""
+
+    @property
+    def waypoints(self) -> Waypoints | None:
+        """(x m, y m) at 3, 6, 9 s in the anchor's robot frame; None where the model's own text has none."""
+        return parse_waypoints(self.text)
+
+
+@dataclass(frozen=True)
+class _Place:
+    k: int
+    draw: int
+    start: int
+    tokens: int
+    prompt_tokens: int
+    own: bool
+    text: str
+
+
+class KvCache:
+    """Read access; what is read is mapped from the file, not copied."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open a folder that `build_kv_cache` has made. Raises KvCacheError."""
+        self.folder = folder
+        try:
+            content = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+            if content["format"] != FORMAT:
+                raise KvCacheError(f"{folder}: expected a cache of format {FORMAT}; delete it and build it again")
+            self.key: str = content["key"]
+            self.kv_dim: int = content["kv_dim"]
+            self.draws: int = content["draws"]
+            """States of each anchor, with other words and another `before`."""
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, KvCacheError):
+                raise
+            raise KvCacheError(f"{folder}: no cache of keys and values ({error!r}); build it first") from error
+        self._indices: dict[str, dict[tuple[int, int], _Place]] = {}
+        self._maps: OrderedDict[str, Halves] = OrderedDict()
+
+    def has(self, drive_id: str, sha256: str) -> bool:
+        """Whether this drive, with this hash of its file, is in the cache."""
+        try:
+            return bool(_read(self.folder, drive_id)["drive_sha256"] == sha256) and _npy(self.folder, drive_id).exists()
+        except KvCacheError:
+            return False
+
+    def anchors(self, drive_id: str) -> tuple[int, ...]:
+        """Frames of a drive that there is a state for, ascending. Raises KvCacheError for a drive that is not there."""
+        return tuple(sorted({k for k, _ in self._index(drive_id)}))
+
+    def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
+        """The state of the generation whose newest frame is k. Raises KvCacheError where there is none."""
+        place = self._index(drive_id).get((k, draw))
+        if place is None:
+            raise KvCacheError(f"drive {drive_id}: no state of frame {k}, draw {draw}")
+        rows = self._map(drive_id)[place.start : place.start + place.tokens]
+        return CachedState(rows, place.prompt_tokens, place.text, place.own)
+
+    def _index(self, drive_id: str) -> dict[tuple[int, int], _Place]:
+        if drive_id not in self._indices:
+            places = [_Place(**place) for place in _read(self.folder, drive_id)["states"]]
+            self._indices[drive_id] = {(place.k, place.draw): place for place in places}
+        return self._indices[drive_id]
+
+    def _map(self, drive_id: str) -> Halves:
+        if drive_id not in self._maps:
+            path, wanted = _npy(self.folder, drive_id), sum(each.tokens for each in self._index(drive_id).values())
+            try:
+                rows: Halves = np.load(path, mmap_mode="r", allow_pickle=False)
+            except (OSError, ValueError) as error:
+                raise KvCacheError(f"{path}: not readable ({error}); delete it and build it again") from error
+            if rows.dtype != np.float16 or rows.shape != (wanted, self.kv_dim):
+                raise KvCacheError(f"{path}: expected f16 {(wanted, self.kv_dim)}, found {rows.dtype} {rows.shape}")
+            self._maps[drive_id] = rows
+            if len(self._maps) > _MAX_OPEN:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(drive_id)
+        return self._maps[drive_id]
+
+
+def begin(folder: Path, *, key: str, kv_dim: int, draws: int) -> None:
+    """Make a folder for states; raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    index = {"format": FORMAT, "key": key, "kv_dim": kv_dim, "draws": draws}
+    write_whole(folder / INDEX, json.dumps(index) + "\n")
+
+
+def _npy(folder: Path, drive_id: str) -> Path:
+    return folder / f"{drive_id}.npy"
+
+
+def _read(folder: Path, drive_id: str) -> Mapping[str, Any]:
+    path = folder / f"{drive_id}.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {"drive_sha256": content["drive_sha256"], "states": content["states"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise KvCacheError(f"{path}: no states of this drive ({error!r}); build the cache for it") from error
+
+
+def write_states(folder: Path, drive_id: str, sha256: str, states: Sequence[Made], kv_dim: int) -> None:
+    """First the numbers, then what says that they are whole."""
+    rows = np.concatenate([state.kv for state in states] or [np.zeros((0, kv_dim), np.float16)])
+    partial = folder / f"{drive_id}.{os.getpid()}.partial"
+    with partial.open("wb") as file:
+        np.save(file, rows, allow_pickle=False)
+    partial.replace(_npy(folder, drive_id))
+    places: list[dict[str, Any]] = []
+    start = 0
+    for state in states:
+        place = _Place(state.k, state.draw, start, len(state.kv), state.prompt_tokens, state.own, state.text)
+        places.append(asdict(place))
+        start += len(state.kv)
+    write_whole(
+        folder / f"{drive_id}.json", json.dumps({"drive_sha256": sha256, "states": places}, separators=(",", ":"))
+    )

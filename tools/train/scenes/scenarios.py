@@ -1,0 +1,273 @@
+"""Tasks to train on: an episode with its scene, its way as it is told, and wordings that the benchmark never uses.
+
+A group is one fresh layout with several tasks. The same seed gives the same scenarios, whoever draws which of them, so
+that workers may share them out by their numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot, isfinite
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from sim_hil.benchmark.language.instruction_reading import untrue
+from sim_hil.benchmark.language.instructions import WordingError, is_held_out, wordings
+from sim_hil.benchmark.language.route import RouteError, Told
+from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
+from sim_hil.benchmark.language.tasks import Task, make_task, sample_task
+from sim_hil.benchmark.suite.build import timeout_s
+from sim_hil.benchmark.suite.episode import ROBOTS, Episode
+from sim_hil.layouts import RESERVED_BELOW, LayoutError, is_reserved
+from sim_hil.scene.scene import Scene
+from tools.train.config.scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
+from tools.train.scenes.sites import Site
+
+WORDINGS: Final = 12  # of one task
+LEAST_WORDINGS: Final = 8
+FIRST_SEED: Final = 1_000_000  # of episodes: far above the suite's
+MAX_SEED: Final = 9_999
+KEPT_SEEDS: Final = range(9_001, 9_005)
+"""Evaluation's and reinforcement learning's: nothing is collected from these."""
+_GROUPS: Final = 100_000  # layouts of one seed
+_LAYOUT_TRIES: Final = 4
+_DRAWS: Final = 60  # for one task
+_LEAST_WAY_M: Final = 1.0  # of the straight line, before the goal has been reached
+_LEAST_LEG_M: Final = 2.0
+# Length of the way, m, and how often: the suite's tasks are 9..35 m indoors and 30..80 m outdoors.
+_INDOORS: Final = (((4.0, 12.0), 0.30), ((9.0, 22.0), 0.40), ((18.0, 36.0), 0.30))
+_OUTDOORS: Final = (((6.0, 22.0), 0.30), ((20.0, 48.0), 0.40), ((40.0, 80.0), 0.30))
+_BANDS: Final = {"corridor": (((4.0, 14.0), 0.4), ((12.0, 27.0), 0.6))}
+_CROWDS: Final = {
+    "indoors": ((0, 0.25), (5, 0.1), (10, 0.15), (20, 0.2), (40, 0.18), (60, 0.12)),
+    "outdoors": ((20, 0.3), (50, 0.3), (80, 0.25), (120, 0.15)),
+    CORRIDOR: ((0, 0.4), (2, 0.2), (5, 0.2), (8, 0.2)),
+}
+# A task is kept the more readily the more there is to learn from it: nothing to do, turns, turns to be counted.
+_KEEP: Final = (0.2, 0.6, 1.0)
+_TAG = 43
+
+_T = TypeVar("_T")
+
+
+class ScenarioError(ValueError):
+    """Scenarios that cannot be drawn, or one that training may not use; one line."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One task with its crowd and robot: what a drive is collected from, or a policy trained in."""
+
+    episode: Episode
+    task: Task
+    site: Site
+
+    def __post_init__(self) -> None:
+        what = f"scenario {self.episode.id}"
+        if is_reserved(self.site.layout_seed) or self.episode.seed < FIRST_SEED:
+            raise ScenarioError(f"{what}: its layout or seed is the benchmark's")
+        if len(self.wordings) < LEAST_WORDINGS:
+            raise ScenarioError(f"{what}: expected {LEAST_WORDINGS} wordings or more, found {len(self.wordings)}")
+        if held := [text for text in self.wordings if is_held_out(text)]:
+            raise ScenarioError(f"{what}: a wording has one of the benchmark's patterns: {held[0]!r}")
+
+    @property
+    def kind(self) -> str:
+        """Of its scene: hospital, office, warehouse, sidewalk or corridor."""
+        return self.site.kind
+
+    @property
+    def layout_seed(self) -> int:
+        """Of its scene; data is split by it."""
+        return self.site.layout_seed
+
+    @property
+    def scene(self) -> Scene:
+        """The world, for EpisodeWorld(episode, options, scene=scene)."""
+        return self.site.scene
+
+    @property
+    def told(self) -> Told:
+        """The way in words' terms."""
+        return self.task.told
+
+    @property
+    def wordings(self) -> tuple[str, ...]:
+        """Instructions that all say this way."""
+        return self.episode.instructions
+
+    def told_json(self) -> list[dict[str, Any]]:
+        """The steps for a drive's header: side, kind, name, ordinal, at_end and where, m."""
+        return [
+            {"side": step.side, "kind": step.kind, "name": step.name, "ordinal": step.ordinal, "at_end": step.at_end,
+             "at": [round(v, 3) for v in step.at]}
+            for step in self.told.steps
+        ]  # fmt: skip
+
+
+def training_episodes(
+    seed: int,
+    count: int,
+    kinds: Mapping[str, float] = SHARES,
+    *,
+    start: int = 0,
+    tasks_per_scene: int = TASKS_PER_SCENE,
+) -> Iterator[Scenario]:
+    """Scenarios number `start` to `start + count - 1` of a seed; `kinds` are shares of the layouts by kind.
+
+    Raises ScenarioError.
+    """
+    if not 0 <= seed <= MAX_SEED or count < 0 or start < 0 or tasks_per_scene < 1:
+        raise ScenarioError(
+            f"expected a seed of 0..{MAX_SEED}, a count and a start of 0 or more, one task a scene or more,"
+            f" found {seed}, {count}, {start} and {tasks_per_scene}"
+        )
+    if start + count > _GROUPS * tasks_per_scene:
+        raise ScenarioError(f"one seed has {_GROUPS} layouts: expected fewer scenarios, found {start + count}")
+    group, skip = divmod(start, tasks_per_scene)
+    left = count
+    while left > 0:
+        made = scenario_group(seed, group, kinds, min(tasks_per_scene, skip + left), tasks_per_scene)
+        yield from made[skip:]
+        left -= len(made) - skip
+        group, skip = group + 1, 0
+
+
+def kind_of_group(seed: int, group: int, kinds: Mapping[str, float]) -> str:
+    """Which kind of layout a group has, by chance in the given shares. Raises ScenarioError."""
+    if unknown := sorted(set(kinds) - set(KINDS)):
+        raise ScenarioError(f"unknown kind of scene {unknown[0]!r}, expected of {', '.join(KINDS)}")
+    if not all(isfinite(share) and share >= 0 for share in kinds.values()) or sum(kinds.values()) <= 0:
+        raise ScenarioError(f"shares of kinds must be 0 or more, some of them more, found {dict(kinds)}")
+    names = [name for name in KINDS if kinds.get(name, 0) > 0]
+    # Spread evenly rather than drawn: a short run has its shares too. The golden ratio leaves no gaps.
+    place = (0.5 + 0.618033988749895 * group + 0.37 * seed) % 1.0
+    return _at(place, [(name, kinds[name]) for name in names])
+
+
+def scenario_group(
+    seed: int, group: int, kinds: Mapping[str, float], count: int, tasks_per_scene: int = TASKS_PER_SCENE
+) -> list[Scenario]:
+    """The first `count` scenarios of one group: as a rule of one layout. Raises ScenarioError."""
+    kind = kind_of_group(seed, group, kinds)
+    sites: dict[int, Site] = {}
+    return [_first_found(sites, kind, seed, group, group * tasks_per_scene + j) for j in range(count)]
+
+
+def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, number: int) -> Scenario:
+    """A scenario from the group's layout, or from the next one where none can be drawn there."""
+    why = ""
+    for attempt in range(_LAYOUT_TRIES):
+        layout_seed = RESERVED_BELOW + (seed * _LAYOUT_TRIES + attempt) * _GROUPS + group
+        try:
+            if attempt not in sites:
+                sites[attempt] = Site(kind, layout_seed)
+            return _scenario(sites[attempt], seed, number)
+        except (LayoutError, RouteError) as error:
+            why = str(error)
+    raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {_LAYOUT_TRIES} layouts; the last: {why}")
+
+
+def _scenario(site: Site, seed: int, number: int) -> Scenario:
+    rng = np.random.default_rng((seed, number, site.layout_seed, _TAG))
+    outdoors = site.outdoors
+    robot = ROBOTS[int(rng.integers(len(ROBOTS)))]
+    people = int(_at(float(rng.uniform()), _CROWDS.get(site.kind, _CROWDS["outdoors" if outdoors else "indoors"])))
+    why = "none was drawn"
+    for _ in range(_DRAWS):
+        try:
+            task = _draw(site, rng)
+        except RouteError as error:
+            why = str(error)
+            continue
+        if not _wanted(site, task, rng):
+            why = "it was not wanted"
+            continue
+        try:
+            return scenario_of(site, task, int(rng.integers(2**31)), robot, people, seed, number)
+        except RouteError as error:
+            why = str(error)
+    raise RouteError(f"{site.scene.name}: no task found in {_DRAWS} draws; the last: {why}")
+
+
+def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: int, seed: int, number: int) -> Scenario:
+    """A task with wordings that are true of it; raises RouteError where there are none, or no way for the robot."""
+    try:
+        texts = wordings(task.told, WORDINGS, wording_seed, held_out=False)
+    except WordingError as error:
+        raise RouteError(str(error)) from error
+    if any(untrue(text, task.told) for text in texts):
+        raise RouteError("a wording is not true of it")
+    if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.told)):
+        raise RouteError("something that is named is nowhere seen well")
+    shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
+    if not isfinite(shortest_m):
+        raise RouteError(f"the {robot} cannot get there")
+    name = f"{site.scene.name}-{number}"
+    episode = Episode(
+        id=f"t{seed}-{name}-{people}-{robot}",
+        task=name,
+        scene=site.scene.name,
+        robot=robot,
+        people=people,
+        seed=FIRST_SEED * (1 + seed) + number,
+        start=task.start,
+        goal_xy=task.goal,
+        instructions=tuple(texts),
+        timeout_s=timeout_s(shortest_m, people, site.outdoors),
+        threshold_m=site.threshold_m,
+        shortest_m=round(shortest_m, 3),
+        landmarks=named_landmarks(texts, task.told),
+        goal_landmark=task.goal_label,
+    )
+    return Scenario(episode, task, site)
+
+
+def _draw(site: Site, rng: np.random.Generator) -> Task:
+    if site.kind == CORRIDOR and rng.uniform() < 0.6:
+        # As the demo begins, give or take a step.
+        x, y, turn = (float(value) for value in rng.uniform((-0.5, -0.5, -0.3), (4.0, 0.5, 0.3)))
+        thing = next(thing for thing in site.scene.objects if thing.label == "vending machine")
+        return make_task(site.scene, site.grid, (round(x, 2), round(y, 2), round(turn, 3)), thing)
+    length_m = _at(float(rng.uniform()), _BANDS.get(site.kind, _OUTDOORS if site.outdoors else _INDOORS))
+    return sample_task(site.scene, site.grid, rng, things=site.goals, length_m=length_m)
+
+
+def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
+    """Whether it is worth training on, and sound."""
+    told = task.told
+    if not _long_enough(site, task):
+        return False
+    worth = 0 if not told.steps else 2 if any(step.ordinal > 1 for step in told.steps) else 1
+    if site.kind != CORRIDOR and rng.uniform() >= _KEEP[worth]:
+        return False
+    return _unmistakable(site, task)
+
+
+def is_sound(site: Site, task: Task) -> bool:
+    """Whether a task can be learned from, as the benchmark's validator means it: words and way agree."""
+    return _long_enough(site, task) and _unmistakable(site, task)
+
+
+def _long_enough(site: Site, task: Task) -> bool:
+    (x, y), steps = task.goal, task.told.steps
+    if hypot(x - task.start[0], y - task.start[1]) < site.threshold_m + _LEAST_WAY_M:
+        return False
+    return not any(step.before_m < _LEAST_LEG_M for step in steps if step.before_kind != "room")
+
+
+def _unmistakable(site: Site, task: Task) -> bool:
+    """Nobody is at the goal beyond a wall from it, and the way bends where and as it is told."""
+    return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(task.told, task.path)
+
+
+def _at(place: float, choices: Sequence[tuple[_T, float]]) -> _T:
+    """The choice at a place in [0, 1) of (choice, share) pairs laid end to end."""
+    left = place * sum(share for _, share in choices)
+    for choice, share in choices:
+        left -= share
+        if left < 0:
+            return choice
+    return choices[-1][0]

@@ -1,0 +1,250 @@
+"""What a robot should say of an instant, from the world's truth: only what its camera really sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, cos, hypot, radians, sin, tan
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.core.geometry import SE2, wrap_angle
+from edge.state.reasoning_text import WAIT
+from sim_hil.benchmark.language.openings import Frame, Opening, bounds_of
+from sim_hil.benchmark.language.route import Step
+from sim_hil.benchmark.language.task_checks import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
+from sim_hil.benchmark.language.visibility import EYE_M, HFOV_RAD
+from sim_hil.scene.scene import SceneObject, Vec2, Vec3
+from sim_hil.simulation.camera import MOUNTS
+from tools.train.scenes import trace_sentences as words
+from tools.train.scenes.progress_labels import RouteProgress
+from tools.train.scenes.scenarios import Scenario
+from tools.train.scenes.trace_sentences import Trace
+
+__all__ = ["PEOPLE_M", "Trace", "Tracer", "turning_first"]
+
+Array = NDArray[np.float64]
+
+PEOPLE_M: Final = 6.0  # nobody further away is spoken of
+_MANY: Final = (1, 4)  # people in view within PEOPLE_M: few, many
+_AHEAD_RAD: Final = radians(15.0)
+_STANDING_MPS: Final = 0.2
+_ALONG: Final = cos(radians(30.0))
+_BODY_M: Final = (0.35, 0.5, 1.7)  # a person: depth, width, height
+_SHOWN, _WHOLE_PX = 0.2, 4400.0  # of a body as it would be in the picture a metre away
+_SLEEVE_M: Final = 0.1  # whose middle is further beside the picture shows at most a sleeve
+_WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
+_WAIT_FOR_M: Final = 2.5
+_INSIDE_M: Final = 0.2  # so far within an opening it is looked into
+_BACK_M: Final = -0.3  # who means to be so far behind itself in three seconds turns round
+_ROUND_RAD: Final = 2.0  # of its teacher's drives most turn round for what is so far to the side
+_HERE_M: Final = 0.05
+_ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go on
+_EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
+
+
+def turning_first(point: Vec2, turn_radps: float, speed_mps: float) -> Vec2:
+    """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does.
+
+    What lies well behind it comes out behind it, however little time the turn leaves: it means to turn round.
+    """
+    bearing, gap_m = atan2(point[1], point[0]), hypot(*point)
+    if gap_m < _HERE_M:
+        return (_ON_M, 0.0)  # it means to be where it is, and waits for nobody
+    if abs(bearing) > _ROUND_RAD:
+        return (2.0 * _BACK_M, 0.0)
+    gone_m = max(3.0 - abs(bearing) / turn_radps, 0.0) * speed_mps
+    return gone_m * cos(bearing), gone_m * sin(bearing)
+
+
+class Sight(Protocol):
+    """Tells what is seen of a thing, as `Sightlines` does."""
+
+    def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
+        """px of a 128 x 128 picture."""
+        ...
+
+
+class Tracer:
+    """Traces of one scenario's instants."""
+
+    def __init__(
+        self, scenario: Scenario, progress: RouteProgress | None = None, lines: Sight | None = None
+    ) -> None:  # fmt: skip
+        """`lines`: who can be seen from where, in place of the site's own."""
+        self._scene, told = scenario.scene, scenario.told
+        self._lines: Sight = scenario.site.lines if lines is None else lines
+        self.progress = RouteProgress(scenario) if progress is None else progress
+        self._range_m = RANGE_OUTDOORS_M if scenario.site.outdoors else RANGE_INDOORS_M
+        self._eye_ahead_m = MOUNTS[scenario.episode.robot].position_m[0]
+        self._eye_up_m = _EYES_M[scenario.episode.robot]
+        along = [thing for step in told.steps for thing in (*step.near, *step.passed)]
+        self._named = frozenset(thing.label for thing in (*along, *told.passed))
+        self._goal = next(thing for thing in self._scene.objects if thing.label == told.goal_label)
+        self._others = [thing for thing in self._scene.landmarks() if thing is not self._goal]
+
+    def trace(
+        self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None
+    ) -> Trace:  # fmt: skip
+        """Of a true pose, people [n, 2 or 3] (x m, y m, ...) and their velocities [n, 2], m/s, in the world.
+
+        `plan_xy`: where the robot means to be in 3 s (and later), m in its own frame; only by it one sees it wait.
+        """
+        crowd = self._people_in_view(pose, people)
+        progress, step = self.progress.at(pose), self.progress.next_step(pose)
+        left_m = self.progress.to_next_m(pose)
+        ahead = any(gap < _WAIT_FOR_M and _side(pose, people[index]) == "ahead" for index, gap in crowd)
+        plan = words.stop(left_m) if step is None else words.turn(step.side, step.kind, left_m)
+        x_m, y_m = (_ON_M, 0.0) if plan_xy is None else plan_xy[0][:2]
+        if (step is not None and 0 < step.ordinal <= progress.passed) or x_m < _BACK_M:
+            plan = words.TURN_BACK
+        elif ahead and hypot(x_m, y_m) < _WAIT_M:
+            plan = WAIT + plan
+        motion = [
+            words.person(_side(pose, people[index]), gap, _way(pose, people[index], velocities[index]))
+            for index, gap in crowd[: words.MAX_PEOPLE]
+        ]
+        bodies = [_body(people[index]) for index, _ in crowd]
+        return Trace.of(
+            self._situation(pose, len(crowd)), self._objects(pose, step, bodies), motion, progress, plan
+        )  # fmt: skip
+
+    def _situation(self, pose: SE2, near: int) -> str:
+        area = self._scene.area_at(pose.x_m, pose.y_m)
+        place = words.AREAS.get(area.kind, words.NO_AREA) if area is not None else words.NO_AREA
+        return place + words.CROWDS[sum(near >= least for least in _MANY)]
+
+    def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
+        """Indices and distances, m, of those that are seen within PEOPLE_M, nearest first."""
+        gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m) if len(people) else np.zeros(0)
+        found: list[tuple[int, float]] = []
+        nearer: list[SceneObject] = []
+        for index in np.argsort(gaps, kind="stable"):
+            if gaps[index] >= PEOPLE_M:
+                break
+            body = _body(people[index])
+            least_px = max(MIN_PIXELS, _SHOWN * _WHOLE_PX / max(float(gaps[index]), 1.0) ** 2)
+            if self._in_frame(pose, body, _SLEEVE_M) and self._seen(pose, body, nearer, least_px):
+                found.append((int(index), float(gaps[index])))
+                nearer.append(body)
+        return found
+
+    def _seen(
+        self, pose: SE2, thing: SceneObject, bodies: Sequence[SceneObject], least_px: float = MIN_PIXELS
+    ) -> bool:  # fmt: skip
+        """Whether enough of a thing is in the picture, and nobody stands right before it."""
+        return self._pixels(pose, thing) >= least_px and not any(_covers(pose, body, thing) for body in bodies)
+
+    def _pixels(self, pose: SE2, thing: SceneObject) -> float:
+        """What is seen of a thing in a 128 x 128 picture, px."""
+        reach_m = hypot(*thing.size_m[:2]) / 2
+        if not self._in_frame(pose, thing, reach_m * (1.0 + tan(HFOV_RAD / 2))):
+            return 0.0  # no need to cast rays
+        eye = (*self._eye(pose), self._scene.ground_height_m(pose.x_m, pose.y_m) + self._eye_up_m)
+        return self._lines.pixels(eye, pose.theta_rad, thing, self._range_m)
+
+    def _eye(self, pose: SE2) -> Vec2:
+        ahead = self._eye_ahead_m
+        return (pose.x_m + ahead * cos(pose.theta_rad), pose.y_m + ahead * sin(pose.theta_rad))
+
+    def _in_frame(self, pose: SE2, thing: SceneObject, margin_m: float) -> bool:
+        """Whether a thing's middle is between the picture's sides, or beside them by no more than the margin."""
+        (x, y), c, s = self._eye(pose), cos(pose.theta_rad), sin(pose.theta_rad)
+        dx, dy = thing.position_m[0] - x, thing.position_m[1] - y
+        return abs(dy * c - dx * s) <= tan(HFOV_RAD / 2) * (dx * c + dy * s) + margin_m
+
+    def _objects(self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject]) -> list[str]:
+        """The goal, the next opening that counts, what an instruction may name, then whatever is nearest."""
+        said = [self._said(pose, self._goal)] if self._seen(pose, self._goal, bodies) else []
+        if step is not None and (opening := self._next_opening(pose, step)):
+            said.append(opening)
+        for thing in sorted(self._others, key=lambda thing: (thing.label not in self._named, _gap(pose, thing))):
+            if len(said) == words.MAX_THINGS:
+                break
+            if (text := self._said(pose, thing)) not in said and self._seen(pose, thing, bodies):
+                said.append(text)
+        return said
+
+    @staticmethod
+    def _said(pose: SE2, thing: SceneObject) -> str:
+        return words.seen(thing.landmark, _side(pose, thing.position_m), _gap(pose, thing))
+
+    def _next_opening(self, pose: SE2, step: Step) -> str:
+        """The nearest opening ahead that counts for a step and is in view; "" without any."""
+        frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
+        here = frame.along(xy)
+        for opening in step.counted:
+            if opening.middle_m <= here:
+                continue
+            left = opening.side == "left"
+            across = self._border(frame, xy, opening) + (_INSIDE_M if left else -_INSIDE_M)
+            point = frame.point(opening.middle_m, across)
+            # From close to the wall its far end is seen first.
+            if self._in_sight(pose, point) or self._in_sight(pose, frame.point(opening.high_m - _INSIDE_M, across)):
+                # Along the corridor it is on the side on which it counts, however small the angle.
+                along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
+                side = opening.side if along else _side(pose, point)
+                metres = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
+                return words.seen(words.opening(opening.area.kind), side, metres)
+        return ""
+
+    def _border(self, frame: Frame, xy: Vec2, opening: Opening) -> float:
+        """Where an opening begins, across the direction of travel."""
+        low, high = frame.span(bounds_of(opening.area))[1]
+        if not low < frame.across(xy) < high:
+            return low if opening.side == "left" else high
+        # The corridor runs into or across that area: it opens where the corridor's own wall ends.
+        own = self._scene.area_at(*xy)
+        low, high = (frame.across(xy),) * 2 if own is None else frame.span(bounds_of(own))[1]
+        return high if opening.side == "left" else low
+
+    def _in_sight(self, pose: SE2, point: Vec2) -> bool:
+        """Whether a post as high as a table would be seen at a point."""
+        post = SceneObject("post", "column", (*point, 0.0), 0.0, (0.1, 0.1, 0.8), (0.0, 0.0, 0.0), "")
+        return self._pixels(pose, post) > 0
+
+
+def _gap(pose: SE2, thing: SceneObject) -> float:
+    return hypot(thing.position_m[0] - pose.x_m, thing.position_m[1] - pose.y_m)
+
+
+def _side(pose: SE2, at: Sequence[float] | Array) -> str:
+    bearing = wrap_angle(atan2(at[1] - pose.y_m, at[0] - pose.x_m) - pose.theta_rad)
+    return "ahead" if abs(bearing) <= _AHEAD_RAD else "left" if bearing > 0 else "right"
+
+
+def _way(pose: SE2, at: Array, velocity: Array) -> str:
+    """How somebody moves over the ground, seen from the robot."""
+    speed = hypot(velocity[0], velocity[1])
+    if speed < _STANDING_MPS:
+        return "standing"
+    dx, dy = at[0] - pose.x_m, at[1] - pose.y_m
+    gap = max(hypot(dx, dy), 1e-6)
+    away = (velocity[0] * dx + velocity[1] * dy) / (gap * speed)
+    if abs(away) >= cos(radians(45.0)):
+        return "leaving" if away > 0 else "coming"
+    leftwards = (dx * velocity[1] - dy * velocity[0]) > 0
+    return "crossing left" if leftwards else "crossing right"
+
+
+def _body(at: Array) -> SceneObject:
+    """Somebody as a thing to look at."""
+    heading = float(at[2]) if len(at) > 2 else 0.0
+    return SceneObject("person", "column", (float(at[0]), float(at[1]), 0.0), heading, _BODY_M, (0.5, 0.5, 0.5), "")
+
+
+def _covers(pose: SE2, body: SceneObject, thing: SceneObject) -> bool:
+    """Whether somebody stands before a thing's whole width."""
+    if _gap(pose, body) > _gap(pose, thing) - 0.3:
+        return False
+    (low, high), (right, left) = _bearings(pose, thing), _bearings(pose, body)
+    return right <= low and high <= left
+
+
+def _bearings(pose: SE2, thing: SceneObject) -> tuple[float, float]:
+    """Directions of a thing's right and left edges from the robot's heading, rad."""
+    bearings = [
+        wrap_angle(atan2(y - pose.y_m, x - pose.x_m) - pose.theta_rad) for x, y in thing.box.corners()
+    ]  # fmt: skip
+    return min(bearings), max(bearings)

@@ -1,0 +1,237 @@
+"""How well the language model speaks of places that it has never seen: what it says against what is true.
+
+Twice: told the right progress of the generation before, as in training, and told what it said itself, generation after
+generation along a drive, as on the robot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from math import hypot
+from typing import Any, Final
+
+import numpy as np
+
+from edge.reasoning.decoding_rules import NOTHING_KNOWN, Known, TextGuide
+from edge.state.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, parse_progress, parse_waypoints
+from export.model.language import LanguageModel
+from tools.train.config.collect import RATE_HZ
+from tools.train.config.sft import EvalConfig
+from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
+from tools.train.samples.greedy import decode
+from tools.train.samples.language_batch import FrameTokens, Row, collate, frames_of
+from tools.train.scenes import trace_sentences as trace_words
+
+_TAG: Final = 0xE7A1
+_SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
+_PLACE: Final = re.compile(rf" ({'|'.join(trace_words.SIDES)}) \d+ m$", re.ASCII)
+
+
+class Score:
+    """Adds up answers; `numbers` are shares and means over them.
+
+    A change is an anchor whose progress is not what it was at the generation before: there, repeating does not help.
+    A false change is another answer than the last one's where nothing has changed.
+    """
+
+    def __init__(self, gap_s: float) -> None:
+        """`gap_s`: how long before it the last generation looked."""
+        self._gap_s = gap_s
+        self._count: Counter[str] = Counter()
+        self._errors_m: list[list[float]] = []
+
+    def add(self, text: str, anchor: Anchor) -> None:
+        """One answer to an anchor."""
+        found = self._count
+        found["answers"] += 1
+        waypoints = parse_waypoints(text)
+        progress = parse_progress(text)
+        found["waypoints"] += waypoints is not None
+        found["progress"] += progress is not None
+        found["progress right"] += progress == anchor.progress
+        if anchor.before(self._gap_s) not in (None, anchor.progress):
+            found["changes"] += 1
+            found["change right"] += progress == anchor.progress
+        elif anchor.before(self._gap_s) is not None:
+            found["repeats"] += 1
+            found["false change"] += progress != anchor.progress
+        true_side = side_of(anchor.reasoning)
+        if true_side is not None:
+            found["sides"] += 1
+            found["side right"] += side_of(text) == true_side
+        said, there = landmarks_of(text), landmarks_of(anchor.reasoning)
+        found["landmarks said"] += said.total()
+        found["landmarks there"] += there.total()
+        found["landmarks right"] += (said & there).total()
+        if waypoints is not None:
+            pairs = zip(waypoints, anchor.points, strict=True)
+            self._errors_m.append([hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs])
+
+    def numbers(self) -> dict[str, Any]:
+        """JSON values; a share of nothing is None."""
+        n = self._count
+        errors = np.array(self._errors_m).reshape(-1, len(WAYPOINT_TIMES_S))
+        return {
+            "answers": n["answers"],
+            "waypoints_parsable": _share(n["waypoints"], n["answers"]),
+            "progress_parsable": _share(n["progress"], n["answers"]),
+            "progress_right": _share(n["progress right"], n["answers"]),
+            "change_right": _share(n["change right"], n["changes"]),
+            "changes": n["changes"],
+            "false_change": _share(n["false change"], n["repeats"]),
+            "side_right": _share(n["side right"], n["sides"]),
+            "sides": n["sides"],
+            "landmark_precision": _share(n["landmarks right"], n["landmarks said"]),
+            "landmark_recall": _share(n["landmarks right"], n["landmarks there"]),
+            "waypoint_error_m": [float(mean) for mean in errors.mean(0)] if len(errors) else None,
+        }
+
+    def points(self) -> dict[str, Any]:
+        """Those of `numbers` that an answer without reasoning has."""
+        numbers = self.numbers()
+        return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
+
+
+def evaluate(
+    language: LanguageModel,
+    prompts: Prompts,
+    tokens: FrameTokens,
+    anchors: Sequence[Anchor],
+    config: EvalConfig,
+    *,
+    seed: int,
+) -> dict[str, Any]:
+    """Scores under `taught` (right words before), `own` (its own words before) and `waypoints_only`."""
+    rng = np.random.default_rng((seed, _TAG))
+    speaker = Speaker(language, prompts, tokens, config)
+    some = _some(anchors, config.anchors, rng)
+    scores: dict[str, Any] = {
+        "taught": taught(speaker, some, config.gap_s).numbers(),
+        "waypoints_only": taught(speaker, some, config.gap_s, waypoints_only=True).points(),
+    }
+    ids = sorted({anchor.drive_id for anchor in anchors})
+    chosen = {ids[int(i)] for i in rng.permutation(len(ids))[: config.drives]}
+    scores["own"] = closed_loop(speaker, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
+    return scores
+
+
+def glance(
+    language: LanguageModel,
+    prompts: Prompts,
+    tokens: FrameTokens,
+    anchors: Sequence[Anchor],
+    config: EvalConfig,
+    *,
+    seed: int,
+) -> dict[str, float]:
+    """A few numbers for a curve, of `epoch_anchors` anchors, always the same ones; {} where there are none."""
+    some = _some(anchors, config.epoch_anchors, np.random.default_rng((seed, _TAG)))
+    numbers = taught(Speaker(language, prompts, tokens, config), some, config.gap_s).numbers()
+    found = {
+        "parsable_share": numbers["waypoints_parsable"],
+        "progress_share": numbers["progress_right"],
+        "side_share": numbers["side_right"],
+        "landmark_recall": numbers["landmark_recall"],
+        "waypoint_error_3s_m": numbers["waypoint_error_m"] and numbers["waypoint_error_m"][0],
+    }
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def taught(
+    speaker: Speaker, questions: Sequence[tuple[Anchor, str]], gap_s: float, *, waypoints_only: bool = False
+) -> Score:
+    """Of answers to (anchor, wording) where the generation before, `gap_s` ago, was right."""
+    drawn = [(anchor, Drawn(wording, anchor.before(gap_s), waypoints_only)) for anchor, wording in questions]
+    score = Score(gap_s)
+    for (anchor, _), text in zip(drawn, speaker.say(drawn), strict=True):
+        score.add(text, anchor)
+    return score
+
+
+def _some(anchors: Sequence[Anchor], count: int, rng: np.random.Generator) -> list[tuple[Anchor, str]]:
+    """Anchors spread over all, each with one of its wordings."""
+    chosen = [anchors[int(i)] for i in sorted(rng.permutation(len(anchors))[:count])]
+    return [(anchor, anchor.wordings[int(rng.integers(len(anchor.wordings)))]) for anchor in chosen]
+
+
+class Speaker:
+    """Greedy answers of a language model, in batches of about one length."""
+
+    def __init__(self, language: LanguageModel, prompts: Prompts, tokens: FrameTokens, config: EvalConfig) -> None:
+        self._language = language
+        self._prompts = prompts
+        self._tokens = tokens
+        self._config = config
+
+    def guide(self, known: Known) -> TextGuide:
+        """What the runner holds an answer to."""
+        return self._prompts.guide(known)
+
+    def say(
+        self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[TextGuide | None] | None = None
+    ) -> list[str]:
+        """The text after each prompt, the start that it was given included; `guides`: one a question."""
+        guides = guides or [None] * len(questions)
+        rows = [
+            Row(self._prompts.prompt(anchor, drawn), (), frames_of(self._tokens, anchor.drive_id, anchor.frames))
+            for anchor, drawn in questions
+        ]
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i].prompt))
+        texts = [""] * len(rows)
+        language = self._language
+        for start in range(0, len(order), self._config.batch):
+            chosen = order[start : start + self._config.batch]
+            batch = collate(
+                [rows[i] for i in chosen],
+                img_context_id=language.config.img_context_id,
+                device=language.embed.weight.device,
+            )
+            answers = decode(language, batch, self._config.max_new_tokens, [guides[i] for i in chosen])
+            for i, said in zip(chosen, answers, strict=True):
+                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
+        return texts
+
+
+def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
+    """Scores along drives where `before` is what the model itself said last, as the runner remembers it.
+
+    Their progress is held to what may follow that, as the runner holds it; how far a turn is, is not.
+    """
+    drives: dict[str, list[Anchor]] = {}
+    for anchor in anchors:
+        if anchor.k % round(gap_s * RATE_HZ) == 0:
+            drives.setdefault(anchor.drive_id, []).append(anchor)
+    wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
+    known = dict.fromkeys(drives, NOTHING_KNOWN)
+    score = Score(gap_s)
+    for step in range(max((len(each) for each in drives.values()), default=0)):
+        now = [each[step] for each in drives.values() if step < len(each)]
+        drawn = [(anchor, Drawn(wording[anchor.drive_id], known[anchor.drive_id].before)) for anchor in now]
+        guides = [speaker.guide(known[anchor.drive_id]) for anchor in now]
+        for anchor, guide, text in zip(now, guides, speaker.say(drawn, guides), strict=True):
+            score.add(text, anchor)
+            known[anchor.drive_id] = known[anchor.drive_id].after(text, guide)
+    return score.numbers()
+
+
+def side_of(text: str) -> str | None:
+    """The side of the turn that the text plans: "left", "right"; None where it plans none."""
+    found = _SIDE.search(_line(text, PLAN_HEAD))
+    return found.group() if found else None
+
+
+def landmarks_of(text: str) -> Counter[str]:
+    """Names that the text's objects have, without where they are."""
+    items = (_PLACE.sub("", item.strip()) for item in _line(text, trace_words.OBJECTS).rstrip(".").split(","))
+    return Counter(item for item in items if item not in ("", trace_words.NOTHING))
+
+
+def _line(text: str, head: str) -> str:
+    """What the first line with this head says; empty without one."""
+    return next((line[len(head) :] for line in text.split("\n") if line.startswith(head)), "")
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

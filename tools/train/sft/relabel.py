@@ -1,0 +1,300 @@
+"""The same drive under other instructions: ways to other goals from where it began, and what is true of them along it.
+
+A drive shows one of many ways that its first pictures allow. A model that sees every corridor with one instruction
+learns corridors by heart, and where to go in them; with several it has to read what is asked. Past the place where the
+drive leaves the other way, it shows a turn that was missed. Only words are told anew, and only where nobody is near:
+where people stood is not recorded, so neither what they hid nor how to go round them is known of another way.
+
+Retellings lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They
+are written by rename, so a build that was ended goes on with the next drive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import hypot
+from pathlib import Path
+from typing import Any, Final
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.core.cli import write_whole
+from sim_hil.benchmark.language.route import RouteError
+from sim_hil.benchmark.language.tasks import begins_ahead, make_task
+from sim_hil.benchmark.policies.expert import NEAR, along, driving_of, from_here
+from sim_hil.benchmark.policies.expert_route import RoutePlanner
+from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
+from sim_hil.layouts import LayoutError
+from sim_hil.scene.scene import SceneObject, Vec3
+from tools.train.config.collect import TRACE_EVERY
+from tools.train.config.sft import RetellConfig
+from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
+from tools.train.run.distributed import SINGLE, Ranks
+from tools.train.run.job import QuietProgress, StageProgress
+from tools.train.samples.anchors import Anchor, anchors_of
+from tools.train.scenes import trace_sentences as words
+from tools.train.scenes.progress_labels import RouteProgress
+from tools.train.scenes.scenarios import Scenario, ScenarioError, is_sound, scenario_of
+from tools.train.scenes.sites import Site, SiteError
+from tools.train.scenes.trace_sentences import Trace
+from tools.train.scenes.traces import Sight, Tracer, turning_first
+
+FOLDER: Final = "retold"
+FORMAT: Final = 2
+LEAST_FRAMES: Final = 50
+"""That a retelling has; a shorter one teaches nothing."""
+_OFF_M: Final = 3.0  # so far from the other way a retelling ends: most of it is not of turns that were missed
+_APART_M: Final = 2.0  # between two goals
+_FREE: Final = 0.9  # of a drive's poses are on the scene's free floor, if it is the scene; a policy brushes walls
+_ARRIVE_SHARE: Final = 0.7  # of the distance that counts as arrived, as where drives end
+_REACH_M: Final = 10.0  # of a route: 9 s of it
+_TAG: Final = 0x2E7E11
+
+
+class RetellError(ValueError):
+    """Retellings that cannot be read; one line: what, expected, found, what to do."""
+
+
+@dataclass(frozen=True)
+class Retelling:
+    """Another way, told of the first N frames of a drive.
+
+    `plan_xy` [N, 3, 2]: where one would be on it in 3, 6 and 9 s, m in the robot's frame; `traces`: one a second.
+    """
+
+    wordings: tuple[str, ...]
+    told: tuple[dict[str, Any], ...]
+    goal_xy: tuple[float, float]
+    plan_xy: NDArray[np.float32]
+    traces: tuple[dict[str, Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.plan_xy)
+
+    def of(self, drive: Drive) -> Drive:
+        """The drive as this tells it: nothing is known of what to do next, and its pictures are left out."""
+        count = len(self)
+        about = replace(
+            drive.about, wordings=self.wordings, told=self.told, goal_xy=self.goal_xy, traces=self.traces
+        )  # fmt: skip
+        return Drive(
+            about=about,
+            jpeg=np.zeros(0, np.uint8),
+            jpeg_end=drive.jpeg_end[:count],
+            pose=drive.pose[:count],
+            pose_odom=drive.pose_odom[:count],
+            state=drive.state[:count],
+            future=np.zeros_like(drive.future[:count]),
+            future_steps=np.zeros_like(drive.future_steps[:count]),
+            plan_xy=self.plan_xy,
+            by=drive.by[:count],
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """What `of_json` reads."""
+        plan = [[[round(float(v), 3) for v in point] for point in frame] for frame in self.plan_xy]
+        return {**asdict(self), "plan_xy": plan}
+
+    @staticmethod
+    def of_json(content: dict[str, Any]) -> Retelling:
+        """What `as_json` has written; raises KeyError, TypeError, ValueError."""
+        x, y = content["goal_xy"]
+        lists = {name: tuple(content[name]) for name in ("wordings", "told", "traces")}
+        plan = np.array(content["plan_xy"], np.float32).reshape(-1, len(PLAN_TIMES_S), 2)
+        return Retelling(goal_xy=(float(x), float(y)), plan_xy=plan, **lists)
+
+
+class Retellings:
+    """Those of a data set's drives, by one set of numbers."""
+
+    def __init__(self, dataset: Dataset, config: RetellConfig, seed: int, speed_mps: float) -> None:
+        """Opens what is there; `build` makes what is missing. `speed_mps`: the expert's, at which waypoints are."""
+        numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **asdict(config)}
+        self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
+        self.folder = dataset.folder / FOLDER / self.key[:16]
+        self._dataset, self._config, self._seed, self._speed_mps = dataset, config, seed, speed_mps
+        self._entries = {entry.id: entry for entry in dataset.entries}
+
+    def build(
+        self, ids: Sequence[str], *, ranks: Ranks = SINGLE, progress: StageProgress | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:  # fmt: skip
+        """Make what is missing of these drives. Ranks share the layouts; all must call.
+
+        Raises DriveError, OSError, and KeyboardInterrupt when `stopped` on any rank.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        ranks.barrier()
+        missing = [self._entries[drive_id] for drive_id in ids if self._read(drive_id) is None]
+        ranks.barrier()  # everybody has looked before anybody adds
+        places: dict[tuple[str, int], list[Entry]] = {}
+        for entry in missing:
+            places.setdefault((entry.kind, entry.layout_seed), []).append(entry)
+        own = [places[place] for place in sorted(places)[ranks.rank :: ranks.world]]
+        done, count = 0, sum(map(len, own))
+        for entries in own:
+            kind, layout_seed = entries[0].kind, entries[0].layout_seed
+            site = _site(kind, layout_seed)
+            for entry in entries:
+                if stopped():
+                    break
+                drive = self._dataset.load(entry.id, pictures=False)
+                found = [] if site is None else retell(drive, site, self._config, self._seed, self._speed_mps)
+                content = {"drive_sha256": entry.sha256, "ways": [each.as_json() for each in found]}
+                write_whole(self._path(entry.id), json.dumps(content, separators=(",", ":")) + "\n")
+                done += 1
+                (progress or QuietProgress()).update(done, count)
+        if ranks.any(stopped()):
+            raise KeyboardInterrupt
+
+    def anchors(self, drive: Drive) -> list[Anchor]:
+        """Those of a drive under its other instructions at which nobody is near; raises RetellError before `build`."""
+        found = self._read(drive.id)
+        if found is None:
+            raise RetellError(f"{self._path(drive.id)}: not the retellings of this drive; build them first")
+        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == words.NOBODY}
+        return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
+
+    def _read(self, drive_id: str) -> list[Retelling] | None:
+        """What was written of a drive as it is now; None where nothing was, or where it cannot be read."""
+        try:
+            content = json.loads(self._path(drive_id).read_text(encoding="utf-8"))
+            found = [Retelling.of_json(each) for each in content["ways"]]
+        except (OSError, KeyError, TypeError, ValueError):
+            return None
+        return found if content["drive_sha256"] == self._entries[drive_id].sha256 else None
+
+    def _path(self, drive_id: str) -> Path:
+        return self.folder / f"{drive_id}.json"
+
+
+def _site(kind: str, layout_seed: int) -> Site | None:
+    """None for a scene that is not one of ours."""
+    try:
+        return Site(kind, layout_seed)
+    except (SiteError, LayoutError):
+        return None
+
+
+def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps: float) -> list[Retelling]:
+    """Ways to other goals of its site, in an order by chance; the same numbers give the same."""
+    rng = np.random.default_rng((seed, _TAG, crc32(drive.id.encode())))
+    things = [site.goals[int(index)] for index in rng.permutation(len(site.goals))[: config.tries]]
+    first = drive.T_world_base(0)
+    start = (round(first.x_m, 2), round(first.y_m, 2), round(first.theta_rad, 3))
+    lines = _Remembered(site.lines)
+    found: list[Retelling] = []
+    if not drive.traces or not _was_here(drive, site) or not site.grid.is_free(*start[:2]):
+        return found
+    for thing in things:
+        if len(found) >= config.ways:
+            break
+        scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
+        if scenario is not None and (one := told_along(drive, scenario, speed_mps, lines)) is not None:
+            found.append(one)
+    return found
+
+
+def _was_here(drive: Drive, site: Site) -> bool:
+    """Whether a drive is of a scene as it is built now: of its name, and through no wall of it."""
+    free = [site.robot_grid(drive.about.robot).is_free(float(x), float(y)) for x, y, _ in drive.pose[::TRACE_EVERY]]
+    return drive.about.scene == site.scene.name and float(np.mean(free)) >= _FREE
+
+
+def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int) -> Scenario | None:
+    """The task to go to a thing from a drive's start; None where it cannot be told, or is the drive's own."""
+    about = drive.about
+    try:
+        task = make_task(site.scene, site.grid, start, thing)
+        gaps = [hypot(task.goal[0] - x, task.goal[1] - y) for x, y in (about.goal_xy, start[:2])]
+        if gaps[0] < _APART_M or gaps[1] < site.threshold_m + _APART_M:
+            return None
+        if not (begins_ahead(task) and is_sound(site, task)):
+            return None
+        return scenario_of(site, task, wording_seed, about.robot, about.people, 0, 0)
+    except (RouteError, ScenarioError):
+        return None
+
+
+def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None) -> Retelling | None:
+    """What is true along a drive of the way of a scenario that begins where it began; None where it hardly shows any.
+
+    Told up to where the drive is 3 m from that way, or has arrived. `lines`: as of `Tracer`.
+    """
+    progress = RouteProgress(scenario)
+    count = _shown_frames(drive, scenario, progress)
+    plan = _plans(drive, scenario, speed_mps, count) if count >= LEAST_FRAMES else None
+    if plan is None:
+        return None
+    tracer = Tracer(scenario, progress, lines)
+    driving = driving_of(scenario.episode.robot)
+    traces = []
+    for own in drive.traces:
+        k = int(own["k"])
+        if k >= count:
+            break
+        means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
+        alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
+        traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
+    told = tuple(scenario.told_json())
+    return Retelling(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
+
+
+def _among(alone: Trace, own: Trace) -> Trace:
+    """A trace of an empty place, with the people of another one of the same instant."""
+    things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
+    people = [] if own.motion == words.NOBODY else own.motion.split(", ")
+    return Trace.of(own.situation, things, people, alone.progress, alone.plan)
+
+
+def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:
+    """How many frames a drive has before it arrives at another goal, or is too far from the way there."""
+    x, y = scenario.episode.goal_xy
+    near = np.hypot(drive.pose[:, 0] - x, drive.pose[:, 1] - y) < _ARRIVE_SHARE * scenario.episode.threshold_m
+    for k in range(len(drive)):
+        if progress.strayed_m(drive.T_world_base(k)) > _OFF_M:
+            return k
+        if near[k]:
+            return k + 1
+    return len(drive)
+
+
+def _plans(drive: Drive, scenario: Scenario, speed_mps: float, count: int) -> NDArray[np.float32] | None:
+    """[count, 3, 2]: where one would be on the way, from every frame; None where the robot cannot get there."""
+    episode = scenario.episode
+    robot, goal_xy = episode.robot, episode.goal_xy
+    planner = RoutePlanner(
+        scenario.scene, goal_xy, footprint_m(robot), max_step_m(robot), NEAR * episode.threshold_m, scenario.task.path
+    )
+    driving = replace(driving_of(robot), speed_mps=speed_mps)
+    plan = np.zeros((count, len(PLAN_TIMES_S), 2), np.float32)
+    route = np.zeros((0, 2))
+    for k in range(count):
+        pose = drive.T_world_base(k)
+        if k % (TRACE_EVERY // 2) == 0:
+            if not planner.reachable(pose.x_m, pose.y_m):
+                return None
+            route = planner.route((pose.x_m, pose.y_m), np.zeros((0, 2)), _REACH_M)
+        route = from_here(route, pose)
+        plan[k] = along(route, pose, max(float(drive.state[k, 0]), 0.0), driving, PLAN_TIMES_S)
+    return plan
+
+
+class _Remembered:
+    """Sightlines that are asked the same for several ways along one drive."""
+
+    def __init__(self, lines: Sight) -> None:
+        self._lines = lines
+        self._known: dict[tuple[object, ...], float] = {}
+
+    def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
+        """As `Sightlines.pixels`."""
+        key = (eye, heading_rad, thing.label, thing.position_m, range_m)
+        if key not in self._known:
+            self._known[key] = self._lines.pixels(eye, heading_rad, thing, range_m)
+        return self._known[key]

@@ -1,0 +1,391 @@
+"""Stage 1: the language model learns reasoning with waypoints, and waypoints alone, over a frozen encoder (equation 3).
+
+What is random — words, `before`, kind of answer, order — is a pure function of seed and epoch, so a run that was ended
+goes on exactly, and any number of ranks sees the same batches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tokenizers import Tokenizer
+
+from export.checkpoint import tokenizer_for
+from export.model.network import TicVla
+from tools.train.collect.tours import build_tours, tour_anchors
+from tools.train.config.collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ, CollectConfig
+from tools.train.config.optim import OptimConfig
+from tools.train.config.recipe import Recipe
+from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig
+from tools.train.drives.drive import Dataset
+from tools.train.run import checkpoint
+from tools.train.run.job import StageJob
+from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
+from tools.train.run.optim import Optimiser, autocast
+from tools.train.run.own_drives import drives_after
+from tools.train.samples.anchors import Anchor, Prompts, anchors_of, draw, waiting
+from tools.train.samples.kv_build import parts_sha256
+from tools.train.samples.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
+from tools.train.samples.mirror import FOLDER as MIRRORED
+from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
+from tools.train.samples.tokens import TokenCache
+from tools.train.sft.language_augment import disturbed, shifted
+from tools.train.sft.language_eval import evaluate, glance
+from tools.train.sft.relabel import Retellings
+
+STAGE: Final = "sft"
+PLANNED_TOUR_S: Final = 45.0
+_DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
+_RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
+_DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
+
+
+class SftError(ValueError):
+    """Data or a checkpoint that cannot be learned from; one line."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One drawn question and answer as ids, int32, and the anchor that it is about, as it is or in the mirror."""
+
+    anchor: int
+    in_mirror: bool
+    prompt: npt.NDArray[np.int32]
+    answer: npt.NDArray[np.int32]
+    frames: tuple[int, ...]
+    noise_seed: int | None = None
+    """Of what disturbs the visual tokens; None: nothing does."""
+
+    def __len__(self) -> int:
+        return len(self.prompt) + len(self.answer)
+
+
+class Samples:
+    """What can be drawn from the anchors of some drives."""
+
+    def __init__(
+        self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0,
+        deciding: int = 1, shown: ShowConfig | None = None,
+    ) -> None:  # fmt: skip
+        """`mirrored`: share of samples that are of the mirrored drive; `deciding`: how often an anchor that decides
+        is drawn; `shown`: how its frames are disturbed (None: not at all)."""
+        self.anchors = tuple(anchors)
+        self._shown = [i for i, each in enumerate(self.anchors) for _ in range(deciding if each.decides else 1)]
+        self._prompts = prompts
+        self._views = views
+        self._words = words
+        self._mirrored = mirrored
+        self._show = shown
+
+    def __len__(self) -> int:
+        return len(self._shown)
+
+    def draw(self, rng: np.random.Generator) -> list[Sample]:
+        """One sample of every anchor, `deciding` of those that decide."""
+        drawn: list[Sample] = []
+        for index in self._shown:
+            anchor = self.anchors[index]
+            in_mirror = bool(rng.uniform() < self._mirrored)
+            seed = None
+            if self._show is not None:
+                near, seed = shifted(anchor, self._show, rng), int(rng.integers(2**31))
+                # In the mirror only whole seconds have tokens.
+                anchor = anchor if in_mirror else near
+            asked = mirrored(anchor) if in_mirror else anchor
+            prompt, answer = self._prompts.of(asked, draw(asked, self._words, rng))
+            ids = np.array(prompt, np.int32), np.array(answer, np.int32)
+            drawn.append(Sample(index, in_mirror, *ids, anchor.frames, seed))
+        return drawn
+
+    def rows(self, samples: Sequence[Sample]) -> list[Row]:
+        """The same with their frames' tokens."""
+        return [
+            Row(
+                tuple(each.prompt.tolist()),
+                tuple(each.answer.tolist()),
+                self._frames(each),
+            )
+            for each in samples
+        ]
+
+    def _frames(self, sample: Sample) -> tuple[Halves, ...]:
+        anchor = replace(self.anchors[sample.anchor], frames=sample.frames)
+        frames = self._views.of(anchor, in_mirror=sample.in_mirror)
+        if self._show is None or sample.noise_seed is None:
+            return frames
+        return disturbed(frames, self._show, np.random.default_rng((_NOISE, sample.noise_seed)))
+
+
+def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
+    """(what, how many, which measured rate) before there are drives: they are planned to be 30 s long."""
+    config, collect = recipe.sft or SftConfig(), recipe.collect
+    seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
+    each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
+    anchors = round(seconds * each) * config.epochs
+    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    if not config.tours.count:
+        return drives
+    toured = round(PLANNED_TOUR_S * config.tours.count)
+    shown = round(toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
+    frames = toured * (2 if config.mirrored > 0 else 1)
+    tours = (
+        ("made", config.tours.count, "tour"),
+        ("frames encoded", frames, "encode"),
+        ("anchors learned", shown, "sft"),
+    )
+    return [*drives, *((f"{OF_TOURS}{what}", count, key) for what, count, key in tours)]
+
+
+def run(job: StageJob) -> dict[str, Any]:
+    """Train on the run's data set; leaves the network with its new language model.
+
+    Raises SftError, CollectError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
+    """
+    config = _config(job)
+    dataset = drives_after(job, STAGE)
+    network, epochs, optim = _start(job, config)
+    plain = TokenCache(dataset, network.vision)
+    mirror: TokenCache | None = None
+    _encode(job, plain, dataset.ids)
+    if config.mirrored > 0:
+        mirror = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
+        _encode(job, mirror, dataset.train)
+    job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
+    more = _retold(job, dataset) if config.retold.ways else []
+    views = Views(plain, mirror)
+    if config.tours.count:
+        tours = _tours(job, dataset)
+        views = _with_tours(job, network, views, tours)
+        more += tour_anchors(tours, tours.ids)
+    result = fit(job, network.to(job.device), dataset, views, more)
+    if job.ranks.first:
+        finish_network(job, STAGE, network.cpu())
+    job.ranks.barrier()
+    return result
+
+
+def _start(job: StageJob, config: SftConfig) -> tuple[TicVla, int, OptimConfig]:
+    """The network to begin with, for how many epochs it is trained and how."""
+    rounds = job.run_dir.retired(STAGE)
+    if not rounds or not config.go_on_share:
+        return start_network(job, STAGE), config.epochs, config.optim
+    path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
+    optim = replace(config.optim, lr=config.optim.lr * config.go_on_lr_share)
+    epochs = max(1, round(config.epochs * config.go_on_share))
+    return read_network(path, job.recipe.model, job.recipe.seed), epochs, optim
+
+
+def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
+    if tokens.missing(ids):
+        job.progress.say("encoding frames")
+    tokens.build(ids, device=job.device, ranks=job.ranks, progress=job.progress)
+
+
+def fit(
+    job: StageJob, network: TicVla, dataset: Dataset, views: Views, more: Sequence[Anchor] = ()
+) -> dict[str, Any]:  # fmt: skip
+    """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is.
+
+    `more`: anchors to learn from beside those of the drives: of other instructions, of tours.
+    """
+    config, language = _config(job), network.language
+    content = tokenizer_for(network.config, None)
+    prompts = Prompts(Tokenizer.from_buffer(content), network.config)
+    anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train), *more]
+    data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
+    held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
+    if not data.anchors:
+        raise SftError(f"{dataset.folder}: no anchors with reasoning; collect drives, or import them with words")
+    per_epoch = -(-len(data) // config.batch)
+    total = per_epoch * config.epochs
+    job.ranks.copy_parameters(language.parameters())
+    optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
+    state = _State(job, network, optimiser, _key(job, config, dataset, content, network, more))
+    numbers = state.load()
+    questions = _held(held, config, job.seed)
+    while optimiser.step_count < total:
+        epoch, within = divmod(optimiser.step_count, per_epoch)
+        samples = data.draw(np.random.default_rng((job.seed, _DRAWS, epoch)))
+        order = buckets([len(each) for each in samples], config.batch, np.random.default_rng((job.seed, _ORDER, epoch)))
+        for chosen in order[within:]:
+            lr = optimiser.lr
+            numbers["loss"] = _learn(job, network, optimiser, data, [samples[i] for i in chosen])
+            step = optimiser.step_count
+            line = {"loss": numbers["loss"], "lr": lr}
+            if questions and step % per_epoch == 0:
+                line["held_loss"] = numbers["held_loss"] = mean_loss(job, network, held, questions)
+            if job.ranks.first:
+                if step % per_epoch == 0:
+                    line |= glance(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
+                job.run_dir.log(STAGE, step, **line)
+            job.progress.update(step, total, **numbers)
+            stopping = job.should_stop()
+            if stopping or step % config.checkpoint_steps == 0 or step % per_epoch == 0:
+                state.save(numbers)
+            if stopping:
+                raise KeyboardInterrupt
+    result: dict[str, Any] = {
+        "steps": total,
+        "anchors": len(data.anchors),
+        "more_anchors": len(more),
+        "held_anchors": len(held.anchors),
+        **numbers,
+    }
+    if job.ranks.first and held.anchors:
+        result["held_out"] = evaluate(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
+    return result
+
+
+def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence[Sample]) -> float:
+    """Equation 3 over given samples (one or more), in batches shared by the ranks."""
+    config = _config(job)
+    order = sorted(range(len(questions)), key=lambda i: (len(questions[i]), i))
+    batches = [order[at : at + config.batch] for at in range(0, len(order), config.batch)]
+    total = 0.0
+    with torch.no_grad(), autocast(job.device, config.optim.bf16):
+        for chosen in batches[job.ranks.rank :: job.ranks.world]:
+            batch = _batch(job, network, data, [questions[i] for i in chosen])
+            total += float(row_losses(network.language, batch).sum())
+    return job.ranks.sum(total) / len(questions)
+
+
+def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, samples: Sequence[Sample]) -> float:
+    """One step from one global batch; returns its mean loss over all ranks."""
+    own = samples[job.ranks.rank :: job.ranks.world]
+    value = 0.0
+    if own:
+        batch = _batch(job, network, data, own)
+        with autocast(job.device, optimiser.config.bf16):
+            loss = row_losses(network.language, batch).mean()
+        loss.backward()
+        value = float(loss.detach())
+    optimiser.step(len(own))
+    return job.ranks.mean(value, len(own))
+
+
+def _batch(job: StageJob, network: TicVla, data: Samples, samples: Sequence[Sample]) -> LanguageBatch:
+    image_id = network.config.language.img_context_id
+    return collate(data.rows(samples), img_context_id=image_id, device=torch.device(job.device))
+
+
+def _held(held: Samples, config: SftConfig, seed: int) -> list[Sample]:
+    """Questions of held-out layouts, the same after every epoch, spread over all drives."""
+    rng = np.random.default_rng((seed, _HELD))
+    samples = held.draw(rng)
+    chosen = rng.permutation(len(samples))[: config.held_anchors]
+    return [samples[int(i)] for i in sorted(chosen)]
+
+
+def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
+    for drive in dataset.drives(ids, pictures=False):
+        yield from anchors_of(drive)
+
+
+def _tours(job: StageJob, dataset: Dataset) -> Dataset:
+    """Those to learn from now, made where they are not there yet."""
+    collected = job.recipe.collect or CollectConfig()
+    config, rounds = _config(job), job.run_dir.retired(STAGE)
+    job.progress.say("carrying robots about")
+    tours = build_tours(
+        dataset, config.tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
+        stopped=lambda: job.stop.asked,
+    )  # fmt: skip
+    if not rounds or not config.go_on_share:
+        return tours
+    chosen = np.random.default_rng((job.recipe.seed, _AGAIN, rounds)).permutation(len(tours))
+    entries = (tours.entries[int(i)] for i in sorted(chosen[: round(config.tours_again * len(tours))]))
+    return Dataset(tours.folder, tuple(entries))
+
+
+def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) -> Views:
+    """Tokens of tours beside those of the drives."""
+    seconds = TokenCache(SecondsDataset.of(tours), network.vision)
+    _encode(job, seconds, tours.ids)
+    mirror = views.mirror
+    if mirror is not None:
+        other = TokenCache(SecondsDataset.of(tours, mirrored=True), network.vision, tours.folder / MIRRORED)
+        _encode(job, other, tours.ids)
+        mirror = Joined(mirror, other, frozenset(tours.ids))
+    return Views(views.plain, mirror, seconds)
+
+
+def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
+    """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
+    collected = job.recipe.collect or CollectConfig()
+    retellings = Retellings(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
+    job.progress.say("telling other ways")
+    retellings.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
+    return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in retellings.anchors(drive)]
+
+
+def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
+    """One anchor a drive of a robot that has waited at its start for one generation or more."""
+    for number, drive in enumerate(dataset.drives(ids, pictures=False)):
+        for anchor in anchors_of(drive)[:1]:
+            yield waiting(anchor, 1 + number % 3)
+
+
+def _config(job: StageJob) -> SftConfig:
+    if job.recipe.sft is None:
+        raise SftError("the recipe has no table [sft]")
+    return job.recipe.sft
+
+
+def _key(
+    job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, more: Sequence[Anchor]
+) -> str:  # fmt: skip
+    """What a checkpoint must have been made with to be gone on from."""
+    made = {
+        "seed": job.seed,
+        "config": asdict(config),
+        "dataset": dataset.sha256,
+        "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
+        "sizes": asdict(network.config.language),
+        "vision": parts_sha256(network, ("vision",)),
+        "more": hashlib.sha256("\n".join(each.reasoning for each in more).encode()).hexdigest(),
+    }
+    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
+
+
+class _State:
+    """The stage's checkpoint: weights, moments, step and the last numbers."""
+
+    def __init__(self, job: StageJob, network: TicVla, optimiser: Optimiser, key: str) -> None:
+        self._job = job
+        self._network = network
+        self._optimiser = optimiser
+        self._key = key
+        self._path: Path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
+
+    def save(self, numbers: Mapping[str, float]) -> None:
+        """Written by the first rank alone: all have the same."""
+        if self._job.ranks.first:
+            weights = checkpoint.with_prefix("language", self._network.language.state_dict())
+            meta = {"key": self._key, "step": self._optimiser.step_count, "numbers": dict(numbers)}
+            checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
+
+    def load(self) -> dict[str, float]:
+        """Go on if asked to and able to; gives the last numbers. Raises SftError for another run's checkpoint."""
+        if not (self._job.resume and self._path.exists()):
+            self._rewind(-1)
+            return {}
+        tensors, meta = checkpoint.load(self._path)
+        if meta["key"] != self._key:
+            raise SftError(f"{self._path}: of other data, another encoder or another recipe; delete it to begin anew")
+        self._network.language.load_state_dict(checkpoint.under("language", tensors))
+        self._optimiser.restore(tensors)
+        self._rewind(int(meta["step"]))
+        return dict(meta["numbers"])
+
+    def _rewind(self, step: int) -> None:
+        if self._job.ranks.first:
+            self._job.run_dir.rewind(STAGE, step)
+        self._job.ranks.barrier()
