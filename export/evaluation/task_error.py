@@ -335,6 +335,6 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _plain(errors: Errors) -> dict[str, Any]:
+def _plain(errors: Errors) -> dict[str, object]:
     stats = {name: vars(value) for name, value in vars(errors).items() if isinstance(value, Stat)}
     return {"moments": errors.moments, **{name: dict(stat) for name, stat in stats.items()}}

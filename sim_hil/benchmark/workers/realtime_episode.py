@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
@@ -250,7 +251,7 @@ def _generation(record: Mapping[str, Any], begin_ns: int) -> dict[str, Any]:
     }
 
 
-def _last_people(trace: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _last_people(trace: Path) -> NDArray[np.float64]:
     last: list[list[float]] = []
     for line in read_lines(trace):
         if line.get("kind") == "people":

@@ -287,7 +287,7 @@ class _Tour:
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
         return people[(gaps < _VIEW_M) & (np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDING_MPS)]
 
-    def trace(self) -> Mapping[str, Any]:
+    def trace(self) -> Mapping[str, object]:
         """What is to be said here."""
         means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
         people, velocities = self._carriage.people(), self._carriage.velocities()

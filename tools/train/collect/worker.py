@@ -67,7 +67,7 @@ class Order:
         return dict(plain(self))
 
     @staticmethod
-    def of_json(content: Mapping[str, Any]) -> Order:
+    def of_json(content: Mapping[str, object]) -> Order:
         """An order that `as_json` has written; raises FieldError."""
         return build(Order, content, "order")
 

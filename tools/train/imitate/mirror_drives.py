@@ -56,7 +56,7 @@ def _flipped(array: NDArray[Any], *axes: int) -> NDArray[Any]:
     return array
 
 
-def _mirrored_trace(trace: Mapping[str, Any]) -> dict[str, Any]:
+def _mirrored_trace(trace: Mapping[str, object]) -> dict[str, Any]:
     return {key: mirrored_text(value) if isinstance(value, str) else value for key, value in trace.items()}
 
 

@@ -111,7 +111,7 @@ class Trace:
         """The five lines and the waypoints' (x, y), m, at 3, 6 and 9 s: what the model is to answer."""
         return f"{self.reasoning()}\n{format_waypoints(tuple(waypoints))}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """For a drive's header."""
         return asdict(self)
 

@@ -88,7 +88,7 @@ class Score:
             "waypoint_error_m": [float(mean) for mean in errors.mean(0)] if len(errors) else None,
         }
 
-    def points(self) -> dict[str, Any]:
+    def points(self) -> dict[str, object]:
         """Those of `numbers` that an answer without reasoning has."""
         numbers = self.numbers()
         return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
