@@ -67,7 +67,7 @@ def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
 
 
 @dataclass
-class _Drive:
+class RealtimeDrive:
     """What was seen while the episode was driven."""
 
     poses: list[TruePose] = field(default_factory=list)
@@ -168,7 +168,7 @@ def _asked_to_end() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
+def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> RealtimeDrive:
     """Start everything and follow the robot until the episode is over; the clock starts when the robot is armed."""
     stack.start_robot(lambda: None)
     stack.start_bridge(lambda: None)
@@ -181,7 +181,7 @@ def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
         if time.monotonic_ns() > deadline_ns:
             raise runner.failure(f"not armed within {ARM_TIMEOUT_S:g} s")
         time.sleep(POLL_S)
-    tail, drive = TruthTail(stack.trace), _Drive()
+    tail, drive = TruthTail(stack.trace), RealtimeDrive()
     before = tail.update()
     drive.poses = before[-1:]
     while not drive.poses:
@@ -190,14 +190,14 @@ def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
     while runner.running:
         stack.check()
         for pose in tail.update():
-            if _over(drive, pose, task.episode):
+            if is_over(drive, pose, task.episode):
                 return drive
         tell(drive.time_s)
         time.sleep(POLL_S)
     return drive
 
 
-def _over(drive: _Drive, pose: TruePose, episode: Episode) -> bool:
+def is_over(drive: RealtimeDrive, pose: TruePose, episode: Episode) -> bool:
     drive.poses.append(pose)
     drive.time_s = (pose.t_ns - drive.poses[0].t_ns) / 1e9
     if pose.touching and drive.first_collision_s is None:

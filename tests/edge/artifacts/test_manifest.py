@@ -274,6 +274,7 @@ def mapped_copy(mapped: Path, tmp_path: Path) -> Path:
 DATA = "vision_encoder.onnx.data"
 
 
+@pytest.mark.slow
 def test_weights_in_a_data_file_compute_the_same(mapped: Path, artifacts_dir: Path) -> None:
     assert (mapped / DATA).exists() and not (artifacts_dir / DATA).exists()
     frame = np.random.default_rng(0).integers(0, 256, (1, 128, 128, 3)).astype(np.uint8)

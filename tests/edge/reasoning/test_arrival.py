@@ -209,7 +209,7 @@ def test_standing_to_think_is_told_before_having_arrived() -> None:
     bench = Bench()
     bench.drive()
     bench.think(stop=SE2(bench.walked_m, 0.0, 0.0))
-    bench.loop._slot.drive_until_ns = 0
+    bench.slot.drive_until_ns = 0
     bench.see()
     assert bench.tick() == (0.0, "thinking")
 

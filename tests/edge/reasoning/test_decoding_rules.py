@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tokenizers import Tokenizer
 
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2, wrap_angle
@@ -409,7 +410,8 @@ def said(artifacts: Artifacts, text: str, known: Known) -> tuple[str, TextGuide,
     """(text, its guide, whether what was fed is what was said) of a model that would say `text`."""
     language = LanguageModel(artifacts, threads=1)
     tail = language.prompt.tail((), known.before)
-    lines = [language._tokenizer.encode(line, add_special_tokens=False).ids for line in text.splitlines(keepends=True)]
+    tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
+    lines = [tokenizer.encode(line, add_special_tokens=False).ids for line in text.splitlines(keepends=True)]
     script = Script([*lines[:-1], [*lines[-1], language.runtime.im_end_id]], len(tail.ids))
     language.prefill_call = language.decode_call = cast("Call", script)
     guide = language.guide(known)

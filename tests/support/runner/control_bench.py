@@ -116,7 +116,9 @@ class Bench:
         self.stop = threading.Event()
         self.on_time: list[bool] = []
         self._random = np.random.default_rng(0)
-        controller = ControllerConfig(limits, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200)
+        self.controller_config = controller = ControllerConfig(
+            limits, step_s=0.1, frame_max_age_ms=500, odometry_max_age_ms=200
+        )
         sources = Sources(
             findings=self.findings,
             attitude=lambda: self.attitude,

@@ -256,6 +256,7 @@ def office() -> Iterator[tuple[Scenario, CameraWorld]]:
     world.close()
 
 
+@pytest.mark.slow
 def test_a_person_is_spoken_of_just_when_the_picture_shows_one(office: tuple[Scenario, CameraWorld]) -> None:
     scenario, world = office
     tracer, rng = _tracer(scenario), np.random.default_rng(3)
@@ -278,6 +279,7 @@ def _without(scene: Scene, label: str) -> CameraWorld:
     return CameraWorld(scene.without(label), people=1, seed=4)
 
 
+@pytest.mark.slow
 def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scenario, CameraWorld]) -> None:
     scenario, world = office
     tracer, told = _tracer(scenario), scenario.told
@@ -298,6 +300,7 @@ def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scen
         bare.close()
 
 
+@pytest.mark.slow
 def test_a_whole_walk_through_people_can_be_told() -> None:
     scenario = scenarios("hospital")[0]
     tracer, people = _tracer(scenario), People(replace(scenario.scene, start=scenario.task.start), 20, 1)
