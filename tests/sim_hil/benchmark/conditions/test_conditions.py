@@ -36,10 +36,10 @@ def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: fl
     assert latency is not None and latency.generation_s == (latency_s,)
 
 
-def test_the_goal_ends_an_episode_unless_it_is_asked_to_stay_where_it_thinks_that_it_is() -> None:
+def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
-    assert not free.stays and "stays" not in free.describe()
-    assert stays.stays and "stays where it says" in stays.describe()
+    assert not free.stays and "halts" not in free.describe()
+    assert stays.stays and "halts at its own stop" in stays.describe()
 
 
 def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
@@ -52,10 +52,13 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
         (("--policy", "artifacts:"), "expected artifacts:DIR"),
         (("--policy", "expert:here"), "expected artifacts:DIR"),
-        (("--policy", "expert", "--mode", "sync"), "mode: belongs to a policy from artifacts"),
-        (("--policy", "expert", "--latency", "2"), "latency: expert does not think"),
+        (("--policy", "expert", "--mode", "sync"), "mode: expected one for artifacts:DIR and for no other policy"),
+        (
+            ("--policy", "expert", "--latency", "2"),
+            "latency: expected only with artifacts:DIR or external:ADDR, found with expert",
+        ),
         (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
-        (("--policy", "expert", "--stay"), "stay: belongs to a policy from artifacts"),
+        (("--policy", "expert", "--stay"), "stay: expected only with artifacts:DIR"),
         (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
         (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
         (("--policy", "still", "--camera", "8x8"), "expected auto or WxH"),
@@ -77,6 +80,6 @@ def test_conditions_of_another_kind_are_refused(change: dict[str, Any]) -> None:
 
 
 def test_a_model_needs_a_latency_in_lockstep() -> None:
-    with pytest.raises(ConditionsError, match="needs one in lockstep"):
+    with pytest.raises(ConditionsError, match="expected one for artifacts:DIR in lockstep"):
         Conditions(PolicySpec("artifacts", "/nano"), mode="async")
     Conditions(PolicySpec("artifacts", "/nano"), mode="async", latency=LatencyProfile.constant(1))
