@@ -1,4 +1,4 @@
-"""A datagram socket that faults of a running front end are switched by: one JSON object in, one out."""
+"""Datagram socket that switches faults of a running front end: one JSON object per request and answer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MAX_A_POLL: Final = 16
 
 
 class FaultSocket(ABC):
-    """Binds PATH for its user alone; `poll` takes in what has come. Raises OSError."""
+    """Fault socket at a path that only this user can access; `poll` handles requests. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,7 +32,7 @@ class FaultSocket(ABC):
         self._socket.setblocking(False)
 
     def poll(self) -> None:
-        """Take in the commands that have come; never waits."""
+        """Handle the requests that have arrived, without waiting."""
         for _ in range(_MAX_A_POLL):
             try:
                 data, sender = self._socket.recvfrom(_MAX_BYTES + 1)
@@ -43,12 +43,12 @@ class FaultSocket(ABC):
             except ValueError as error:
                 answer = {"error": str(error)}
             if sender:  # an unbound socket has no address to answer to
-                with contextlib.suppress(OSError):  # it has gone or does not read
+                with contextlib.suppress(OSError):  # the client ended or does not read
                     self._socket.sendto(json.dumps(answer).encode(), sender)
 
     @abstractmethod
     def _switch(self, table: dict[str, object]) -> dict[str, object]:
-        """Do what one command says; the answer. Raises ValueError."""
+        """Execute one request and return the answer. Raises ValueError."""
 
     def close(self) -> None:
         """Close and remove the socket."""

@@ -14,7 +14,7 @@ from edge.core.geometry import SE2
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.unitree.camera_process import CameraProcess
 from sim_hil.protocols.unitree.drifting import DriftingOdometry
 from sim_hil.protocols.unitree.remote import Remote
@@ -139,7 +139,7 @@ class UnitreeFrontEnd:
         """Until a request arrives."""
         self._waitset.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
+    def serve(self) -> list[ReceivedCommand]:
         """Answer what is waiting at every service; the camera's are told of by its process."""
         received = self._serve_sport()
         self._leases.serve_leases()
@@ -253,6 +253,8 @@ def _odometry(options: FrontEndOptions) -> OdometryFrame:
     return DriftingOdometry(start, OdometryNoise(LEVELS[options.odometry_noise], options.seed))
 
 
-def _heard(request: Received) -> Heard:
+def _heard(request: Received) -> ReceivedCommand:
     name = api_name(request.service, request.api_id)
-    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id)
+    return ReceivedCommand(
+        request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id
+    )
