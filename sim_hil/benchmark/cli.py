@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import signal
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from edge.artifacts.files import ArtifactError
@@ -23,6 +21,7 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import ConfigError
@@ -202,7 +201,7 @@ def _run(args: argparse.Namespace) -> int:
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
     started_ns = time.monotonic_ns()
-    with _output_directory(args.out) as folder, stop_flag() as stop:
+    with _output_directory(args.out) as folder, stop_signals() as stop:
         backend, store = _backend(args), None
         try:
             store = (ResultStore.resume if args.resume else ResultStore.create)(folder, run.config())
@@ -240,22 +239,6 @@ def _output_directory(out: Path | None) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def stop_flag() -> Iterator[list[int]]:
-    """Yield a list that is empty until SIGINT or SIGTERM arrives; then it contains the signal's number."""
-    received: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _write_outputs(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import os
-import signal
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 import pybullet
@@ -24,6 +20,7 @@ from edge.core.cli import (
     OutputError,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import ConfigError
@@ -66,22 +63,6 @@ with --faults, a datagram with one JSON object switches a fault, such as {"fault
 answer contains the time at which it took effect; the answer to an unknown name lists all faults
 exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed; the result
 is still written), or trace or result could not be written; 2 bad arguments"""
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Yield a list to which the number of every SIGINT and SIGTERM is appended until the block ends."""
-    received: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def parse_size(text: str) -> tuple[int, int] | None:

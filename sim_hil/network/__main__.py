@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,7 @@ from edge.core.cli import (
     EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from sim_hil.network.config import KINDS, NetworkConfig, NetworkError, load_network
@@ -52,20 +53,6 @@ with the right command and ends the left one
 exit codes: 0 done (also after SIGTERM), of `between` the right command's own (128 + N if signal N ended it); 1 the
 relay failed or the result could not be written; 2 bad input, or no right to the addresses, interfaces or namespaces;
 130 interrupted (SIGINT), the result is written all the same"""
-
-
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    received: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _frame: received.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -100,7 +87,7 @@ def main(argv: list[str] | None = None) -> int:
             raise NetworkError(f"--duration: expected seconds above 0, found {args.duration}")
         if args.command == "between":
             return _between(args, cable(config), argv)
-        with _stop_signals() as stop:
+        with stop_signals() as stop:
             relay = Relay(config, control=args.control)
             sys.stderr.write(f"network: ready, {', '.join(link.name for link in config.links)}\n")
             sys.stderr.flush()
@@ -118,7 +105,7 @@ def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | 
         check_rights()
         # Again, in a namespace of its own: the cable's ends must not appear on the machine's network.
         command = [sys.executable, "-m", "sim_hil.network", *(sys.argv[1:] if argv is None else argv)]
-        with _stop_signals() as stop:
+        with stop_signals() as stop:
             inside = subprocess.Popen(["unshare", "--net", "--", *command], env={**os.environ, _INSIDE: "1"})
             while inside.poll() is None:
                 time.sleep(0.05)
@@ -127,7 +114,7 @@ def _between(args: argparse.Namespace, config: NetworkConfig, argv: list[str] | 
         return _code(inside.returncode)
     environment = os.environ.pop(_INSIDE)
     assert environment
-    with _stop_signals() as stop:
+    with stop_signals() as stop:
         sides = Sides(commands)
         with contextlib.ExitStack() as ends:
             ends.callback(sides.end)

@@ -20,10 +20,10 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
-from sim_hil.hil.command import stop_signals
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS

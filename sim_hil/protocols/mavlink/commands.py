@@ -11,7 +11,7 @@ from typing import Final, Protocol
 from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink.modes import find_mode
-from sim_hil.protocols.mavlink.telemetry import STREAMS, Snapshot, Schedule, autopilot_version
+from sim_hil.protocols.mavlink.telemetry import STREAMS, Schedule, Snapshot, autopilot_version
 from sim_hil.protocols.mavlink.vehicle import ACCEPTED, DENIED, Station, Vehicle
 from sim_hil.protocols.mavlink.wire import Message
 
