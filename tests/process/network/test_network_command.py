@@ -117,7 +117,7 @@ class TestExitCodes:
 
         monkeypatch.setattr(Relay, "turn", fail)
         assert main(["run", str(path), "--json", str(result)]) == 1
-        assert capsys.readouterr().err.splitlines()[1:] == ["network: the relay has failed: gone"]
+        assert capsys.readouterr().err.splitlines()[1:] == ["network: the relay failed: gone"]
         assert json.loads(result.read_text())["links"]["l"]["there"]["packets"] == 0
 
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
