@@ -70,14 +70,14 @@ class TestExitCodes:
     @pytest.mark.parametrize(
         ("text", "arguments", "complaint"),
         [
-            ("", ["run", "no-such-file"], "expected a file"),
+            ("", ["run", "no-such-file"], "expected a readable file"),
             ("x = " + "[" * 5000, ["run", "FILE"], "expected TOML"),
             (UDP.replace('"udp"', "[1]"), ["run", "FILE"], "kind: expected"),
             (UDP.replace("127.0.0.1:0", "a..b:0"), ["run", "FILE"], "."),
             (UDP, ["run", "FILE", "--duration", "nan"], "--duration: expected"),
             (UDP, ["run", "FILE", "--control", "x" * 200], "--control .+: expected .+ too long"),
             (UDP, ["run", "FILE", "--json", "/"], "--json .+: expected"),
-            (UDP, ["between", "FILE", *COMMANDS], "exactly one link, of kind frames"),
+            (UDP, ["between", "FILE", *COMMANDS], "exactly one link of kind frames"),
             (FRAMES, ["between", "FILE", "--left", "sh 'x", "--right", "true"], "--left: expected"),
             (FRAMES, ["between", "FILE", "--left", "true", "--right", ""], "--right: expected"),
         ],
