@@ -24,6 +24,7 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
+from edge.state.switches import Decoding, RecoverySwitch
 from firmware_bridge.core.config import ConfigError
 from sim_hil.benchmark.conditions.conditions import (
     BASELINES,
@@ -116,8 +117,16 @@ def parser() -> argparse.ArgumentParser:
         help="control experiment: give every task the instruction of another task in the same scene",
     )
     p.add_argument(
-        "--stay", action="store_true",
-        help="halt at the stop that the model's waypoints give, as edge-run does (default: only the goal ends the run)",
+        "--decoding", choices=[each.value for each in Decoding],
+        help="decoding of an artifact policy: greedy as in the paper (free), or within rules (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
+        "--recovery", choices=[each.value for each in RecoverySwitch],
+        help="recoveries of an artifact policy; off: only the plan moves the robot (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
+        "--stay", action=argparse.BooleanOptionalAction, default=False,
+        help="halt at the stop that the reasoning text gives, as edge-run does (default: only the goal ends the run)",
     )  # fmt: skip
     p.add_argument(
         "--camera", default="auto", metavar="WxH", help="render images of this size even if the policy uses none"
@@ -178,6 +187,8 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         wording=args.wording,
         wordings=args.wordings,
         swap_instructions=args.swap_instructions,
+        decoding=args.decoding,
+        recovery=args.recovery,
         stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,

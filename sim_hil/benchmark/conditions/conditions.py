@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile
 from sim_hil.robots.odometry_noise import LEVELS
 
@@ -79,8 +80,12 @@ class Conditions:
     wordings: str = "benchmark"
     swap_instructions: int | None = None
     """Seed of the permutation that gives every task the instruction of another task in its scene; None: its own."""
+    decoding: str | None = None
+    """Decoding of an artifact policy's texts; None: the manifest's."""
+    recovery: str | None = None
+    """Whether recoveries may replace an artifact policy's commands; None: the manifest's."""
     stays: bool = False
-    """Whether an artifact policy halts at the stop that its waypoints give; otherwise only the goal ends an episode."""
+    """Whether an artifact policy halts at the stop that its texts give; otherwise only the goal ends an episode."""
     camera: str = "auto"
     """Image rendered in every control period: `WxH` px, or `auto` for the policy's own input size (none if unused)."""
     external_timeout_s: float = 60.0
@@ -99,8 +104,13 @@ class Conditions:
             raise ConditionsError(
                 f"mode: expected one for artifacts:DIR and for no other policy, found {self.mode} with {kind}"
             )
-        if self.stays and kind != "artifacts":
-            raise ConditionsError(f"stay: expected only with artifacts:DIR, found with {kind}")
+        for name, requested in (("stay", self.stays), ("decoding", self.decoding), ("recovery", self.recovery)):
+            if requested and kind != "artifacts":
+                raise ConditionsError(f"{name}: expected only with artifacts:DIR, found with {kind}")
+        try:
+            _ = self.switches
+        except ValueError as error:
+            raise ConditionsError(str(error)) from error
         if self.latency is not None and kind in (*BASELINES, "point-goal-net"):
             raise ConditionsError(f"latency: expected only with artifacts:DIR or external:ADDR, found with {kind}")
         if kind == "artifacts" and self.clock == "lockstep" and self.latency is None:
@@ -116,6 +126,17 @@ class Conditions:
                 f"external timeout: expected up to {MAX_EXTERNAL_TIMEOUT_S:g} s, found {self.external_timeout_s}"
             )
         _ = self.camera_size
+
+    @property
+    def switches(self) -> SwitchOptions:
+        """Decoding rules and recoveries that a policy from artifacts is asked for."""
+        return SwitchOptions.parse(self.decoding, self.recovery, self.stays)
+
+    def with_defaults_of(self, decoding: Decoding, recovery: RecoverySwitch) -> Conditions:
+        """Return these conditions with a manifest's defaults where they leave a switch open. Raises ConditionsError."""
+        return replace(
+            self, decoding=self.decoding or decoding.value, recovery=self.recovery or recovery.value
+        )  # fmt: skip
 
     @property
     def camera_size(self) -> tuple[int, int] | None:
@@ -159,6 +180,9 @@ class Conditions:
             parts.append(f"{self.wordings} wordings")
         if self.swap_instructions is not None:
             parts.append(f"instructions swapped by {self.swap_instructions}")
+        parts += [
+            f"{name} {value}" for name, value in (("decoding", self.decoding), ("recovery", self.recovery)) if value
+        ]
         if self.stays:
             parts.append("halts at its own stop")
         return ", ".join([*parts, f"drift {self.drift}"])

@@ -34,7 +34,7 @@ _HEADLINE = {
 }
 
 
-def write_report(store: ResultStore, summary: Mapping[str, Any], title: str) -> Path:
+def write_report(store: ResultStore, summary: Mapping[str, object], title: str) -> Path:
     """Write the page into the run's directory and return its path. Raises OSError."""
     path = store.directory / REPORT
     results = sorted(store.results, key=lambda result: result.id)
@@ -110,7 +110,7 @@ def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
         return None  # results do not depend on it; the map's caption gives the number of paths
 
 
-def _untrained(config: Mapping[str, Any]) -> str:
+def _untrained(config: Mapping[str, object]) -> str:
     if config.get("trained", True):
         return ""
     return (

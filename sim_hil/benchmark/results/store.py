@@ -46,7 +46,7 @@ class ResultStore:
         self._failed = list(failed)
 
     @staticmethod
-    def create(directory: Path, config: Mapping[str, Any]) -> ResultStore:
+    def create(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """Create a run in a new or empty directory. Raises StoreError."""
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise StoreError(
@@ -58,7 +58,7 @@ class ResultStore:
         return ResultStore(directory, config, (), _locked(directory))
 
     @staticmethod
-    def resume(directory: Path, config: Mapping[str, Any]) -> ResultStore:
+    def resume(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """Continue a run with the same configuration. Raises StoreError that names the difference."""
         if not (directory / CONFIG).is_file():
             raise StoreError(f"--resume: {directory} contains no benchmark run ({CONFIG}); start one without --resume")
@@ -175,7 +175,7 @@ def _make(directory: Path) -> None:
         raise StoreError(f"--out {directory}: cannot be created ({error.strerror})") from error
 
 
-def _append(path: Path, content: Mapping[str, Any]) -> None:
+def _append(path: Path, content: Mapping[str, object]) -> None:
     """Append one line in one write and sync it to the disk."""
     data = (json.dumps(content) + "\n").encode()
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -205,7 +205,7 @@ def _cut_torn_line(path: Path) -> None:
             file.truncate(whole)
 
 
-def _difference(found: Mapping[str, Any], requested: Mapping[str, Any], key: str) -> str:
+def _difference(found: Mapping[str, object], requested: Mapping[str, object], key: str) -> str:
     """Describe the two values of a key in one line; of a table only the first entry that differs."""
     was, now = found.get(key), requested.get(key)
     if isinstance(was, dict) and isinstance(now, dict):

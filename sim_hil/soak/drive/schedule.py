@@ -158,7 +158,7 @@ def _range(value: Any) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def check_keys(table: Mapping[str, Any], keys: set[str], what: str) -> None:
+def check_keys(table: Mapping[str, object], keys: set[str], what: str) -> None:
     """Check that a table has no unknown keys. Raises SoakInputError."""
     unknown = sorted(set(table) - keys)
     if unknown:

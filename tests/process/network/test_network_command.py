@@ -18,6 +18,8 @@ from sim_hil.network.impairment import Impairment
 from sim_hil.network.relay import Relay
 from tests.support.processes import REPOSITORY
 
+pytestmark = pytest.mark.process
+
 UDP = '[[links]]\nname = "l"\nkind = "udp"\nleft = "127.0.0.1:0"\nright = "127.0.0.1:9"\n'
 FRAMES = '[[links]]\nname = "l"\nkind = "frames"\nleft = "-"\nright = "-"\n'
 COMMANDS = ["--left", "true", "--right", "true"]
@@ -104,7 +106,7 @@ class TestExitCodes:
         monkeypatch.setenv("PATH", str(programs))
         assert main(["between", str(path), *COMMANDS]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert ("install util-linux" if missing else "(root): unshare: Operation not permitted") in line
+        assert ("install util-linux" if missing else "run as root: unshare: Operation not permitted") in line
 
     def test_a_relay_that_fails_is_1_and_what_it_has_carried_is_written(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -131,6 +133,7 @@ class TestExitCodes:
         assert result.exists()
 
 
+@pytest.mark.slow
 def test_the_command_is_told_changes_over_its_socket_and_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "l.toml").write_text(
         '[[links]]\nname = "l"\nkind = "udp"\nleft = "127.0.0.1:0"\nright = "127.0.0.1:9"\n'

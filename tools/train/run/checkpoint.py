@@ -21,7 +21,7 @@ class CheckpointFileError(ValueError):
     """A checkpoint that is not whole or not ours; one line."""
 
 
-def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, Any]) -> None:
+def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, object]) -> None:
     """Write tensors (any device, kept dtype) and JSON in one rename; raises OSError and leaves the old file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -93,11 +93,11 @@ def restore_generator(generator: torch.Generator, state: torch.Tensor) -> None:
     generator.set_state(state)
 
 
-def rng_meta(rng: np.random.Generator) -> dict[str, Any]:
+def rng_meta(rng: np.random.Generator) -> dict[str, object]:
     """State of a numpy generator as JSON."""
     return dict(rng.bit_generator.state)
 
 
-def restore_rng(rng: np.random.Generator, meta: Mapping[str, Any]) -> None:
+def restore_rng(rng: np.random.Generator, meta: Mapping[str, object]) -> None:
     """Set a numpy generator to a saved state."""
     rng.bit_generator.state = dict(meta)

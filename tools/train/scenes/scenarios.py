@@ -31,8 +31,8 @@ FIRST_SEED: Final = 1_000_000  # of episodes: far above the suite's
 MAX_SEED: Final = 9_999
 KEPT_SEEDS: Final = range(9_001, 9_005)
 """Evaluation's and reinforcement learning's: nothing is collected from these."""
-_GROUPS: Final = 100_000  # layouts of one seed
-_LAYOUT_TRIES: Final = 4
+GROUPS: Final = 100_000  # layouts of one seed
+LAYOUT_TRIES: Final = 4
 _DRAWS: Final = 60  # for one task
 _LEAST_WAY_M: Final = 1.0  # of the straight line, before the goal has been reached
 _LEAST_LEG_M: Final = 2.0
@@ -124,8 +124,8 @@ def training_episodes(
             f"expected a seed of 0..{MAX_SEED}, a count and a start of 0 or more, one task a scene or more,"
             f" found {seed}, {count}, {start} and {tasks_per_scene}"
         )
-    if start + count > _GROUPS * tasks_per_scene:
-        raise ScenarioError(f"one seed has {_GROUPS} layouts: expected fewer scenarios, found {start + count}")
+    if start + count > GROUPS * tasks_per_scene:
+        raise ScenarioError(f"one seed has {GROUPS} layouts: expected fewer scenarios, found {start + count}")
     group, skip = divmod(start, tasks_per_scene)
     left = count
     while left > 0:
@@ -159,15 +159,15 @@ def scenario_group(
 def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, number: int) -> Scenario:
     """A scenario from the group's layout, or from the next one where none can be drawn there."""
     why = ""
-    for attempt in range(_LAYOUT_TRIES):
-        layout_seed = RESERVED_BELOW + (seed * _LAYOUT_TRIES + attempt) * _GROUPS + group
+    for attempt in range(LAYOUT_TRIES):
+        layout_seed = RESERVED_BELOW + (seed * LAYOUT_TRIES + attempt) * GROUPS + group
         try:
             if attempt not in sites:
                 sites[attempt] = Site(kind, layout_seed)
             return _scenario(sites[attempt], seed, number)
         except (LayoutError, RouteError) as error:
             why = str(error)
-    raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {_LAYOUT_TRIES} layouts; the last: {why}")
+    raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {LAYOUT_TRIES} layouts; the last: {why}")
 
 
 def _scenario(site: Site, seed: int, number: int) -> Scenario:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from edge.state.switches import Decoding, RecoverySwitch
 from sim_hil.benchmark.cli import conditions_of, parser
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
@@ -21,6 +22,7 @@ def asked(*arguments: str) -> Conditions:
         ("--policy", "expert", "--drift", "severe"),
         ("--policy", "artifacts:nano", "--mode", "sync", "--latency", "3", "--variant", "no-latency"),
         ("--policy", "artifacts:nano", "--stay"),
+        ("--policy", "artifacts:nano", "--decoding", "free", "--recovery", "off"),
         ("--policy", "external:127.0.0.1:7001", "--latency", "1.5", "--wording", "2"),
         ("--policy", "external:unix:server.sock", "--camera", "320x180"),
     ],
@@ -42,6 +44,19 @@ def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     assert stays.stays and "halts at its own stop" in stays.describe()
 
 
+def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
+    free = asked("--policy", "artifacts:nano", "--decoding", "free")
+    resolved = free.with_defaults_of(Decoding.CONSTRAINED, RecoverySwitch.OFF)
+    assert (resolved.decoding, resolved.recovery) == ("free", "off")
+    assert "decoding free, recovery off" in resolved.describe()
+
+
+def test_conditions_of_a_run_before_the_switches_can_still_be_read() -> None:
+    content = asked("--policy", "artifacts:nano").as_json()
+    old = {key: value for key, value in content.items() if key not in ("decoding", "recovery")}
+    assert Conditions.of_json(old) == asked("--policy", "artifacts:nano")
+
+
 def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
     assert asked("--policy", "artifacts:nano").policy.where.startswith("/")
 
@@ -59,6 +74,9 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         ),
         (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
         (("--policy", "expert", "--stay"), "stay: expected only with artifacts:DIR"),
+        (("--policy", "expert", "--decoding", "free"), "decoding: expected only with artifacts:DIR"),
+        (("--policy", "still", "--recovery", "off"), "recovery: expected only with artifacts:DIR"),
+        (("--policy", "artifacts:nano", "--recovery", "off", "--stay"), "expected --recovery on with it, found off"),
         (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
         (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
         (("--policy", "still", "--camera", "8x8"), "expected auto or WxH"),

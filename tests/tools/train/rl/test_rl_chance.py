@@ -145,6 +145,7 @@ class _Watching:
         """Nothing."""
 
 
+@pytest.mark.slow
 def test_a_pilot_is_told_the_time_to_the_nanosecond() -> None:
     episode = corridor_episode(timeout_s=1.2)
     scenario: Any = SimpleNamespace(
