@@ -17,6 +17,7 @@ from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
 
 ANSWER_S = 2.0
+STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
 STOP: Final = "stop"
 """What the runner is sent for every stop phrase."""
 ROBOT_FILE_SOCKET: Final = "bridge.sock"
@@ -117,7 +118,7 @@ def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
 def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
     """The runner's answer to a stop phrase; None without one that can be used."""
     try:
-        answer = _answer(asking, path, ANSWER_S)
+        answer = _answer(asking, path, STOP_ANSWER_S)
     except (SayError, OSError) as error:
         sys.stderr.write(f"edge-say: {error}\n")
         return None

@@ -88,7 +88,10 @@ def test_a_latch_file_that_says_nothing_readable_is_a_latch(rig: Rig, content: b
 
 
 def test_a_latch_file_that_cannot_be_written_delays_nothing_and_is_told_in_one_line(rig: Rig) -> None:
-    with rig.bridge("bridge", "--latch", rig.folder / "missing folder" / "latch") as bridge, HostStall() as host:
+    folder = rig.folder / "removed later"
+    folder.mkdir()
+    with rig.bridge("bridge", "--latch", folder / "latch") as bridge, HostStall() as host:
+        folder.rmdir()
         with rig.driving():
             since_ns = time.monotonic_ns()
             assert rig.operate("stop")[0] == 0
