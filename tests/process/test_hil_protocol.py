@@ -96,7 +96,7 @@ class TestCameraProcess:
     @pytest.mark.slow
     def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., CameraProcess]) -> None:
         camera = started("", then="exec cat >/dev/null")
-        with pytest.raises(CameraProcessError, match="still running"):
+        with pytest.raises(CameraProcessError, match="still runs"):
             camera.wait_ready([])
         camera.close()
 
@@ -264,7 +264,7 @@ def exit_status(command: list[str]) -> int:
     [
         (["--scene", "moon"], "moon"),
         (["--scene", "nowhere/moon.toml"], "moon.toml"),
-        (["--protocol", "can"], "speaks, unitree"),
+        (["--protocol", "can"], "protocol of this robot, unitree"),
         (["--robot", "carter"], "--robot carter --protocol unitree"),
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
@@ -324,7 +324,7 @@ def test_a_run_that_fails_is_one_line_a_result_an_end_line_and_exit_status_1(
     code = f"""
 import sys
 import pybullet
-from sim_hil import hil
+from sim_hil.hil import command as hil
 from sim_hil.simulation.physics import Simulation
 from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
 from sim_hil.protocols.unitree.services.service import ServiceServer

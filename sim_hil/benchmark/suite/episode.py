@@ -7,11 +7,12 @@ timeout (paper appendix C: "share the same semantic objective but differ in crow
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, hypot, isfinite, radians
 from pathlib import Path
-from typing import Any
+
+from sim_hil.scene.table import Table
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -81,65 +82,7 @@ class Episode:
             raise SuiteError(f"{what}: goal_landmark {self.goal_landmark!r} is not among its landmarks")
 
 
-class _Table:
-    """Strict reader of a TOML table: every key must be known and have the right type."""
-
-    def __init__(self, what: str, table: object) -> None:
-        if not isinstance(table, Mapping):
-            raise SuiteError(f"{what}: expected a table, found {type(table).__name__}")
-        self._what, self._rest = what, dict(table)
-
-    def take(self, key: str) -> Any:
-        if key not in self._rest:
-            raise SuiteError(f"{self._what}: key {key!r} is missing")
-        return self._rest.pop(key)
-
-    def text(self, key: str) -> str:
-        value = self.take(key)
-        if not isinstance(value, str):
-            raise SuiteError(f"{self._what}: {key} must be text, found {value!r}")
-        return value
-
-    def texts(self, key: str) -> tuple[str, ...]:
-        value = self.take(key)
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise SuiteError(f"{self._what}: {key} must be an array of texts, found {value!r}")
-        return tuple(value)
-
-    def whole(self, key: str) -> int:
-        value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise SuiteError(f"{self._what}: {key} must be a whole number, found {value!r}")
-        return value
-
-    def number(self, key: str) -> float:
-        return _number(f"{self._what}: {key}", self.take(key))
-
-    def vector(self, key: str, length: int) -> tuple[float, ...]:
-        value = self.take(key)
-        if not isinstance(value, list) or len(value) != length:
-            raise SuiteError(f"{self._what}: {key} must be {length} numbers, found {value!r}")
-        return tuple(_number(f"{self._what}: {key}", item) for item in value)
-
-    def tables(self, key: str) -> list[object]:
-        value = self.take(key)
-        if not isinstance(value, list) or not value:
-            raise SuiteError(f"{self._what}: {key} must be an array of tables")
-        return value
-
-    def done(self) -> None:
-        if self._rest:
-            raise SuiteError(f"{self._what}: unknown key {sorted(self._rest)[0]!r}")
-
-
-def _number(what: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise SuiteError(f"{what} must be a finite number, found {value!r}")
-    return float(value)
-
-
-def _task(raw: object, index: int) -> list[Episode]:
-    table = _Table(f"tasks[{index}]", raw)
+def _task(table: Table) -> list[Episode]:
     task, scene = table.text("task"), table.text("scene")
     x, y, heading_deg = table.vector("start_deg", 3)
     goal_x, goal_y = table.vector("goal_xy", 2)
@@ -149,8 +92,8 @@ def _task(raw: object, index: int) -> list[Episode]:
     if len(instructions) < MIN_WORDINGS:
         raise SuiteError(f"task {task!r}: expected {MIN_WORDINGS} wordings or more, found {len(instructions)}")
     episodes = []
-    for number, item in enumerate(table.tables("episodes")):
-        row = _Table(f"task {task!r}, episodes[{number}]", item)
+    for row in table.tables("episodes"):
+        row.what = f"task {task!r}, {row.what}"
         episodes.append(
             Episode(
                 id=row.text("id"),
@@ -177,13 +120,15 @@ def _task(raw: object, index: int) -> list[Episode]:
 def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
     """Parse a suite's TOML text into episodes, in the file's order; `source` names it in errors. Raises SuiteError."""
     try:
-        table = _Table("suite", tomllib.loads(text))
+        table = Table("suite", tomllib.loads(text), SuiteError)
         if (found := table.whole("format")) != FORMAT:
             raise SuiteError(f"format {FORMAT} expected, found {found}")
         table.text("name")
         table.whole("version")
-        episodes = [episode for i, raw in enumerate(table.tables("tasks")) for episode in _task(raw, i)]
+        episodes = [episode for task in table.tables("tasks") for episode in _task(task)]
         table.done()
+        if not episodes:
+            raise SuiteError("expected [[tasks]] with [[tasks.episodes]], found none")
     except tomllib.TOMLDecodeError as error:
         raise SuiteError(f"{source}: not valid TOML: {error}") from error
     except SuiteError as error:
