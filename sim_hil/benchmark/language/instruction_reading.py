@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
 from sim_hil.benchmark.language.openings import opening_class
-from sim_hil.benchmark.language.route import Step, Told
+from sim_hil.benchmark.language.route import RouteDescription, Step
 
 _TURN = "(?:turn|go|head|bear)"
 _CORRIDOR = "(?:(?:main|cross|back) aisle|corridor|hallway|hall|passage|aisle|row|sidewalk|pavement)"
@@ -104,7 +104,7 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     )
 
 
-def untrue(text: str, told: Told) -> list[str]:
+def untrue(text: str, told: RouteDescription) -> list[str]:
     """What an instruction says that is not so of a way, one line each; empty when all of it is true and complete."""
     try:
         claims = read(text)
@@ -168,7 +168,7 @@ def _counted_as(kind: str) -> str:
     return "passage" if kind == "sidewalk" else opening_class(kind)
 
 
-def _wrong_pass(claim: Claim, told: Told, steps: list[Step], taken: int) -> list[str]:
+def _wrong_pass(claim: Claim, told: RouteDescription, steps: list[Step], taken: int) -> list[str]:
     """A thing is passed on the stretch that comes next, or one that goes on straight after it."""
     stretches = [told.passed] if taken >= len(steps) else [steps[taken].passed]
     index = told.steps.index(steps[taken]) if taken < len(steps) else len(told.steps)
