@@ -1,4 +1,4 @@
-"""How well an encoder sees: what its heads say of held-out pictures against the truth, and against a fixed answer."""
+"""Scores of an encoder: predictions of its heads on held-out images against the labels and a constant baseline."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Arrays = Mapping[str, NDArray[Any]]
 BEARING_RAD: Final = radians(10.0)
 _NEAR_BINS: Final = (0.0, 2.0, 5.0, 10.0, inf)  # m
 _FREE_BINS: Final = (0.0, 2.0, 5.0, 8.0, inf)
-_LEAST_CELLS: Final = 20  # fewer say nothing of a class
+_LEAST_CELLS: Final = 20  # classes with fewer cells are not reported
 _HALF_WIDTH: Final = float(np.tan(CAMERA_HFOV_RAD / 2))
 
 
 def decide(predicted: Predictions) -> dict[str, NDArray[Any]]:
-    """Labels as the heads would have them, and `share` [n, side, side, classes], how likely each cell is what."""
+    """Convert predictions to labels, and to `share` [n, side, side, classes], the probabilities of each cell."""
     scores = {name: predicted[name].argmax(dim=-1) for name in ("main", "thing", "colour", "facing", "open_kind")}
     scores["place"] = predicted["place"].argmax(dim=-1)
     distances = {name: predicted[name].exp() for name in ("near_m", "thing_m")}
@@ -46,10 +46,10 @@ def decide(predicted: Predictions) -> dict[str, NDArray[Any]]:
 
 
 class Fixed:
-    """The best answer that does not look: what is most common, or in the middle, at each place of the picture."""
+    """Constant baseline: the most frequent or median label at each position of the image."""
 
     def __init__(self, labels: Arrays) -> None:
-        """From all labels to learn from, arrays [N, ...]."""
+        """Compute the baseline from all training labels, arrays [N, ...]."""
         share = np.stack([(labels["thing"] == c).mean(axis=0) for c in range(len(CLASSES))], axis=-1)
         there = labels["rank"] > BACKGROUND
         opens = labels["open_kind"] > 0
@@ -68,12 +68,12 @@ class Fixed:
         }
 
     def of(self, count: int) -> dict[str, NDArray[Any]]:
-        """The answer to `count` pictures."""
+        """Return the baseline's labels for `count` images."""
         return {name: np.broadcast_to(one, (count, *np.shape(one))) for name, one in self._one.items()}
 
 
 class Score:
-    """Gathers answers and truth batch by batch."""
+    """Accumulates predictions and labels batch by batch."""
 
     def __init__(self) -> None:
         self._confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
@@ -82,7 +82,7 @@ class Score:
         self._pictures = 0
 
     def add(self, said: Arrays, labels: Arrays) -> None:
-        """Answers and truth of some pictures, arrays [n, ...]."""
+        """Add predictions and labels of some images, arrays [n, ...]."""
         self._pictures += len(labels["thing"])
         thing, rank = labels["thing"], labels["rank"]
         np.add.at(self._confusion, (thing.ravel(), said["thing"].ravel()), 1)
@@ -105,7 +105,7 @@ class Score:
         self._pair("open", said["open_m"][opens], labels["open_m"][opens])
 
     def result(self) -> dict[str, Any]:
-        """Shares from 0 to 1 and distances in m; None where there was nothing to be right about."""
+        """Return shares from 0 to 1 and distances in m; None for scores without cases."""
         found: dict[str, Any] = {name: _mean(counts) for name, counts in sorted(self._shares.items())}
         found["landmarks"] = self._shares.get("landmark_bearing", [0, 0])[1]
         found["pictures"] = self._pictures
@@ -146,7 +146,7 @@ class Score:
 
 
 def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> NDArray[np.bool_]:
-    """For every kind of landmark in every picture: whether the likeliest cell lies within 10 degrees of a true one."""
+    """Return for every kind of landmark in every image whether its most probable cell is within 10° of a true one."""
     side = thing.shape[1]
     angles = np.array([bearing_rad(_HALF_WIDTH, column, side) for column in range(side)])
     hits: list[bool] = []
@@ -160,7 +160,7 @@ def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> N
 
 
 def _most_common(values: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """[...]: of [N, ...] the most common number below `count` at each place."""
+    """Return the most frequent number below `count` at each position [...] of [N, ...]."""
     winners: NDArray[np.int64] = np.stack([(values == c).sum(axis=0) for c in range(count)], axis=-1).argmax(axis=-1)
     return winners
 
