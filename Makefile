@@ -8,15 +8,25 @@ SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
 
-.PHONY: help demo demos nano faults test test-all lint clean
+# Tests: two at a time with one thread each where they are isolated, one at a time where they start real-time processes.
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest
+PARALLEL := OMP_NUM_THREADS=1 $(PYTEST) -n $(WORKERS) --dist loadfile
+PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
+# Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: help demo demos nano faults test test-slow test-random test-all lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
-	@echo "make test   lint, type-check and run the tests"
-	@echo "make test-all  the same and the tests marked slow"
+	@echo "make test   lint, type-check and run the fast tests (5 min on 2 cores)"
+	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
+	@echo "make test-slow    the tests that 'make test' leaves out"
+	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
 
@@ -61,10 +71,27 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/pytest
+	@echo "== fast tests, $(WORKERS) at a time"
+	$(PARALLEL) -m "not slow and not process"
+	@echo "== fast tests of processes, one at a time"
+	$(PYTEST) -m "process and not slow" $(PROCESS_FILES)
+
+test-slow: .venv/.test-installed
+	@echo "== slow tests, $(WORKERS) at a time"
+	$(PARALLEL) --durations=15 -m "slow and not process"
+	@echo "== slow tests of processes, one at a time"
+	$(PYTEST) --durations=15 -m "slow and process" $(PROCESS_FILES)
+
+test-random: .venv/.test-installed
+	@seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
+	echo "== property tests with the random seed $$seed; repeat them with: make test-random SEED=$$seed"; \
+	$(PARALLEL) -m "hypothesis and not process" --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
-	$(BIN)/pytest -m ""
+	@echo "== all tests but those of processes, $(WORKERS) at a time"
+	$(PARALLEL) --durations=15 -m "not process"
+	@echo "== all tests of processes, one at a time"
+	$(PYTEST) --durations=15 -m process $(PROCESS_FILES)
 
 clean:
 	rm -rf out

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
@@ -64,7 +65,7 @@ class TraceTail:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = 0
-        self._last_xy: np.ndarray | None = None
+        self._last_xy: NDArray[np.float64] | None = None
         self._last_ns = 0
         self.moves = 0
         self.walked_m = 0.0

@@ -7,32 +7,42 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from export.core.cache import StageCache, open_cache
+from tests.support.processes import claimed_dds_domain, locked
 
-# How long an example takes says nothing about it on a shared machine.
-settings.register_profile("tests", deadline=None)
+# `tests` gives the same examples in every run and does not shrink a failing one: shrinking may take five minutes.
+# `random` is what `make test-random` asks for; it prints its seed. How long an example takes is no evidence on a shared
+# machine.
+settings.register_profile(
+    "tests", derandomize=True, deadline=None, print_blob=True, phases=(Phase.explicit, Phase.generate)
+)
+settings.register_profile("random", deadline=None, print_blob=True, database=None)
 settings.load_profile("tests")
 
 
 @pytest.fixture(scope="session")
-def dds_domain() -> int:
-    """A DDS domain of this test run's own, so that two runs on one machine never meet (ports stay below 32768)."""
-    return 1 + os.getpid() % 90
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of this test run that all its workers share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@pytest.fixture(scope="session")
+def dds_domain() -> Iterator[int]:
+    """DDS domain of this worker of this test run alone."""
+    with claimed_dds_domain() as domain:
+        yield domain
 
 
 @pytest.fixture(scope="session", autouse=True)
-def export_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache of finished export stages of this test run's own, also for the processes it starts."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield Path(os.environ["XDG_CACHE_HOME"]) / "tic-vla-edge"
-    if before is None:
-        del os.environ["XDG_CACHE_HOME"]
-    else:
-        os.environ["XDG_CACHE_HOME"] = before
+def export_cache(run_folder: Path) -> Iterator[Path]:
+    """Cache of finished export stages for this test run alone, shared by its workers and the processes they start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(run_folder / "cache"))
+        yield run_folder / "cache" / "tic-vla-edge"
 
 
 @pytest.fixture
@@ -43,12 +53,14 @@ def cache(export_cache: Path) -> Iterator[StageCache]:
 
 
 @pytest.fixture(scope="session")
-def artifacts_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The `nano` artifacts, exported once for the whole session by the real command."""
+def artifacts_dir(run_folder: Path) -> Path:
+    """The `nano` artifacts, exported by the real command: once in a run, by the worker that needs them first."""
     from export.cli import main
 
-    out = tmp_path_factory.mktemp("artifacts") / "nano"
-    assert main(["--target", "cpu", "--model", "nano", "--random-weights", "0", "--out", str(out)]) == 0
+    out = run_folder / "artifacts" / "nano"
+    with locked(run_folder / "artifacts.lock", wait=True):
+        if not out.exists():
+            assert main(["--target", "cpu", "--model", "nano", "--random-weights", "0", "--out", str(out)]) == 0
     return out
 
 

@@ -29,7 +29,7 @@ _REFUSED_CONTENT = (
     (re.compile(rb"PK\x03\x04"), "a zip archive (.pt, .npz)"),
     (re.compile(rb"\x93NUMPY"), "a NumPy array"),
 )
-_SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "plan", "provenance", SEAL)
+SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "plan", "provenance", SEAL)
 
 
 class ArtifactError(ValueError):
@@ -103,7 +103,7 @@ def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
         raise ArtifactError(
             f"{path}: schema version {manifest.get('schema_version')!r}, expected {SCHEMA_VERSION}; export again"
         )
-    missing = [section for section in _SECTIONS if section not in manifest]
+    missing = [section for section in SECTIONS if section not in manifest]
     if missing:
         raise ArtifactError(f"{path}: sections {missing} are missing")
     if seal(manifest)[SEAL] != manifest[SEAL]:

@@ -110,12 +110,12 @@ class LogPart:
 
     def flush(self) -> None:
         """Close the chunk and have the device keep it: whatever dies, it can be read."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.flush()
         self.file.sync()
 
     def finish(self) -> None:
         """Write the summary (indexes, statistics) that makes the file seekable."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
         self.file.sync()
 
 

@@ -108,16 +108,20 @@ class _Source(Generic[T]):
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    def read(self) -> None:
+        """Read once in the calling thread; a failure leaves the newest value as it was."""
+        began_ns = self._clock()
+        try:
+            self._newest = (began_ns, self._read(began_ns))
+            self.error = None
+        except MeterError as error:
+            self.error = str(error)
+        except Exception as error:  # noqa: BLE001 - a driver's surprise may cost its value, not the thread
+            self.error = f"{type(error).__name__}: {error}"
+
     def _run(self) -> None:
         while not self._stop.is_set():
-            began_ns = self._clock()
-            try:
-                self._newest = (began_ns, self._read(began_ns))
-                self.error = None
-            except MeterError as error:
-                self.error = str(error)
-            except Exception as error:  # noqa: BLE001 - a driver's surprise may cost its value, not the thread
-                self.error = f"{type(error).__name__}: {error}"
+            self.read()
             self._stop.wait(self._period_s)
 
 
@@ -201,6 +205,11 @@ class PowerMonitor:
         if self._snapshot.over_current:
             result["over_current_events"] = dict(self._snapshot.over_current)
         return result
+
+    def read(self) -> None:
+        """Read every source once in the calling thread: for a caller of `step` that does not `start` the threads."""
+        for source in self._sources():
+            source.read()
 
     def step(self, now_ns: int) -> PowerSnapshot:
         """One step of the stepping thread, without its clock."""

@@ -97,6 +97,11 @@ class PathMemory:
         """Stamp of the newest pose that was seen, kept or not; None before the first."""
         return self._newest_ns
 
+    @property
+    def points(self) -> tuple[Point, ...]:
+        """Points kept, (x m, y m) in the odometry frame, oldest first; fewer than CAPACITY."""
+        return tuple(self._points)
+
     def put(self, stamp_ns: int, T_odom_base: SE2) -> None:
         """See a pose; one that is not newer than the newest changes nothing."""
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:

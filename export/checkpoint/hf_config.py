@@ -123,14 +123,14 @@ def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
     return said
 
 
-def _chat(where: str, top: Mapping[str, Any], directory: Path, ours: LanguageConfig) -> HfConfig:
+def _chat(where: str, top: Mapping[str, object], directory: Path, ours: LanguageConfig) -> HfConfig:
     vision, text = _section(where, top, "vision_config"), _section(where, top, "llm_config")
     _demand(where, "", top, _CHAT)
     _demand(where, "vision_config.", vision, _CHAT_VISION)
     return _assemble(where, top, directory, ours, (vision, {}), text)
 
 
-def _hugging_face(where: str, top: Mapping[str, Any], directory: Path, ours: LanguageConfig) -> HfConfig:
+def _hugging_face(where: str, top: Mapping[str, object], directory: Path, ours: LanguageConfig) -> HfConfig:
     vision, text = _section(where, top, "vision_config"), _section(where, top, "text_config")
     _demand(where, "", top, _HF)
     _demand(where, "vision_config.", vision, _HF_VISION)
@@ -172,9 +172,9 @@ def _assemble(
 
 def _vision(
     where: str,
-    top: Mapping[str, Any],
+    top: Mapping[str, object],
     directory: Path,
-    tower: tuple[Mapping[str, Any], Mapping[str, Any]],
+    tower: tuple[Mapping[str, object], Mapping[str, object]],
     token_dim: int,
 ) -> VisionConfig:
     vision, defaults = tower
@@ -233,14 +233,14 @@ def _rope_theta(where: str, text: Mapping[str, Any], max_context: int) -> float:
     return _number(where, "text_config.", source, "rope_theta", float, 10000.0)
 
 
-def _section(where: str, top: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _section(where: str, top: Mapping[str, object], key: str) -> Mapping[str, Any]:
     section = top.get(key)
     if not isinstance(section, dict):
         raise CheckpointError(f"{where}: has no {key}")
     return section
 
 
-def _demand(where: str, prefix: str, section: Mapping[str, Any], demands: tuple[Demand, ...]) -> None:
+def _demand(where: str, prefix: str, section: Mapping[str, object], demands: tuple[Demand, ...]) -> None:
     for key, accepted, default in demands:
         value = section.get(key, default)
         if value not in accepted:
@@ -249,7 +249,7 @@ def _demand(where: str, prefix: str, section: Mapping[str, Any], demands: tuple[
 
 
 def _number(
-    where: str, prefix: str, section: Mapping[str, Any], key: str, kind: type[N], default: object = _NO_DEFAULT
+    where: str, prefix: str, section: Mapping[str, object], key: str, kind: type[N], default: object = _NO_DEFAULT
 ) -> N:
     value = section.get(key, default)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):

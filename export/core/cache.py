@@ -108,7 +108,7 @@ def package_versions() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def stage_key(stage: str, parts: Mapping[str, Any], modules: Sequence[str]) -> str:
+def stage_key(stage: str, parts: Mapping[str, object], modules: Sequence[str]) -> str:
     """SHA-256 of everything that a stage's result follows from: `parts` (plain JSON) and the code of `modules`."""
     source = source_sha256(tuple(sorted(modules)))
     content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source}
@@ -208,7 +208,7 @@ class StageCache:
                 shutil.rmtree(partial, ignore_errors=True)
         return entry, False
 
-    def result(self, key: str, compute: Callable[[], Mapping[str, Any]]) -> tuple[dict[str, Any], bool]:
+    def result(self, key: str, compute: Callable[[], Mapping[str, object]]) -> tuple[dict[str, Any], bool]:
         """A stage whose result is plain JSON, and whether it was there already."""
 
         def build(directory: Path) -> None:

@@ -40,7 +40,7 @@ def build(cls: type[T], content: object, where: str) -> T:
     for key in content:
         if key not in known:
             raise FieldError(f"{where}: unknown key {key!r}; {near(str(key), known)}")
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]  # T is any class; `field_types` has refused others
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in content:
             raise FieldError(f"{where}: key {field.name!r} is missing")
@@ -53,7 +53,7 @@ def build(cls: type[T], content: object, where: str) -> T:
         raise FieldError(f"{where}: {error}") from error
 
 
-def convert(kind: Any, value: object, where: str) -> Any:
+def convert(kind: object, value: object, where: str) -> Any:
     """`value` as the type `kind`; raises FieldError."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -67,8 +67,8 @@ def convert(kind: Any, value: object, where: str) -> Any:
         if matching:
             return value
         raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
-    if dataclasses.is_dataclass(kind):
-        return value if isinstance(value, kind) else build(kind, value, where)  # type: ignore[arg-type]
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        return value if isinstance(value, kind) else build(kind, value, where)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise FieldError(f"{where}: expected a list, found {value!r}")
@@ -86,7 +86,7 @@ def convert(kind: Any, value: object, where: str) -> Any:
     return value
 
 
-def from_text(kind: Any, text: str, where: str) -> Any:
+def from_text(kind: object, text: str, where: str) -> Any:
     """A command line's text as the type `kind`; raises FieldError."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -116,7 +116,7 @@ def from_text(kind: Any, text: str, where: str) -> Any:
     raise FieldError(f"{where}: is a table; name one of its keys")
 
 
-def kind_name(kind: Any) -> str:
+def kind_name(kind: object) -> str:
     """A type in words."""
     names = {str: "a text", int: "a whole number", float: "a finite number", bool: "true or false"}
     if kind in names:

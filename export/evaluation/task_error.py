@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to
-from edge.motion.guidance import waypoints_now
 from edge.reasoning.prompt import Segment
+from edge.state.semantic import waypoints_now
 from export.evaluation.task_samples import Sample, SampleSet
 
 Floats = npt.NDArray[np.float32]
@@ -335,6 +335,6 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _plain(errors: Errors) -> dict[str, Any]:
+def _plain(errors: Errors) -> dict[str, object]:
     stats = {name: vars(value) for name, value in vars(errors).items() if isinstance(value, Stat)}
     return {"moments": errors.moments, **{name: dict(stat) for name, stat in stats.items()}}

@@ -43,7 +43,7 @@ def config_from_file(path: Path) -> TicVlaConfig:
         raise ModelConfigError(f"{path}: {error}") from error
 
 
-def config_from_dict(content: Any) -> TicVlaConfig:
+def config_from_dict(content: object) -> TicVlaConfig:
     """The inverse of `TicVlaConfig.to_dict`; raises ModelConfigError on unknown keys and values of another type."""
     if not isinstance(content, dict):
         raise ModelConfigError(f"expected an object with name, {', '.join(_sections())}; found {_kind(content)}")
@@ -88,11 +88,11 @@ def _hints(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _kind(value: Any) -> str:
+def _kind(value: object) -> str:
     return "nothing" if value is None else type(value).__name__
 
 
-def _check_keys(prefix: str, values: Mapping[str, Any], expected: list[str]) -> None:
+def _check_keys(prefix: str, values: Mapping[str, object], expected: list[str]) -> None:
     unknown = sorted(set(values) - set(expected))
     if unknown:
         raise ModelConfigError(f"{prefix}{unknown[0]} is not known; expected one of: {', '.join(expected)}")

@@ -43,7 +43,7 @@ class _SkipRandomInit(TorchFunctionMode):
         func: Callable[..., Any],
         types: Collection[type],
         args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
+        kwargs: Mapping[str, object] | None = None,
     ) -> Any:
         if func in self.SKIPPED:
             return args[0] if args else (kwargs or {})["tensor"]

@@ -31,7 +31,7 @@ OLDER_SCHEMAS = (1, 2)
 """Schemas whose directories an export replaces."""
 
 
-def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, Any]:
+def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, object]:
     """The manifest's `runtime` section; a plan that fits says how many tokens a generation may have."""
     language, policy = config.language, target.runtime
     planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
@@ -53,6 +53,8 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "control_cores": list(policy.control_cores),
         "reasoning_cores": list(policy.reasoning_cores),
         "control_priority": policy.control_priority,
+        "decoding": policy.decoding,
+        "recovery": policy.recovery,
     }
 
 
@@ -206,7 +208,7 @@ def _graph_entry(pipeline: Pipeline, name: str, files: list[Path]) -> dict[str, 
     }
 
 
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
     # Not sorted: of a precision's exceptions the first that matches wins.
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -246,7 +248,7 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Pro
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
 
 
-def asked_dict(asked: Asked) -> dict[str, Any]:
+def asked_dict(asked: Asked) -> dict[str, object]:
     """Plain JSON form."""
     return {**vars(asked), "settings": list(asked.settings)}
 

@@ -149,7 +149,9 @@ class Pipeline:
                     watch.from_cache()
         return self._entries[key]
 
-    def _key(self, stage: str, parts: Mapping[str, Any], modules: tuple[str, ...], recipe: Callable[..., Any]) -> str:
+    def _key(
+        self, stage: str, parts: Mapping[str, object], modules: tuple[str, ...], recipe: Callable[..., Any]
+    ) -> str:
         """Key of a stage, also of the method here that makes it (the whole module would undo all on every edit) and of
         the threads that sum for it."""
         parts = {**parts, "recipe": inspect.getsource(recipe), "threads": self._threads}

@@ -6,7 +6,6 @@ import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from export.checkpoint.coverage import CheckpointError, Coverage
 from export.checkpoint.load import LoadedCheckpoint, load_checkpoint
@@ -41,7 +40,7 @@ class WeightSource:
         self._seed = DEFAULT_SEED if seed is None and not checkpoints else seed
         self._loaded: LoadedCheckpoint | None = None
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> dict[str, object]:
         """What identifies the weights without loading them: the files' hashes and the seed; raises CheckpointError."""
         files: dict[str, str] = {}
         for path in self._checkpoints:

@@ -324,7 +324,7 @@ def _error(share: float | None) -> str:
     return f" ± {100 * share:.0f} %" if share else ""
 
 
-def _calibration(calibration: Mapping[str, Any]) -> str:
+def _calibration(calibration: Mapping[str, object]) -> str:
     assumed = f"; assumed: {calibration['assumed']}" if calibration["assumed"] else ""
     return (
         f"<p>Set <b>{text_html(str(calibration['name']))}</b>: {calibration['clips']} clips, "

@@ -95,7 +95,7 @@ def _notes(asked: Asked) -> list[str]:
     return [f"note: thresholds were set when it was built: {', '.join(moved)}"] if moved else []
 
 
-def first_difference(found: Any, expected: Any, key: str) -> str | None:
+def first_difference(found: object, expected: object, key: str) -> str | None:
     """The first key at which two JSON values differ, with both, in words; None when they are the same."""
     if isinstance(found, dict) and isinstance(expected, dict):
         for name in [*expected, *(name for name in found if name not in expected)]:
@@ -113,6 +113,6 @@ def first_difference(found: Any, expected: Any, key: str) -> str | None:
     return None if same else f"{key} is {_shown(found)}, this export writes {_shown(expected)}"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}…"

@@ -141,7 +141,7 @@ class Target:
             raise TargetError(f"gates.{graph} is missing: expected the thresholds of that graph")
         return found
 
-    def session(self, graph: str, inputs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def session(self, graph: str, inputs: Sequence[Mapping[str, object]]) -> dict[str, Any]:
         """The manifest's `session` of a graph with these inputs (name, shape); raises TargetError for a free axis
         that an engine is built for without a profile."""
         policy, provider = self.graphs[graph], self.provider(graph)
@@ -194,7 +194,7 @@ def load_target(name: str, model: str | None = None) -> Target:
     return target if model is None else for_model(target, model)
 
 
-def parse_target(content: Mapping[str, Any], where: str) -> Target:
+def parse_target(content: Mapping[str, object], where: str) -> Target:
     """Validate a target's tables; unknown keys, missing keys and wrong types are errors."""
     tables = dict(content)
     if tables.pop("schema", None) != SCHEMA:
@@ -235,7 +235,7 @@ def for_model(target: Target, model: str, where: str | None = None) -> Target:
     return parse_target(_merged(base, changes), where)
 
 
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: Mapping[str, object], changes: Mapping[str, object]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
@@ -268,7 +268,7 @@ def with_settings(target: Target, settings: Iterable[str]) -> Target:
     return parse_target(content, f"{target.name} with --set")
 
 
-def _value(kind: Any, text: str, path: str) -> Any:
+def _value(kind: object, text: str, path: str) -> Any:
     options = [option for option in typing.get_args(kind) if option is not type(None)]
     if kind is Figure or options == [Figure]:
         return {"value": from_text(float, text, path), "source": "set on the command line"}
@@ -285,7 +285,7 @@ def _places(content: Mapping[str, Any], path: str) -> list[tuple[list[str], Any]
     return [_place(content, parts, path)]
 
 
-def _place(content: Mapping[str, Any], parts: list[str], path: str) -> tuple[list[str], Any]:
+def _place(content: Mapping[str, object], parts: list[str], path: str) -> tuple[list[str], Any]:
     kind: Any = Target
     keys: list[str] = []
     table: Any = content
@@ -312,7 +312,7 @@ def _place(content: Mapping[str, Any], parts: list[str], path: str) -> tuple[lis
     return keys, kind
 
 
-def _entry(table: Mapping[str, Any], parts: list[str], path: str) -> tuple[str, list[str]]:
+def _entry(table: Mapping[str, object], parts: list[str], path: str) -> tuple[str, list[str]]:
     """The longest start of `parts` that is a key of the table (names of graphs hold dots), and what follows it."""
     for end in range(len(parts), 0, -1):
         if ".".join(parts[:end]) in table:
@@ -320,10 +320,10 @@ def _entry(table: Mapping[str, Any], parts: list[str], path: str) -> tuple[str, 
     raise FieldError(f"{path}: unknown key {parts[0]!r}; {near(parts[0], table)}")
 
 
-def _optional(kind: Any) -> bool:
+def _optional(kind: object) -> bool:
     return type(None) in typing.get_args(kind)
 
 
-def _is_mapping(kind: Any) -> bool:
+def _is_mapping(kind: object) -> bool:
     origin = typing.get_origin(kind)
     return isinstance(origin, type) and issubclass(origin, Mapping)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import atan2, hypot
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_hil.crowd.courtesy import Courtesy
 from sim_hil.crowd.groups import Groups
@@ -340,7 +341,7 @@ class Plans:
         self._courtesy.like(crowd, like_x, like_y)
         crowd.like_x, crowd.like_y = like_x, like_y
 
-    def _on_the_way(self, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _on_the_way(self, who: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         crowd, ways = self._crowd, self._ways
         x, y = crowd.x[who], crowd.y[who]
         tx, ty = ways.ahead(crowd.spot[who], x, y)
@@ -361,7 +362,7 @@ class Plans:
         pace = np.where(near & ends, np.minimum(pace, 0.35 + 0.6 * left), pace)
         return dx / norm * pace, dy / norm * pace
 
-    def _stay_put(self, who: np.ndarray, robot: RobotSeen) -> tuple[np.ndarray, np.ndarray]:
+    def _stay_put(self, who: NDArray[np.int64], robot: RobotSeen) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Back to one's spot when pushed off it; a slow step aside for the robot that comes up to one."""
         crowd = self._crowd
         dx, dy = crowd.target_x[who] - crowd.x[who], crowd.target_y[who] - crowd.y[who]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import hypot, pi
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_hil.crowd.state import Crowd, Doing
 from sim_hil.crowd.walkable_map import CrowdMap
@@ -24,7 +25,7 @@ class Start:
         free = (gaps >= min(0.4, float(gaps.max()))) & self._far(x, y)
         self._x, self._y = x[free], y[free]
 
-    def _far(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _far(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.asarray(np.hypot(x - self._scene.start[0], y - self._scene.start[1]) > self._clear_m)
 
     def fits(self, person: int, x: float, y: float, apart_m: float = _APART_M) -> bool:

@@ -131,7 +131,7 @@ def _partitions(where: str, value: object) -> tuple[tuple[float, float], ...]:
     return tuple((float(begin), float(end)) for begin, end in pairs)
 
 
-def _known(where: str, table: Mapping[str, Any], keys: tuple[str, ...]) -> None:
+def _known(where: str, table: Mapping[str, object], keys: tuple[str, ...]) -> None:
     for key in table:
         if key not in keys:
             raise NetworkError(f"{where}: expected {', '.join(keys)}, found {key!r}")

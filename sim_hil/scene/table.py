@@ -22,7 +22,7 @@ class Table:
     def __contains__(self, key: str) -> bool:
         return key in self._rest
 
-    def take(self, key: str, default: Any = None) -> Any:
+    def take(self, key: str, default: object = None) -> Any:
         """The raw value; raises SceneError when the key is missing and there is no default."""
         if key not in self._rest and default is None:
             raise SceneError(f"{self.what}: key {key!r} is missing")

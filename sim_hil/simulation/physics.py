@@ -88,7 +88,8 @@ class Simulation:
         self._touched: dict[str, int] = {}  # label -> the latest step in which it was touched
         self._contacts: dict[str, int] = {}  # the same without those who were only near
         self._fell = False
-        self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+        self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+        """pybullet's number of this world, its `physicsClientId`."""
         try:
             # The engine reads its files while building: afterwards even a killed run leaves none behind.
             with TemporaryDirectory(prefix="edge-sim-") as folder:
@@ -98,7 +99,7 @@ class Simulation:
             raise
 
     def _build(self, scene: Scene, folder: Path, robot: str) -> None:
-        client = self._client
+        client = self.client
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.dt_s, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=client
         )
@@ -137,19 +138,17 @@ class Simulation:
         # Imported by name: a wheeled base's code is not needed to walk, nor the other way round.
         build = cast("Callable[..., Robot]", getattr(importlib.import_module(module), name))
         start = self.scene.start
-        loaded = build(self._client, folder, start, self.dt_s)
+        loaded = build(self.client, folder, start, self.dt_s)
         ground = self.scene.ground_height_m(start[0], start[1])
         if ground > 0:
-            (x, y, z), turn = pybullet.getBasePositionAndOrientation(loaded.body, physicsClientId=self._client)
-            pybullet.resetBasePositionAndOrientation(
-                loaded.body, (x, y, z + ground), turn, physicsClientId=self._client
-            )
+            (x, y, z), turn = pybullet.getBasePositionAndOrientation(loaded.body, physicsClientId=self.client)
+            pybullet.resetBasePositionAndOrientation(loaded.body, (x, y, z + ground), turn, physicsClientId=self.client)
             loaded.observe()
         return loaded
 
     def _static(self, box: Box, friction: float) -> int:
         half = [extent / 2 for extent in box.size_m]
-        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
         turn = pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0])))
         return self._immovable(shape, box.centre_m, turn, friction)
 
@@ -166,7 +165,7 @@ class Simulation:
                 collisionFrameOrientations=[
                     pybullet.getQuaternionFromEuler((0, 0, atan2(box.axis[1], box.axis[0]))) for _, box in group
                 ],
-                physicsClientId=self._client,
+                physicsClientId=self.client,
             )
             solids[self._immovable(shape, (0, 0, 0), (0, 0, 0, 1), _SIDES)] = group
         return solids
@@ -175,14 +174,14 @@ class Simulation:
         corners = np.array(piece.vertices_m)
         middle = corners.mean(axis=0)
         shape = pybullet.createCollisionShape(
-            pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self._client
+            pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self.client
         )
         return self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
 
     def _immovable(
         self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float
     ) -> int:  # fmt: skip
-        client = self._client
+        client = self.client
         # As a plain rigid body: a multi-body that cannot move would be solved for in every step all the same.
         body = int(
             pybullet.createMultiBody(
@@ -198,7 +197,7 @@ class Simulation:
             return -1
         return int(
             pybullet.createVisualShape(
-                pybullet.GEOM_SPHERE, radius=0.001, rgbaColor=(0, 0, 0, 0), physicsClientId=self._client
+                pybullet.GEOM_SPHERE, radius=0.001, rgbaColor=(0, 0, 0, 0), physicsClientId=self.client
             )
         )
 
@@ -221,7 +220,7 @@ class Simulation:
                 continue
             place = self._parking(slot) if person < 0 else self._middle_of(person)
             self._embodied[slot] = person
-            pybullet.resetBasePositionAndOrientation(body, place, (0, 0, 0, 1), physicsClientId=self._client)
+            pybullet.resetBasePositionAndOrientation(body, place, (0, 0, 0, 1), physicsClientId=self.client)
 
     def _middle_of(self, person: int) -> tuple[float, float, float]:
         x, y = float(self._people[person, 0]), float(self._people[person, 1])
@@ -259,14 +258,14 @@ class Simulation:
 
     def _physics(self) -> None:
         self._robot.drive()
-        pybullet.stepSimulation(physicsClientId=self._client)
+        pybullet.stepSimulation(physicsClientId=self.client)
         self._robot.observe()
         self._steps += 1
         if self._steps % self._contact_every == 0:
             self._watch()
 
     def _explained(self, error: Exception) -> Exception:
-        if pybullet.isConnected(self._client):
+        if pybullet.isConnected(self.client):
             return error
         return SimulationClosedError(
             "simulation: its physics ended (the window was closed, or close() was called): expected it to run until"
@@ -275,7 +274,7 @@ class Simulation:
 
     def _watch(self) -> None:
         labels = set()
-        for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self._client):
+        for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self.client):
             # The engine also lists what is about to touch, up to 2 cm away.
             if contact[9] > 0.0 or contact[8] < 0.0:
                 if contact[2] in self._is_person:
@@ -378,10 +377,10 @@ class Simulation:
 
     def close(self) -> None:
         """Release the physics client; may be called twice, and after its window was closed."""
-        if self._client >= 0:
+        if self.client >= 0:
             with suppress(pybullet.error):
-                pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+                pybullet.disconnect(physicsClientId=self.client)
+            self.client = -1
 
 
 def _nearest_label(boxes: list[tuple[str, Box]], point: tuple[float, float, float]) -> str:

@@ -185,7 +185,7 @@ def _write(
     args: argparse.Namespace,
     soak: SoakFolder,
     options: SoakOptions,
-    result: Mapping[str, Any],
+    result: Mapping[str, object],
     budget: Sequence[BudgetLine],
 ) -> None:
     write_result(str(soak.path / "result.json"), result)
@@ -212,7 +212,7 @@ def summary_lines(result: Mapping[str, Any]) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _why(line: Mapping[str, Any]) -> str:
+def _why(line: Mapping[str, object]) -> str:
     return f"  ({line['why']})" if "why" in line else ""
 
 

@@ -121,6 +121,7 @@ def test_generations_are_taken_as_a_flight_log_would_have_them() -> None:
     assert found.times_s == [pytest.approx((3.0, 0.5))]
 
 
+@pytest.mark.slow
 def test_a_model_thinks_beside_ticks_and_the_first_generations_are_left_out(artifacts_dir: Path) -> None:
     said: list[str] = []
     measured = measure(
@@ -139,6 +140,7 @@ def test_a_model_thinks_beside_ticks_and_the_first_generations_are_left_out(arti
     assert measured.ticks >= len(measured.times_s) + WARM
 
 
+@pytest.mark.slow
 def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts_dir: Path) -> None:
     measured = measure(
         load_artifacts(artifacts_dir),

@@ -222,6 +222,7 @@ def with_energies(artifacts_dir: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_dry_run_fits_the_model_it_is_fed_with_and_is_never_called_measured(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -37,6 +37,7 @@ def can_make_a_network() -> bool:
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
+pytestmark = pytest.mark.process
 needs_network_namespace = pytest.mark.skipif(not can_make_a_network(), reason="no network namespaces for this user")
 
 

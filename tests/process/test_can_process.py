@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.process
+
 
 def _drive(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sim_hil.protocols.can.drive", *arguments]
@@ -62,6 +64,7 @@ def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> N
     assert not line.is_symlink()
 
 
+@pytest.mark.slow
 def test_no_base_on_the_line_is_a_failed_check_in_one_line(tmp_path: Path) -> None:
     from sim_hil.protocols.can.pty_line import PtyLine
 

@@ -7,20 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 import pytest
 
 from edge.core.cli import EXIT_BAD_INPUT, check_result_target, run_with_extra, write_result
+from tests.support.processes import REPOSITORY
 
-COMMANDS = [
-    "calib.cli",
-    "edge.deploy.doctor.command",
-    "edge.deploy.install",
-    "edge.flightlog.replay.command",
-    "edge.runner",
-    "export.entry",
-    "firmware_bridge.bridge",
-    "sim_hil.hil.entry",
-]
+with (REPOSITORY / "pyproject.toml").open("rb") as _file:
+    COMMANDS = sorted(entry.split(":")[0] for entry in tomllib.load(_file)["project"]["scripts"].values())
 
 
 @pytest.mark.parametrize("module", COMMANDS)

@@ -57,6 +57,7 @@ def run(out: Path, **moods: str) -> int:
     return demo.main(["--out", str(out), "--duration", "6", "--domain", "77"], commands=fakes(**moods))
 
 
+@pytest.mark.slow
 def test_all_steps_give_a_report_whose_path_is_the_last_line(
     tmp_path: Path, temporary: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -68,6 +69,7 @@ def test_all_steps_give_a_report_whose_path_is_the_last_line(
     assert left_behind(tmp_path) == [] and socket_folders(temporary) == []
 
 
+@pytest.mark.slow
 def test_a_failed_check_is_exit_1_and_still_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def report(files: object, *, wall_s: float) -> dict[str, object]:
         return {"checks": {"tick_p99_ms": {"value": 120.0, "limit": 100.0, "pass": False}}}
@@ -116,6 +118,7 @@ def test_an_old_report_does_not_survive_a_failed_run(tmp_path: Path) -> None:
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "demo.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("role", "step"), [(role, step) for step, role in ROLES.items()])
 def test_a_failing_step_is_named_with_its_log_and_last_lines(
     tmp_path: Path, temporary: Path, role: str, step: str, capsys: pytest.CaptureFixture[str]
@@ -129,6 +132,7 @@ def test_a_failing_step_is_named_with_its_log_and_last_lines(
     assert left_behind(tmp_path) == [] and socket_folders(temporary) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_a_fault_ended_is_named_and_still_gets_its_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +144,7 @@ def test_a_run_that_a_fault_ended_is_named_and_still_gets_its_report(
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_robot_that_ends_while_the_runner_drives_fails_the_demo(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,6 +153,7 @@ def test_a_robot_that_ends_while_the_runner_drives_fails_the_demo(
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_robot_that_never_gets_ready_fails_the_demo(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,6 +196,7 @@ def start_demo(out: Path, runner_mood: str) -> subprocess.Popen[str]:
     return process
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_every_process_and_exits_130(tmp_path: Path, number: int) -> None:
     process = start_demo(tmp_path, "slow")
@@ -201,6 +208,7 @@ def test_ctrl_c_ends_every_process_and_exits_130(tmp_path: Path, number: int) ->
     assert left_behind(tmp_path) == [] and socket_folders(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_even_a_killed_demo_leaves_no_process_behind(tmp_path: Path) -> None:
     process = start_demo(tmp_path, "slow")
     process.kill()

@@ -42,6 +42,7 @@ def hashes(out: Path) -> dict[str, str]:
     return {result.id: result.trajectory_sha256 for result in read_results(out)}
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_of_one_process_continues_to_the_same_trajectories_as_one_of_two(
     suite: Path, two_jobs: Path, tmp_path: Path
 ) -> None:

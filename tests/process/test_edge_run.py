@@ -30,6 +30,8 @@ from tests.support.processes import (
 )
 from tools.bench.stop import received_moves
 
+pytestmark = pytest.mark.process
+
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 STOP_BOUND_NS = 300_000_000
 
@@ -111,6 +113,7 @@ def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> No
         assert tick["delay_s"] == pytest.approx((tick["now_ns"] - state["frames_ns"][-1]) / 1e9, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) -> None:
     with drive(robot) as runner, HostStall() as host:
         wait_for(robot.is_moving, 20, "the robot to be told to move")
@@ -125,6 +128,7 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
     assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
 
 
+@pytest.mark.slow
 def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_an_operator_arms_it(
     robot: Robot,
 ) -> None:
@@ -138,6 +142,7 @@ def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_
         assert runner.stderr().count(waiting) == 1
 
 
+@pytest.mark.slow
 def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead(robot: Robot) -> None:
     with drive(robot) as runner, HostStall() as host:
         wait_for(robot.is_moving, 20, "the robot to be told to move")
@@ -154,6 +159,7 @@ def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands
     assert status == 1, "a run that the bridge had to stop is a failed run"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
 def test_a_signal_ends_the_run_with_the_robot_standing_still(robot: Robot, number: int, status: int) -> None:
     result = robot.folder / "run.json"
@@ -166,6 +172,7 @@ def test_a_signal_ends_the_run_with_the_robot_standing_still(robot: Robot, numbe
     assert robot.moves()[-1][1], "the last command on the wire is zero velocity"
 
 
+@pytest.mark.slow
 def test_a_terminal_that_takes_nothing_does_not_keep_a_signal_from_stopping_the_robot(robot: Robot) -> None:
     """As with `edge-run 2>&1 | less` that nobody scrolls."""
     reader, writer = os.pipe()
@@ -191,6 +198,7 @@ def test_without_a_bridge_it_refuses(tmp_path: Path, artifacts_dir: Path, dds_do
     assert "start `edge-bridge" in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_an_instruction_that_would_not_fit_with_four_frames_is_refused(
     tmp_path: Path, artifacts_dir: Path, dds_domain: int
 ) -> None:
@@ -212,6 +220,7 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
     assert "action_expert.onnx" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -18,6 +18,8 @@ from tools.faults.host_stall import HostStall
 from tools.faults.rig import Rig
 from tools.faults.rows import rows
 
+pytestmark = pytest.mark.process
+
 ROWS = {row.name: row for row in rows()}
 
 
@@ -37,6 +39,7 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
             yield rig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

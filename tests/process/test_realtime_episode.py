@@ -62,10 +62,10 @@ def episode() -> Episode:
     return next(one for one in load_suite("dynanav") if one.robot == "go2")
 
 
-def followed(*poses: TruePose) -> realtime._Drive:
-    drive = realtime._Drive([poses[0]])
+def followed(*poses: TruePose) -> realtime.RealtimeDrive:
+    drive = realtime.RealtimeDrive([poses[0]])
     for pose in poses[1:]:
-        if realtime._over(drive, pose, episode()):
+        if realtime.is_over(drive, pose, episode()):
             break
     return drive
 

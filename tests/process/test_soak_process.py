@@ -30,6 +30,8 @@ from sim_hil.soak.verdict.analysis import ANALYSIS, TRACE, faults_of, read_life,
 from sim_hil.soak.verdict.measures import measures
 from tests.support.processes import need_room_to_record, wait_for
 
+pytestmark = pytest.mark.process
+
 DURATION_S = 20
 # On a machine with many others on it all is slow. These only bound how long a test waits for what it looks for.
 LONGER_S = 240
@@ -141,6 +143,7 @@ def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soa
     return Soaked(arguments, folder / "out", code)
 
 
+@pytest.mark.slow
 def test_it_ends_by_itself_and_leaves_no_process(soaked: Soaked) -> None:
     assert soaked.code in (0, 1) and soaked.result["finished"]
     lines = [" ".join(process.info["cmdline"] or []) for process in psutil.process_iter(["cmdline"])]
@@ -281,6 +284,7 @@ def test_a_disk_too_full_to_record_to_is_refused_before_anything_starts(
     assert f"--out {out}: 61440 MiB" in error and error.count("\n") == 1 and not out.parent.exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_writes_the_report_of_what_there_is(artifacts_dir: Path, tmp_path: Path) -> None:
     need_room_to_record(tmp_path)
     out = tmp_path / "out"

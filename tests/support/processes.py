@@ -6,9 +6,12 @@ And know how long the machine itself stood still, for tests of a real-time promi
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.stack import free_domain
 from tools.faults.host_stall import HostStall
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -66,6 +70,38 @@ def running(module: str, *arguments: object, folder: Path, ready: str = "ready")
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, wait: bool) -> Iterator[bool]:
+    """Hold the lock file `path` until the end of the block or of this process; gives False if another has it."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:  # another user's file
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def claimed_dds_domain() -> Iterator[int]:
+    """DDS domain that no other worker and no other test run on this machine uses; its ports stay below 32768."""
+    first = free_domain()
+    for domain in (1 + (first - 1 + i) % 90 for i in range(90)):
+        lock = Path(tempfile.gettempdir()) / f"tic-vla-edge-tests-dds-{domain}.lock"
+        with locked(lock, wait=False) as held:
+            if held:
+                yield domain
+                return
+    raise RuntimeError("other test runs use all DDS domains from 1 to 90: end one of them")
 
 
 def need_room_to_record(folder: Path) -> None:

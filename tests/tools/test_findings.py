@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from edge.artifacts.files import _SECTIONS, SCHEMA_VERSION, seal
+from edge.artifacts.files import SCHEMA_VERSION, SECTIONS, seal
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyProfile
@@ -41,7 +41,7 @@ def models(root: Path, *names: str, alike: bool = False) -> Path:
     for name in names:
         (root / name).mkdir(parents=True)
         files = {"action_expert.onnx": {"sha256": "same" if alike else name}, "report.html": {"sha256": name}}
-        sections = {key: {} for key in _SECTIONS} | {"schema_version": SCHEMA_VERSION, "files": files}
+        sections = {key: {} for key in SECTIONS} | {"schema_version": SCHEMA_VERSION, "files": files}
         (root / name / "manifest.json").write_text(json.dumps(seal(sections)))
     return root
 
@@ -67,6 +67,7 @@ def test_a_small_difference_is_undecided() -> None:
     assert judge(claim, {"sync": outcomes(*[1, 0] * 10), "async": outcomes(*[1, 0] * 9, 1, 1)}).verdict == OPEN
 
 
+@pytest.mark.slow
 def test_what_is_harmless_may_lose_a_little() -> None:
     claim = Finding("drift", "", "", (("none", "typical"),), least=-10.0)
     many = [1, 1, 0, 1] * 50
@@ -241,6 +242,7 @@ def run(root: Path, out: Path, suite: Path, *more: str) -> int:
     return main(["--artifacts", str(root), "--out", str(out), "--suite", str(suite), *more])
 
 
+@pytest.mark.slow
 def test_a_page_a_picture_and_json_are_written(
     tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

@@ -72,6 +72,7 @@ def _parse(html: str) -> _Collector:
     return parser
 
 
+@pytest.mark.slow
 def test_the_page_loads_nothing_from_anywhere(html: str) -> None:
     for tag, attributes in _parse(html).tags:
         assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
@@ -120,6 +121,7 @@ def test_untrained_weights_are_said_plainly(html: str) -> None:
     assert "The weights are untrained" in html
 
 
+@pytest.mark.slow
 def test_trained_weights_are_not_called_untrained(tmp_path: Path) -> None:
     synthetic_run.write_run(tmp_path, 6.0, trained=True)
     write_report(RunFiles(tmp_path, tmp_path / "artifacts"), wall_s=1.0)
@@ -153,6 +155,7 @@ def test_the_machine_is_the_one_the_run_was_measured_on(html: str) -> None:
     assert _row_of(html.split("<h2>Machine</h2>")[1], "processor") == ["processor", "Synthetic 9000"]
 
 
+@pytest.mark.slow
 def test_a_run_that_did_not_note_its_machine_gets_no_other(tmp_path: Path) -> None:
     synthetic_run.write_run(tmp_path, 6.0)
     (tmp_path / "settings.json").write_text('{"duration_s": 6.0}')
@@ -382,6 +385,7 @@ def test_a_missing_file_is_named_in_one_line(tmp_path: Path, name: str, capsys: 
     assert Path(name).name in error and error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_reports_path_and_fails_with_a_failed_check(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -391,6 +395,7 @@ def test_the_command_prints_the_reports_path_and_fails_with_a_failed_check(
     assert "FAIL" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_artifacts_that_the_run_used(tmp_path: Path) -> None:
     out, elsewhere = tmp_path / "demo", tmp_path / "elsewhere"
     synthetic_run.write_run(out, 6.0)
@@ -425,6 +430,7 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
     return spoil
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -452,12 +458,14 @@ def test_a_damaged_file_is_one_line_and_leaves_the_old_report(
     assert (tmp_path / "report.html").read_text() == "the old one"
 
 
+@pytest.mark.slow
 def test_an_empty_picture_does_not_end_the_report(tmp_path: Path) -> None:
     synthetic_run.write_run(tmp_path, 6.0)
     _frames_that_are_no_pictures("")(tmp_path)
     assert demo_report.main([str(tmp_path)]) in (0, 1)
 
 
+@pytest.mark.slow
 def test_results_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synthetic_run.write_run(tmp_path, 6.0)
     written: list[str] = []

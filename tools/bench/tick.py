@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from edge.artifacts.files import ArtifactError, read_manifest
 from edge.artifacts.manifest import load_artifacts
@@ -31,14 +32,14 @@ from export.model.network import build
 HERE = SE2(0.0, 0.0, 0.0)
 
 
-def onnx_tick(directory: Path, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
+def onnx_tick(directory: Path, image: NDArray[np.uint8], kv: NDArray[np.float32]) -> Callable[[], NDArray[np.float32]]:
     """The runner's own code path."""
     policy = Policy(load_artifacts(directory), threads=1)
     semantic = SemanticState(0, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
     return lambda: policy.act(policy.encode(image), (0.4, 0.0, 0.0), 2.0, HERE, semantic)
 
 
-def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[], np.ndarray]:
+def torch_tick(model_name: str, image: NDArray[np.uint8], kv: NDArray[np.float32]) -> Callable[[], NDArray[np.float32]]:
     """The same network in PyTorch eager mode on one thread."""
     torch.set_num_threads(1)
     model = build(config_for(model_name), 0)
@@ -46,10 +47,11 @@ def torch_tick(model_name: str, image: np.ndarray, kv: np.ndarray) -> Callable[[
     with torch.no_grad():
         keys, values = model.action.context(torch.from_numpy(kv))
 
-    def tick() -> np.ndarray:
+    def tick() -> NDArray[np.float32]:
         with torch.no_grad():
             plan: torch.Tensor = model.action(model.vision(frame), state, latency, keys, values)
-            return plan.numpy()
+            found: NDArray[np.float32] = plan.numpy()
+            return found
 
     return tick
 

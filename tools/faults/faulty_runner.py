@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge import runner
 from edge.core.geometry import SE2
@@ -86,7 +87,7 @@ class Faults:
     def __init__(self, switches: Switches) -> None:
         self._on = switches.hit
         self._calls, self._swings = itertools.count(), itertools.count()
-        self._held: np.ndarray[Any, Any] | None = None
+        self._held: NDArray[np.float32] | None = None
 
     def install(self) -> None:
         """Replace the methods, for this process only."""

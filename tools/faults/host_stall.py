@@ -30,6 +30,10 @@ class HostStall:
         self._ending.set()
         self._thread.join()
 
+    def add(self, due_ns: int, woken_ns: int) -> None:
+        """Note a sleep that ended at `woken_ns` instead of `due_ns`."""
+        self._stalls.append((due_ns, woken_ns))
+
     def between_ns(self, begin_ns: int, end_ns: int) -> int:
         """Sum of the stalls inside a window, 0 on a machine with time to spare."""
         return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
@@ -40,4 +44,4 @@ class HostStall:
             time.sleep(_SLEEP_S)
             woken_ns = time.monotonic_ns()
             if woken_ns - due_ns > _STALL_NS:
-                self._stalls.append((due_ns, woken_ns))
+                self.add(due_ns, woken_ns)

@@ -85,7 +85,7 @@ def percentile(values: Sequence[float], share: float) -> float:
     return float(np.percentile(np.array(values), share, method="higher"))
 
 
-def result(rows: Sequence[RowResult], machine: Mapping[str, Any]) -> dict[str, Any]:
+def result(rows: Sequence[RowResult], machine: Mapping[str, object]) -> dict[str, Any]:
     """The JSON result."""
     return {
         "injections": sum(len(row.samples) for row in rows),

@@ -35,7 +35,7 @@ beside it; with five of them one may hold by chance.
 
 
 def findings_json(
-    about: Mapping[str, Any],
+    about: Mapping[str, object],
     judged: Sequence[Judged],
     results: Results,
     described: Mapping[str, str],
@@ -54,7 +54,7 @@ def findings_json(
 
 def write_findings(
     out: Path,
-    about: Mapping[str, Any],
+    about: Mapping[str, object],
     judged: Sequence[Judged],
     results: Results,
     described: Mapping[str, str],

@@ -54,7 +54,7 @@ BRIDGE: tuple[Fault, ...] = (
         "latch-lost", 30, Action.STOP, 0, "bridge",
         "The bridge was killed after an emergency stop: the next bridge reads the stop from its latch file.",
         "Find out why the stop was pressed, then run `edge-bridge arm` while a runner waits.",
-        "tests/process/test_latch_restart.py::"
+        "tests/process/bridge/test_latch_restart.py::"
         "test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms",
     ),
     Fault(
@@ -79,7 +79,7 @@ BRIDGE: tuple[Fault, ...] = (
         "state-from-future", 36, Action.NOTHING, 0, "bridge",
         "A report of the robot carried a time that has not come yet and was dropped.",
         "Look for a second publisher of the robot's state: another robot or a forger.",
-        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "tests/process/bridge/test_stop_means_stop.py::TestNotAlone::"
         "test_forged_states_with_future_stamps_do_not_hide_a_tipped_robot",
     ),
     Fault(
@@ -110,28 +110,28 @@ BRIDGE: tuple[Fault, ...] = (
         "lease-taken", 40, Action.STOP, 500, "bridge",
         "Another client asked for the lease of the sport service, which shuts this bridge out.",
         "Close the other program or app; while the robot moves, stop it with L2 and B on its remote.",
-        "tests/process/test_stop_means_stop.py::TestConfirmation::"
+        "tests/process/bridge/test_stop_means_stop.py::TestConfirmation::"
         "test_a_lease_request_while_driving_is_a_second_commander",
     ),
     Fault(
         "stop-denied", 40, Action.STOP, 0, "bridge",
         "Another client holds the lease: the robot denies the stop, and `edge-bridge stop` says that it still moves.",
         "Press L2 and B on the robot's remote, or switch the robot off.",
-        "tests/process/test_stop_means_stop.py::TestConfirmation::"
+        "tests/process/bridge/test_stop_means_stop.py::TestConfirmation::"
         "test_a_robot_that_another_client_drives_on_is_never_confirmed",
     ),
     Fault(
         "second-publisher", 40, Action.STOP, 500, "bridge",
         "A second robot or a forger publishes on a topic that the bridge reads.",
         "Give each robot a network of its own; edge-bridge status names the topic.",
-        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "tests/process/bridge/test_stop_means_stop.py::TestNotAlone::"
         "test_two_robots_are_not_armed_and_a_second_one_stops_the_first",
     ),
     Fault(
         "motor-commands", 40, Action.STOP, 500, "bridge",
         "Another program publishes motor commands (rt/lowcmd), which bypass the sport service.",
         "End that program; where it is the robot's own, set safety.robot_lowcmd_publishers.",
-        "tests/process/test_stop_means_stop.py::TestNotAlone::"
+        "tests/process/bridge/test_stop_means_stop.py::TestNotAlone::"
         "test_a_publisher_of_motor_commands_stops_a_driven_robot",
     ),
     Fault(
@@ -168,7 +168,7 @@ BRIDGE: tuple[Fault, ...] = (
         "permission-expired", 47, Action.NOTHING, 0, "bridge",
         "An operator's arm was not used within 10 s, or its runner disconnected: it is void.",
         "Run `edge-bridge arm` again while a runner waits.",
-        "tests/process/test_stop_means_stop.py::TestPermission::test_it_expires_after_ten_seconds",
+        "tests/process/bridge/test_stop_means_stop.py::TestPermission::test_it_expires_after_ten_seconds",
     ),
 )  # fmt: skip
 

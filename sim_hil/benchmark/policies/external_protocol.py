@@ -153,7 +153,7 @@ class Channel:
     _decoder: Decoder = field(default_factory=Decoder)
     _waiting: list[Message] = field(default_factory=list)
 
-    def send(self, header: Mapping[str, Any], payload: bytes = b"") -> None:
+    def send(self, header: Mapping[str, object], payload: bytes = b"") -> None:
         """Send a message."""
         self.connection.settimeout(self.timeout_s)
         try:
@@ -196,7 +196,7 @@ class Channel:
         self.connection.close()
 
 
-def check_keys(header: Mapping[str, Any], required: set[str], optional: set[str], peer: str) -> None:
+def check_keys(header: Mapping[str, object], required: set[str], optional: set[str], peer: str) -> None:
     """Raise ExternalError for a missing or unknown key."""
     missing, unknown = required - set(header), set(header) - required - optional - {"type"}
     if missing or unknown:
@@ -204,7 +204,7 @@ def check_keys(header: Mapping[str, Any], required: set[str], optional: set[str]
         raise ExternalError(f"{peer}: {header.get('type')} {what}")
 
 
-def text(header: Mapping[str, Any], key: str, peer: str, limit: int = MAX_TEXT_CHARS) -> str:
+def text(header: Mapping[str, object], key: str, peer: str, limit: int = MAX_TEXT_CHARS) -> str:
     """A text of at most `limit` characters; raises ExternalError."""
     value = header.get(key)
     if not isinstance(value, str) or len(value) > limit:
@@ -212,7 +212,7 @@ def text(header: Mapping[str, Any], key: str, peer: str, limit: int = MAX_TEXT_C
     return value
 
 
-def numbers(header: Mapping[str, Any], key: str, count: int, peer: str) -> tuple[float, ...]:
+def numbers(header: Mapping[str, object], key: str, count: int, peer: str) -> tuple[float, ...]:
     """So many finite numbers; raises ExternalError."""
     value = header.get(key)
     if not isinstance(value, list) or len(value) != count:

@@ -45,7 +45,7 @@ class EpisodeLog:
     def write(
         self,
         path: Path,
-        generations: Sequence[Mapping[str, Any]],
+        generations: Sequence[Mapping[str, object]],
         people: NDArray[np.float64],
         goal_xy: Sequence[float],
     ) -> None:

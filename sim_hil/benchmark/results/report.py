@@ -34,7 +34,7 @@ _HEADLINE = {
 }
 
 
-def write_report(store: ResultStore, summary: Mapping[str, Any], title: str) -> Path:
+def write_report(store: ResultStore, summary: Mapping[str, object], title: str) -> Path:
     """Write the page beside the results; raises OSError."""
     path = store.directory / REPORT
     results = sorted(store.results, key=lambda result: result.id)
@@ -110,7 +110,7 @@ def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
         return None  # the results stand without it; the map says how many paths it shows
 
 
-def _untrained(config: Mapping[str, Any]) -> str:
+def _untrained(config: Mapping[str, object]) -> str:
     if config.get("trained", True):
         return ""
     return (

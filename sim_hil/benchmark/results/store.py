@@ -46,7 +46,7 @@ class ResultStore:
         self._failed = list(failed)
 
     @staticmethod
-    def create(directory: Path, config: Mapping[str, Any]) -> ResultStore:
+    def create(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """A new run in a new or empty directory; raises StoreError."""
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise StoreError(
@@ -58,7 +58,7 @@ class ResultStore:
         return ResultStore(directory, config, (), _locked(directory))
 
     @staticmethod
-    def resume(directory: Path, config: Mapping[str, Any]) -> ResultStore:
+    def resume(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """Continue a run that was asked for the very same; raises StoreError, naming what differs."""
         if not (directory / CONFIG).is_file():
             raise StoreError(f"--resume: {directory} holds no benchmark run ({CONFIG}); start one without --resume")
@@ -172,7 +172,7 @@ def _make(directory: Path) -> None:
         raise StoreError(f"--out {directory}: cannot be made ({error.strerror})") from error
 
 
-def _append(path: Path, content: Mapping[str, Any]) -> None:
+def _append(path: Path, content: Mapping[str, object]) -> None:
     """One line in one write to the end, on the disk before anything else is said of it."""
     data = (json.dumps(content) + "\n").encode()
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -202,7 +202,7 @@ def _cut_torn_line(path: Path) -> None:
             file.truncate(whole)
 
 
-def _difference(found: Mapping[str, Any], asked: Mapping[str, Any], key: str) -> str:
+def _difference(found: Mapping[str, object], asked: Mapping[str, object], key: str) -> str:
     """The two values of a key, of a table only where they differ, short enough for a line."""
     was, now = found.get(key), asked.get(key)
     if isinstance(was, dict) and isinstance(now, dict):

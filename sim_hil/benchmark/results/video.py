@@ -69,7 +69,7 @@ class EpisodeVideo:
         world: EpisodeWorld,
         observation: Observation,
         command: tuple[float, float, float],
-        notes: Mapping[str, Any],
+        notes: Mapping[str, object],
     ) -> None:
         """The state that a period begins with, and what the policy made of it."""
         pose = world.pose()
@@ -98,7 +98,7 @@ class EpisodeVideo:
         self._writer.release()
         self._partial.unlink(missing_ok=True)
 
-    def _draw_map(self, world: EpisodeWorld, pose: SE2, notes: Mapping[str, Any]) -> Picture:
+    def _draw_map(self, world: EpisodeWorld, pose: SE2, notes: Mapping[str, object]) -> Picture:
         if self._map is None:
             self._map = draw_map(world.scene, MAP_PX_PER_M, names=True)
             self._view = map_view(world.scene, MAP_PX_PER_M)
@@ -125,7 +125,7 @@ class EpisodeVideo:
         world: EpisodeWorld,
         observation: Observation,
         command: tuple[float, float, float],
-        notes: Mapping[str, Any],
+        notes: Mapping[str, object],
     ) -> None:
         left, top, episode = 16, EYE_H + 12, self._episode
         lines = _wrapped(f"“{self._instruction}”", 74)[:2]
@@ -221,7 +221,7 @@ def _in_world(pose: SE2, notes: Mapping[str, Any]) -> Iterable[tuple[float, floa
         yield (there.x_m, there.y_m)
 
 
-def _state_line(notes: Mapping[str, Any]) -> str:
+def _state_line(notes: Mapping[str, object]) -> str:
     if notes.get("says"):
         return str(notes["says"])[:110]
     parts = []

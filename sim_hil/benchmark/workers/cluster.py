@@ -108,7 +108,7 @@ class ClusterJobs:
         ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=timeout_s)
         return [self._ended(reference) for reference in ready]
 
-    def _ended(self, reference: Any) -> Ended:
+    def _ended(self, reference: object) -> Ended:
         name = self._running.pop(reference)
         try:
             told, files = self._ray.get(reference)

@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
@@ -66,7 +67,7 @@ def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
 
 
 @dataclass
-class _Drive:
+class RealtimeDrive:
     """What was seen while the episode was driven."""
 
     poses: list[TruePose] = field(default_factory=list)
@@ -95,7 +96,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         domain=free_domain(),
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
-        stays=conditions.stays,
+        switches=conditions.switches,
         pose_hz=FRAME_HZ,
     )
     with _asked_to_end(), Stack(options) as stack:
@@ -167,7 +168,7 @@ def _asked_to_end() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
+def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> RealtimeDrive:
     """Start everything and follow the robot until the episode is over; the clock starts when the robot is armed."""
     stack.start_robot(lambda: None)
     stack.start_bridge(lambda: None)
@@ -180,7 +181,7 @@ def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
         if time.monotonic_ns() > deadline_ns:
             raise runner.failure(f"not armed within {ARM_TIMEOUT_S:g} s")
         time.sleep(POLL_S)
-    tail, drive = TruthTail(stack.trace), _Drive()
+    tail, drive = TruthTail(stack.trace), RealtimeDrive()
     before = tail.update()
     drive.poses = before[-1:]
     while not drive.poses:
@@ -189,14 +190,14 @@ def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> _Drive:
     while runner.running:
         stack.check()
         for pose in tail.update():
-            if _over(drive, pose, task.episode):
+            if is_over(drive, pose, task.episode):
                 return drive
         tell(drive.time_s)
         time.sleep(POLL_S)
     return drive
 
 
-def _over(drive: _Drive, pose: TruePose, episode: Episode) -> bool:
+def is_over(drive: RealtimeDrive, pose: TruePose, episode: Episode) -> bool:
     drive.poses.append(pose)
     drive.time_s = (pose.t_ns - drive.poses[0].t_ns) / 1e9
     if pose.touching and drive.first_collision_s is None:
@@ -250,7 +251,7 @@ def _generation(record: Mapping[str, Any], begin_ns: int) -> dict[str, Any]:
     }
 
 
-def _last_people(trace: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _last_people(trace: Path) -> NDArray[np.float64]:
     last: list[list[float]] = []
     for line in read_lines(trace):
         if line.get("kind") == "people":

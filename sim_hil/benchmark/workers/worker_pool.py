@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Final
 
 from sim_hil.benchmark.workers.worker_process import SINGLE_THREADED, Message
 
@@ -69,7 +69,7 @@ class Workers:
         """Process id of every job that runs."""
         return {key: worker.process.pid for key, worker in self._running.items()}
 
-    def start(self, key: str, job: Mapping[str, Any], log: Path) -> None:
+    def start(self, key: str, job: Mapping[str, object], log: Path) -> None:
         """Start a process on a job; what it prints is in `log` until it ends well. Raises OSError for none."""
         reading, writing = os.pipe()
         try:

@@ -49,14 +49,14 @@ def line_to_parent(prog: str, argv: Sequence[str] | None = None) -> Iterator[Tel
     cv2.setNumThreads(1)
     with os.fdopen(args.fd, "w", encoding="utf-8") as lines:
 
-        def tell(message: Mapping[str, Any]) -> None:
+        def tell(message: Mapping[str, object]) -> None:
             lines.write(json.dumps(message) + "\n")
             lines.flush()
 
         yield tell
 
 
-def worker_main(prog: str, messages: Callable[[Message], Iterable[Mapping[str, Any]]]) -> int:
+def worker_main(prog: str, messages: Callable[[Message], Iterable[Mapping[str, object]]]) -> int:
     """Of a worker module: run the job from standard input, telling each of its messages; returns 0."""
     with line_to_parent(prog) as tell:
         for message in messages(json.loads(sys.stdin.read())):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from edge.core.geometry import SE2
 from sim_hil.protocols.unitree.state import OdometryFrame, turned_quaternion
@@ -41,23 +40,23 @@ class DriftingOdometry(OdometryFrame):
         vx, vy, wz = (a - b for a, b in zip((report.vx_mps, report.vy_mps, report.wz_radps), true_mps, strict=True))
         self._error = (vx, vy, wz)
 
-    def position(self, position_m: Any) -> list[float]:
+    def position(self, position_m: object) -> list[float]:
         """A world position [3] as reported."""
         x, y, z = super().position(position_m)
         moved = self._correction @ SE2(x, y, 0.0)
         return [moved.x_m, moved.y_m, z]
 
-    def rpy(self, rpy_rad: Any) -> list[float]:
+    def rpy(self, rpy_rad: object) -> list[float]:
         """Roll, pitch and yaw [3] as reported."""
         roll, pitch, yaw = super().rpy(rpy_rad)
         turned = yaw + self._correction.theta_rad
         return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
 
-    def quaternion(self, wxyz: Any) -> list[float]:
+    def quaternion(self, wxyz: object) -> list[float]:
         """An orientation (w, x, y, z) as reported."""
         return turned_quaternion(super().quaternion(wxyz), self._correction.theta_rad)
 
-    def velocity(self, vector: Any) -> list[float]:
+    def velocity(self, vector: object) -> list[float]:
         """A world velocity [3] as reported, in the odometry frame: it fits the pose that is reported."""
         x, y, z = super().velocity(vector)
         c, s = math.cos(self._correction.theta_rad), math.sin(self._correction.theta_rad)

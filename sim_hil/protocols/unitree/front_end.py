@@ -64,7 +64,7 @@ class UnitreeFrontEnd:
         if options.camera_size is not None:
             self._camera = _camera(simulation, options, options.camera_size, self._dds)
         self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
-        self._robot.sport = self._behaviour  # type: ignore[assignment]
+        self._robot.sport = self._behaviour  # type: ignore[assignment]  # the calls of a SportController that Go2 makes
         self._odometry = _odometry(options)
         self._range_finder = RangeFinder([box for _, box in options.scene.obstacles()])
         self._pilot = Pilot(self._behaviour.request_move, self._free_m)

@@ -72,7 +72,7 @@ class OdometryFrame:
         """An orientation (w, x, y, z) in the odometry frame."""
         return turned_quaternion([float(v) for v in wxyz], -self._theta_rad)
 
-    def velocity(self, vector: Any) -> list[float]:
+    def velocity(self, vector: object) -> list[float]:
         """A world velocity [3] as the robot reports it, in the odometry frame."""
         return self.rotate(vector)
 
@@ -223,7 +223,7 @@ class _Periodic:
             self._wanted = bool(self._writer.get_matched_subscriptions())
         return self._wanted and step % self._every == 0
 
-    def write(self, message: Any) -> None:
+    def write(self, message: object) -> None:
         try:
             self._writer.write(message)
         except DDS_ERRORS:
@@ -248,7 +248,7 @@ class StatePublishers:
         remote: Remote | None = None,
         faults: StateFaults | None = None,
     ) -> None:
-        def periodic(topic: str, kind: Any, rate_hz: int, *, always: bool = False) -> _Periodic:
+        def periodic(topic: str, kind: object, rate_hz: int, *, always: bool = False) -> _Periodic:
             return _Periodic(bus.writer(topic, kind), max(steps_per_s // rate_hz, 1), steps_per_s, always=always)
 
         self._odometry = odometry

@@ -80,7 +80,7 @@ class StateFaults:
         effects, self._effects = self._effects, []
         return effects
 
-    def deliver(self, message: Any, now_ns: int) -> list[Any]:
+    def deliver(self, message: object, now_ns: int) -> list[Any]:
         """What goes out now in place of a fresh sport state; the message itself is altered."""
         self._alter(message)
         out = self._delivered(message, now_ns)
@@ -88,7 +88,7 @@ class StateFaults:
         self._waiting.clear()
         return out
 
-    def beside(self, message: Any) -> list[Any]:
+    def beside(self, message: object) -> list[Any]:
         """What goes out now on a slower topic, between two states of the main one; the message itself is altered."""
         self._alter(message)
         return [] if "state-silent" in self._on else [message]
@@ -114,7 +114,7 @@ class StateFaults:
             message.bms_state.cell_vol = [round(1000 * message.power_v / CELLS)] * CELLS + [0] * 7
         return not self._lost()
 
-    def _delivered(self, message: Any, now_ns: int) -> list[Any]:
+    def _delivered(self, message: object, now_ns: int) -> list[Any]:
         if self._lost():
             return []
         if "odometry-lag" in self._on:

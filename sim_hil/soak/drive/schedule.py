@@ -158,7 +158,7 @@ def _range(value: Any) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def known(table: Mapping[str, Any], keys: set[str], what: str) -> None:
+def known(table: Mapping[str, object], keys: set[str], what: str) -> None:
     """Raises SoakInputError for a key that nobody reads."""
     strange = sorted(set(table) - keys)
     if strange:

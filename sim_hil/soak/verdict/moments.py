@@ -60,7 +60,7 @@ def worst(analysis: Mapping[str, Any]) -> list[Moment]:
     return found
 
 
-def keep_moments(folder: Path, analysis: Mapping[str, Any]) -> None:
+def keep_moments(folder: Path, analysis: Mapping[str, object]) -> None:
     """Write the worst moments' pictures into the leg's folder; raises OSError."""
     kept = []
     for moment in worst(analysis):

@@ -23,6 +23,7 @@ from edge.inference.engines import PROFILES
 from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.state.switches import Decoding, RecoverySwitch
 from export.cli import main
 from export.target.file import load_target
 
@@ -174,6 +175,25 @@ def test_runtime_values_that_cannot_be_run_are_refused(copy: Path, change: dict[
         load_artifacts(copy)
 
 
+def test_a_manifest_from_before_the_switches_gets_their_defaults(copy: Path) -> None:
+    edit(copy, lambda m: [m["runtime"].pop(key, None) for key in ("decoding", "recovery")])
+    runtime = load_artifacts(copy).runtime
+    assert (runtime.decoding, runtime.recovery) == (Decoding.CONSTRAINED, RecoverySwitch.ON)
+
+
+def test_a_manifest_has_defaults_of_the_switches(copy: Path) -> None:
+    edit(copy, lambda m: m["runtime"].update(decoding="free", recovery="off"))
+    runtime = load_artifacts(copy).runtime
+    assert (runtime.decoding, runtime.recovery) == (Decoding.FREE, RecoverySwitch.OFF)
+
+
+@pytest.mark.parametrize("change", [{"decoding": "loose"}, {"recovery": True}, {"recovery": 1}, {"decoding": None}])
+def test_a_switch_that_does_not_exist_is_refused(copy: Path, change: dict[str, Any]) -> None:
+    edit(copy, lambda m: m["runtime"].update(change))
+    with pytest.raises(ArtifactError, match=r"expected.*constrained"):
+        load_artifacts(copy)
+
+
 def test_an_unknown_runtime_key_is_refused(copy: Path) -> None:
     edit(copy, lambda m: m["runtime"].update(max_speed=9))
     with pytest.raises(ArtifactError, match="runtime has"):
@@ -274,6 +294,7 @@ def mapped_copy(mapped: Path, tmp_path: Path) -> Path:
 DATA = "vision_encoder.onnx.data"
 
 
+@pytest.mark.slow
 def test_weights_in_a_data_file_compute_the_same(mapped: Path, artifacts_dir: Path) -> None:
     assert (mapped / DATA).exists() and not (artifacts_dir / DATA).exists()
     frame = np.random.default_rng(0).integers(0, 256, (1, 128, 128, 3)).astype(np.uint8)

@@ -255,6 +255,7 @@ def test_artifacts_that_do_not_verify_fail_and_the_rest_is_still_looked_at(tmp_p
     assert "clock" in by_name(result)
 
 
+@pytest.mark.slow
 def test_a_manifest_that_says_nonsense_of_its_device_is_a_failure_among_others(
     artifacts_dir: Path, tmp_path: Path
 ) -> None:

@@ -465,6 +465,7 @@ def test_a_file_cut_anywhere_yields_a_prefix_and_never_raises(part: float, whole
     assert ticks == list(range(len(ticks)))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(part=st.floats(0.01, 0.99), flip=st.integers(1, 255))
 def test_a_damaged_byte_never_yields_a_wrong_record(part: float, flip: int, whole_file: bytes, tmp_path: Path) -> None:

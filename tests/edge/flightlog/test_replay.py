@@ -18,13 +18,10 @@ from edge.flightlog.replay.command import main
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import Controller, ControllerConfig, ControllerInputs
-from edge.motion.standstill_recovery import TURNING
-from edge.motion.stuck_recovery import BACKING_OFF
-from edge.reasoning.decoding_rules import Known, TextGuide
+from edge.motion.recovery import BACKING_OFF, TURNING
+from edge.reasoning.decoding_rules import EITHER_WAY, DecodingContext, TextConstraint, TurnDistances
 from edge.reasoning.path_memory import way_of
-from edge.reasoning.progress_rules import EITHER_WAY
 from edge.reasoning.prompt import told_before
-from edge.reasoning.turn_estimate import TurnLeft
 from edge.run.camera import decode_frame
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
@@ -198,6 +195,7 @@ def test_the_same_artifacts_give_the_same_plans_texts_and_commands(log: Log) -> 
     assert result["skipped"] == {} and result["same_artifacts"] is True
 
 
+@pytest.mark.slow
 def test_a_plan_that_differs_is_beyond_the_tolerance_and_named(log: Log) -> None:
     log.payload("/tick", 20)["trajectory"][1][0] += 0.01
     code, result = log.replay()
@@ -208,17 +206,20 @@ def test_a_plan_that_differs_is_beyond_the_tolerance_and_named(log: Log) -> None
     assert log.replay("--tolerance-cm", "1.01")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_heading_a_whole_turn_away_is_the_same(log: Log) -> None:
     log.payload("/tick", 20)["trajectory"][1][2] += 2 * math.pi
     assert log.replay()[0] == 0
 
 
+@pytest.mark.slow
 def test_a_plan_that_was_not_finite_in_the_run_is_infinitely_far_away(log: Log) -> None:
     log.payload("/tick", 20)["trajectory"][1][2] = math.nan
     code, result = log.replay()
     assert code == 1 and result["heading_deg"]["max"] == 1e9
 
 
+@pytest.mark.slow
 def test_another_command_than_the_controller_gives_is_found(log: Log) -> None:
     vx, vy, wz = log.payload("/tick", 35)["command"]
     log.payload("/tick", 35)["command"] = [vx + 0.02, vy, wz]
@@ -226,6 +227,7 @@ def test_another_command_than_the_controller_gives_is_found(log: Log) -> None:
     assert code == 1 and result["command"]["max"] == pytest.approx(0.02, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", [BACKING_OFF, TURNING])
 def test_a_command_that_was_not_the_plans_is_not_compared(log: Log, reason: str) -> None:
     log.payload("/tick", TICKS - 1).update(command=[0.0, 0.0, 0.5], reason=reason)
@@ -233,17 +235,20 @@ def test_a_command_that_was_not_the_plans_is_not_compared(log: Log, reason: str)
     assert code == 0
 
 
+@pytest.mark.slow
 def test_another_text_is_found(log: Log) -> None:
     log.payload("/semantic", 1)["text"] += "!"
     code, result = log.replay()
     assert code == 1 and result["generations"]["different"] == [1]
 
 
+@pytest.mark.slow
 def test_another_instruction_is_another_prompt(log: Log) -> None:
     log.payload("/run", 0)["instruction"] = "turn around"
     assert log.replay()[0] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "told", [{"way": [[-9.0, 3.0]]}, {"before": "last leg of 3, passed 0."}], ids=["way", "before"]
 )
@@ -253,22 +258,25 @@ def test_what_the_prompt_told_of_the_way_and_progress_is_told_again(log: Log, to
     assert code == 1 and result["ticks"]["equal"] < result["ticks"]["compared"]
 
 
+@pytest.mark.slow
 def test_a_generation_is_held_to_what_it_was_held_to(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Known] = []
-    guide = LanguageModel.guide
+    asked: list[DecodingContext] = []
+    constraint = LanguageModel.constraint
 
-    def watched(self: LanguageModel, known: Known) -> TextGuide:
+    def watched(self: LanguageModel, known: DecodingContext) -> TextConstraint:
         asked.append(known)
-        return guide(self, known)
+        return constraint(self, known)
 
-    monkeypatch.setattr(LanguageModel, "guide", watched)
+    monkeypatch.setattr(LanguageModel, "constraint", watched)
     log.payload("/semantic", 1).update(follow=EITHER_WAY, turn="left", turn_left_m=[2.5, 3.0], turn_may_be_done=False)
     assert log.replay()[0] == 0
-    assert asked[1] == Known(Progress(1, 3, 1), EITHER_WAY, TurnLeft("left", (2.5, 3.0)), may_be_done=False)
+    turn = TurnDistances("left", (2.5, 3.0))
+    assert asked[1] == DecodingContext(Progress(1, 3, 1), EITHER_WAY, turn, turn_may_be_done=False)
     # A log from before generations were held to anything says nothing of it.
-    assert asked[2] == Known(Progress(1, 3, 2))
+    assert asked[2] == DecodingContext(Progress(1, 3, 2))
 
 
+@pytest.mark.slow
 def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
     lost_ns = log.payload("/tick", 20)["frame_ns"]
     log.drop(lambda topic, stamp_ns, _: topic == "/camera" and stamp_ns == lost_ns)
@@ -278,6 +286,7 @@ def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
     assert result["ticks"]["compared"] == TICKS - THINK_TICKS - 5
 
 
+@pytest.mark.slow
 def test_a_lost_picture_is_no_reason_to_fail(log: Log) -> None:
     lost_ns = log.payload("/tick", 20)["frame_ns"]
     log.drop(lambda topic, stamp_ns, _: topic == "/camera" and stamp_ns == lost_ns)
@@ -285,6 +294,7 @@ def test_a_lost_picture_is_no_reason_to_fail(log: Log) -> None:
     assert (code, result["skipped"]) == (0, {"its picture is not in the log": 1})
 
 
+@pytest.mark.slow
 def test_agreement_of_less_than_nine_plans_in_ten_is_none_unless_the_part_that_is_whole_is_named(log: Log) -> None:
     log.drop(lambda topic, _, payload: topic == "/semantic" and payload["generation"] == 2)
     code, result = log.replay()
@@ -295,6 +305,7 @@ def test_agreement_of_less_than_nine_plans_in_ten_is_none_unless_the_part_that_i
     assert log.replay("--to", "3.5")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_log_that_was_cut_is_replayed_as_far_as_it_is_whole(log: Log) -> None:
     log.records = log.records[:70]
     log.write()
@@ -304,12 +315,14 @@ def test_a_log_that_was_cut_is_replayed_as_far_as_it_is_whole(log: Log) -> None:
     assert code == 0 and 0 < result["ticks"]["recorded"] < TICKS
 
 
+@pytest.mark.slow
 def test_records_of_two_threads_may_lie_in_the_file_the_other_way_round(log: Log) -> None:
     log.records.sort(key=lambda record: record[0] == "/semantic")
     code, result = log.replay()
     assert code == 0 and result["ticks"]["equal"] == TICKS - THINK_TICKS
 
 
+@pytest.mark.slow
 def test_without_the_frames_poses_past_motion_is_told_from_the_ticks(log: Log) -> None:
     for index in range(3):
         del log.payload("/semantic", index)["frame_poses"]
@@ -318,12 +331,14 @@ def test_without_the_frames_poses_past_motion_is_told_from_the_ticks(log: Log) -
     assert result["generations"]["poses_interpolated"] == result["generations"]["ways_from_frames"] == 3
 
 
+@pytest.mark.slow
 def test_without_limits_commands_are_not_compared(log: Log) -> None:
     del log.payload("/run", 0)["limits"]
     code, result = log.replay()
     assert code == 0 and result["commands"]["compared"] == 0 and result["command"]["max"] is None
 
 
+@pytest.mark.slow
 def test_a_part_of_the_log_is_replayed_with_the_generation_that_it_drove_by(log: Log) -> None:
     code, result = log.replay("--from", "1.6", "--to", "2.0")
     assert code == 0
@@ -336,6 +351,7 @@ def test_nothing_to_compare_is_no_success(log: Log) -> None:
     assert code == 1 and "no tick" in result["beyond"][0]
 
 
+@pytest.mark.slow
 def test_other_artifacts_are_refused_unless_forced(log: Log, capsys: pytest.CaptureFixture[str]) -> None:
     log.payload("/run", 0)["manifest_sha256"] = "0" * 64
     assert log.replay()[0] == 3
@@ -345,6 +361,7 @@ def test_other_artifacts_are_refused_unless_forced(log: Log, capsys: pytest.Capt
     assert "not the same artifacts" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_table_says_the_same_as_the_json(log: Log, capsys: pytest.CaptureFixture[str]) -> None:
     log.write()
     assert main([str(log.path), "--artifacts", str(log.artifacts)]) == 0

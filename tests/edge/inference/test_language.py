@@ -79,6 +79,7 @@ def test_any_chunk_length_gives_the_same_answer(artifacts: Artifacts, expected: 
     assert generation.token_ids == expected[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [16, 10_000])
 def test_the_pair_gives_the_same_answer(pair: Artifacts, expected: tuple, size: int) -> None:
     language = model(pair, size)

@@ -82,7 +82,7 @@ def test_a_plan_that_stays_in_place_only_turns() -> None:
 finite = st.floats(-1e6, 1e6, width=32)
 
 
-@settings(derandomize=True, max_examples=500)
+@settings(max_examples=500)
 @given(
     st.lists(st.tuples(finite, finite, finite), min_size=30, max_size=30), st.lists(st.integers(0, 10**9), max_size=5)
 )
@@ -97,7 +97,7 @@ def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], 
         assert command.vy_mps == 0.0
 
 
-@settings(derandomize=True, max_examples=2000)
+@settings(max_examples=1000)
 @given(
     st.floats(0.0, 1e6),
     st.floats(-1e6, 1e6),

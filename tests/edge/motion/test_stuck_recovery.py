@@ -7,12 +7,12 @@ from dataclasses import replace
 from math import hypot
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.motion.controller import VelocityCommand
-from edge.motion.stuck_recovery import BACKING_OFF, BackOff, BackOffConfig
+from edge.motion.recovery import BACKING_OFF, BackOff, BackOffConfig
 
 CONFIG = BackOffConfig(vx_min_mps=-0.4, wz_max_radps=1.0)
 TICK_NS = 100_000_000
@@ -200,7 +200,6 @@ def test_it_keeps_to_the_share_of_speed_that_the_supervisor_leaves() -> None:
     assert run.go(1, STRAIGHT, speed_scale=float("nan")) is STRAIGHT
 
 
-@settings(derandomize=True)
 @given(st.floats(0.01, 1.0), st.floats(-0.8, -0.01), st.floats(0.01, 1.0))
 def test_the_way_back_never_leaves_the_robot_files_limits(
     wz_max_radps: float, vx_min_mps: float, speed_scale: float

@@ -186,6 +186,7 @@ def test_uncertainty_grows_with_the_way_and_vanishes_at_the_anchor() -> None:
     assert traces[0] < 1e-5
 
 
+@pytest.mark.slow
 def test_the_error_is_as_large_as_it_is_said_to_be() -> None:
     """Mean of the normalised squared error of 20 drives, 3 degrees of freedom each: about chi-square's 99.9 % band."""
     rng = np.random.default_rng(1)
@@ -206,6 +207,7 @@ def test_the_error_is_as_large_as_it_is_said_to_be() -> None:
     assert 1.5 < np.mean(errors) < 5.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "drift_deg"), [(1.02, 1.0), (0.95, 5.0)])
 def test_the_drift_rate_is_that_of_the_robots_own_odometry(scale: float, drift_deg: float) -> None:
     path = drive(44, scale=scale, yaw_drift_rad_per_m=math.radians(drift_deg), wz_radps=0.05)

@@ -141,6 +141,7 @@ def test_a_robots_clock_that_is_set_back_is_not_lag() -> None:
     assert all(v.increment is not None for v in verdicts[1:])
 
 
+@pytest.mark.slow
 def test_a_delay_that_stays_is_found_for_as_long_as_it_does() -> None:
     punctual = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(50)]
     late = [

@@ -88,6 +88,7 @@ def test_a_nod_that_the_robot_reports_is_no_motion() -> None:
     assert max(math.hypot(a.T_start_end.x_m, a.T_start_end.y_m) for a in answers) < 0.01
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_down_more_than_told_is_found_out_little_by_little() -> None:
     told = GEOMETRY
     real = CameraGeometry(told.hfov_rad, told.height_m, told.pitch_rad + math.radians(0.4), told.forward_m)

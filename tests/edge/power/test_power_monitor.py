@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -116,14 +116,10 @@ def test_a_meter_that_raises_is_asked_again_and_its_error_is_kept(error: Excepti
 
 
 def test_a_sample_that_is_old_counts_as_none() -> None:
-    running = monitor(None)
-    running._power = None
-    assert running.step(SECOND).sample is None
-    now = [SECOND]
-    live = monitor(steady(), clock=lambda: now[0])
-    live._power._newest = (SECOND, PowerSample(SECOND, 20.0))  # type: ignore[union-attr]
-    assert live.step(SECOND + SECOND // 4).sample is not None
-    assert live.step(SECOND + SECOND).sample is None
+    running = monitor(steady(), clock=lambda: SECOND)
+    running.read()
+    assert running.step(SECOND + SECOND // 4).sample is not None
+    assert running.step(SECOND + SECOND).sample is None
 
 
 def test_without_a_meter_the_result_says_that_there_was_none() -> None:
@@ -133,12 +129,12 @@ def test_without_a_meter_the_result_says_that_there_was_none() -> None:
 
 
 def test_figures_of_a_model_are_never_called_measured() -> None:
-    meter = ModelledMeter(4.6, lambda: 0.0)
-    running = monitor(meter)
-    for index in range(5):
-        now_ns = (index + 1) * SECOND
-        running._power._newest = (now_ns, meter.read(now_ns))  # type: ignore[union-attr]
-        running.step(now_ns)
+    now_ns = [0]
+    running = monitor(ModelledMeter(4.6, lambda: 0.0), clock=lambda: now_ns[0])
+    for second in range(1, 6):
+        now_ns[0] = second * SECOND
+        running.read()
+        running.step(now_ns[0])
     statistics = running.statistics()
     assert (statistics["source"], statistics["tagged"]) == ("the plan's model", "modelled")
     assert statistics["mean"] == pytest.approx(4.6)
@@ -210,14 +206,32 @@ def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
     assert running.step(10 * SECOND).outputs.findings == ("battery-empty", "battery-low")
 
 
-def heated(state: ThermalState, say: Callable[[str], object] = lambda _line: None) -> PowerMonitor:
-    """A monitor whose thermal source has given one state at 1 s; its thread is not started."""
-    running = PowerMonitor(
-        None, Governor(GovernorConfig(None, 48)), activity=Activity, thermal=ThermalReader(Path("/nowhere")), say=say
-    )
-    assert running._heat is not None
-    running._heat._newest = (SECOND, state)
-    return running
+class Heat(ThermalReader):
+    """Gives `state`, or fails while there is none."""
+
+    def __init__(self, state: ThermalState) -> None:
+        self.state: ThermalState | None = state
+
+    def read(self, now_ns: int) -> ThermalState:
+        if self.state is None:
+            raise MeterError("gone")
+        return self.state
+
+
+class Heated:
+    """A monitor without threads whose thermal source is read just before each step."""
+
+    def __init__(self, state: ThermalState, say: Callable[[str], object] = lambda _line: None) -> None:
+        self.heat, self._now_ns = Heat(state), 0
+        governor = Governor(GovernorConfig(None, 48))
+        self.monitor = PowerMonitor(
+            None, governor, activity=Activity, thermal=self.heat, say=say, clock=lambda: self._now_ns
+        )
+
+    def step(self, second: int) -> GovernorOutputs:
+        self._now_ns = second * SECOND
+        self.monitor.read()
+        return self.monitor.step(self._now_ns).outputs
 
 
 HOT = ThermalState(0, {"tj": 102.0}, 102.0, -3.0, 2.5, ("gpu-throttle-alert",))
@@ -225,26 +239,25 @@ HOT = ThermalState(0, {"tj": 102.0}, 102.0, -3.0, 2.5, ("gpu-throttle-alert",))
 
 def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
     said: list[str] = []
-    running = heated(HOT, said.append)
+    heated = Heated(HOT, said.append)
     for second in (1, 5, 60, 120):
-        outputs = running.step(second * SECOND).outputs
+        outputs = heated.step(second)
         assert outputs.findings == ("thermal-trip", "thermal-throttle")
         assert not outputs.budget.allowed
-    assert running.snapshot().thermal is None
+        heated.heat.state = None
+    assert heated.monitor.snapshot().thermal is None
     assert sum("temperatures are not read" in line for line in said) == 1
 
 
 def test_a_zone_that_gives_no_value_any_more_keeps_its_last_distance() -> None:
-    running = heated(HOT)
-    running.step(SECOND)
-    assert running._heat is not None
+    heated = Heated(HOT)
+    heated.step(1)
+    heated.heat.state = ThermalState(0)
     for second in range(2, 60):
-        running._heat._newest = (second * SECOND, ThermalState(0))
-        assert running.step(second * SECOND).outputs.findings == ("thermal-trip", "thermal-throttle")
-    running._heat._newest = (60 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
-    assert running.step(60 * SECOND).outputs.findings == ("thermal-throttle",)
-    running._heat._newest = (71 * SECOND, ThermalState(0, {}, 60.0, 39.0, 44.5))
-    assert running.step(71 * SECOND).outputs.findings == ()
+        assert heated.step(second).findings == ("thermal-trip", "thermal-throttle")
+    heated.heat.state = ThermalState(0, {}, 60.0, 39.0, 44.5)
+    assert heated.step(60).findings == ("thermal-throttle",)
+    assert heated.step(71).findings == ()
 
 
 def test_generations_are_counted_from_what_the_program_does_where_it_does_not_count() -> None:
@@ -281,7 +294,11 @@ def test_the_percentile_is_not_exceeded_for_that_share_of_the_time() -> None:
 
 def test_memory_of_the_statistics_does_not_grow() -> None:
     statistics = PowerStatistics()
-    before = len(statistics._seconds)
-    for index in range(10_000):
-        statistics.add(index, float(index % 2000))
-    assert len(statistics._seconds) == before
+    tracemalloc.start()
+    try:
+        for index in range(10_000):
+            statistics.add(index, float(index % 2000))
+        grown_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert grown_bytes < 50_000  # the samples alone would be 560,000

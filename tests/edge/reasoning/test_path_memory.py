@@ -51,6 +51,7 @@ def corner(before_s: int = 20, after_s: int = 20) -> list[tuple[int, SE2]]:
     return drive([0.0] * (before_s * 10) + [math.pi / 2 / 15] * 15 + [0.0] * (after_s * 10))
 
 
+@pytest.mark.slow
 @given(ways, st.integers(2, 12), st.floats(0, 5))
 def test_a_simplified_way_keeps_its_ends_and_order_and_no_more_points_than_wanted(
     points: list[Point], most: int, tolerance_m: float
@@ -61,6 +62,7 @@ def test_a_simplified_way_keeps_its_ends_and_order_and_no_more_points_than_wante
     assert all(point in rest for point in found)
 
 
+@pytest.mark.slow
 @given(ways, st.floats(0.01, 5))
 def test_with_points_to_spare_no_point_left_out_is_farther_than_the_tolerance(
     points: list[Point], tolerance_m: float
@@ -141,26 +143,27 @@ def test_a_robot_that_stands_keeps_nothing_new() -> None:
     memory = PathMemory()
     for tick in range(36_000):
         memory.put(tick * TICK_NS, SE2(1e-7 * tick, 0.0, 0.0))
-    assert len(memory._points) == 1
+    assert len(memory.points) == 1
 
 
 def test_poses_are_about_a_second_apart() -> None:
     memory = PathMemory()
     for stamp_ns, T_odom_base in drive([0.0] * 100):
         memory.put(stamp_ns, T_odom_base)
-    steps = [math.dist(a, b) for a, b in itertools.pairwise(memory._points)]
-    assert len(memory._points) == 10 and steps == pytest.approx([0.8 * PERIOD_NS / 1e9] * 9)
+    steps = [math.dist(a, b) for a, b in itertools.pairwise(memory.points)]
+    assert len(memory.points) == 10 and steps == pytest.approx([0.8 * PERIOD_NS / 1e9] * 9)
     assert min(steps) > MOVED_M
 
 
+@pytest.mark.slow
 def test_hours_are_bounded_and_the_start_is_never_lost() -> None:
     memory, poses = PathMemory(), drive([0.02 * math.sin(tick / 70) for tick in range(30_000)])
     most = 0
     for stamp_ns, T_odom_base in poses:
         memory.put(stamp_ns, T_odom_base)
-        most = max(most, len(memory._points))
+        most = max(most, len(memory.points))
     assert most < CAPACITY
-    assert memory._points[0] == (poses[0][1].x_m, poses[0][1].y_m)
+    assert memory.points[0] == (poses[0][1].x_m, poses[0][1].y_m)
     assert memory.way(poses[-1][1])[0] == pytest.approx(way_of([poses[0], poses[-1]])[0])
 
 
@@ -169,8 +172,8 @@ def test_what_is_left_out_of_a_long_way_hardly_bends_it() -> None:
     memory = PathMemory()
     for stamp_ns, T_odom_base in poses:
         memory.put(stamp_ns, T_odom_base)
-    assert len(memory._points) < 600  # of 800 s
-    legs = list(itertools.pairwise(memory._points))
+    assert len(memory.points) < 600  # of 800 s
+    legs = list(itertools.pairwise(memory.points))
     for _, pose in poses[::40]:
         point = (pose.x_m, pose.y_m)
         assert min(distance(point, a, b) for a, b in legs) < TOLERANCE_M

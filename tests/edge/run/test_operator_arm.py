@@ -280,6 +280,7 @@ class TestInTheWay:
         runner.run()
         assert runner.bench.status.state == "armed" and runner.asked_ms[0] >= 4_000
 
+    @pytest.mark.slow
     def test_while_no_operator_has_said_arm_it_may_last_for_hours(self) -> None:
         runner = Runner(in_the_way="dark")
         runner.at_ms = {3_600_000: runner.clear, 3_610_000: runner.permit}

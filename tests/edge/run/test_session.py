@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 
 from edge.core.deadline import Deadline
-from edge.flightlog.recorder import Recorder
+from edge.inference.release import ReleaseDelay
 from edge.run import assembly
 from edge.run import session as module
 from edge.run.arming import RefusedError, StoppedEarlyError
+from edge.run.assembly import Loops, RunOptions
 from edge.run.reasoning_loop import Mode
 from edge.run.session import RunSession
 from firmware_bridge.client import BridgeUnavailable
@@ -24,114 +25,177 @@ from firmware_bridge.core.config import load_robot_config
 from tests.support.processes import GO2_SIM
 
 ROBOT = load_robot_config(GO2_SIM)
+OPERATOR_ROBOT = replace(ROBOT, safety=replace(ROBOT.safety, operator_arm=True))
+STOPPED: Any = SimpleNamespace(state="stopped", zero_after_stop=True)
 
 
-class Reporter:
-    """What the service manager would be told."""
+class ArmedError(Exception):
+    """The session has begun to arm: the test is over."""
 
-    def __init__(self) -> None:
-        self.waited: list[str] = []
-        self.said: list[str] = []
+
+class Rig:
+    """A session around fakes: its graphs, its robot, its bridge and its loops.
+
+    The robot is ready after `ready_s` on a clock that every sleep advances; `at_5_s` is called from then on.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, ready_s: float = 0.0) -> None:
+        self.now_ns, self.ready_s = 0, ready_s
+        self.at_5_s: Callable[[], None] = lambda: None
+        self.on_arm: Callable[[], int] = self._arm
+        self.control: Callable[[], None] = lambda: None
+        self.events: list[str] = []
+        self.waited: set[str] = set()
+        self.on_death: Callable[[str], None] = lambda _why: None
+        self.session: RunSession
+        self.stop_flag: threading.Event
+        fakes: dict[str, Any] = {
+            "Policy": lambda *_args, **_named: None,
+            "LanguageModel": lambda *_args, **_named: SimpleNamespace(check_instruction=lambda *_: None),
+            "schedule_for": lambda _artifacts: SimpleNamespace(notes=(), control=None),
+            "warm_up": lambda *_: 1.0,
+            "check_tick": lambda *_: None,
+            "ServiceReporter": lambda *_args, **_named: self,
+            "BridgeClient": lambda _path: self,
+            "RobotInputs": self._inputs,
+            "assemble": self._assemble,
+            "arm": lambda *_args, **_named: self.on_arm(),
+            "enter": lambda _schedule: (),
+            "lock_memory": lambda: None,
+            "freeze_garbage": lambda: None,
+            "run_record": lambda *_: {"instruction": "go"},
+            "run_result": lambda *_args, faults, **_named: {"faults": faults},
+            "Deadline": lambda seconds: Deadline(seconds, clock=lambda: self.now_ns),
+            "time": SimpleNamespace(sleep=self._sleep, monotonic_ns=time.monotonic_ns),
+        }
+        for name, fake in fakes.items():
+            monkeypatch.setattr(module, name, fake)
+
+    def run(self, robot: Any = ROBOT, record: Path | None = None) -> dict[str, Any]:
+        runtime = SimpleNamespace(
+            tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0), decoding="constrained", recovery="on"
+        )
+        artifacts: Any = SimpleNamespace(runtime=runtime, guided_by_waypoints=False, directory=Path("a"))
+        options = RunOptions("go", Mode.ASYNC, None, ReleaseDelay(0.0, 0.0, 0), record)
+        self.session = RunSession(artifacts, robot, options, lambda _line: None)
+        return self.session.run()
+
+    # The bridge
+
+    def poll(self) -> Any:
+        return STOPPED
+
+    def stop(self) -> None:
+        self.events.append("robot stopped")
+
+    def close(self) -> None:
+        self.events.append("bridge closed")
+
+    # The service manager
+
+    def starting(self, _text: str, _limit_s: float) -> None:
+        pass
 
     def on_wait(self, text: str) -> None:
-        self.waited.append(text)
+        self.waited.add(text)
+
+    def on_tick(self, *_: object) -> None:
+        pass
 
     def stopping(self, text: str) -> None:
-        self.said.append(text)
+        self.events.append(f"stopping: {text}")
+
+    # The session's parts
+
+    def _sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+        if self.now_ns >= 5e9:
+            self.at_5_s()
+
+    def _arm(self) -> int:
+        raise ArmedError
+
+    def _inputs(self, *_args: object, on_death: Callable[[str], None], **_named: object) -> Any:
+        rig, self.on_death = self, on_death
+
+        class Inputs:
+            camera = SimpleNamespace(last_error="", start=lambda: None, align=lambda _ns: None)
+            history = SimpleNamespace(newest=lambda: None)
+            recorder: object = None
+
+            @property
+            def ready(self) -> bool:
+                return rig.now_ns >= rig.ready_s * 1e9
+
+            def close(self) -> None:
+                pass
+
+        return Inputs()
+
+    def _assemble(self, *_args: object, stop: threading.Event, **_named: object) -> Any:
+        self.stop_flag = stop
+        power = SimpleNamespace(start=lambda: None, close=lambda: None, statistics=dict)
+        supervision = SimpleNamespace(says="", active=(), state=SimpleNamespace(value="ok"))
+        control = SimpleNamespace(run=lambda *_: self.control(), supervision=supervision, ended_by="test")
+        reasoning = SimpleNamespace(
+            run=lambda: stop.wait(20),
+            cancel=lambda: None,
+            last_progress_ns=time.monotonic_ns(),
+            generation_ms=SimpleNamespace(quantile=lambda _share: 0.0),
+            generations=0,
+        )
+        return Loops(power, control, reasoning, SimpleNamespace(in_the_way=lambda: ""))  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def session() -> Any:
-    """A session whose graphs were never opened."""
-    bare: Any = RunSession.__new__(RunSession)
-    bare._print = lambda line: None
-    bare._lines = deque()
-    bare._robot = ROBOT
-    bare._reporter = Reporter()
-    bare._stop, bare._finished = threading.Event(), threading.Event()
-    bare._stop_requested = bare._began = False
-    bare._faults = []
-    return bare
+def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(monkeypatch)
 
 
 # The flight log
 
 
-def recorded(folder: Path) -> Recorder:
-    return Recorder(folder / "flight.mcap")
+def test_the_log_of_a_run_that_broke_off_after_it_began_is_kept(rig: Rig, tmp_path: Path) -> None:
+    def fail() -> None:
+        raise OSError("no")
+
+    rig.on_arm, rig.control = lambda: 7, fail
+    assert rig.run(record=tmp_path / "flight.mcap")["faults"] == ["control thread died: OSError: no"]
+    assert (tmp_path / "flight.mcap").stat().st_size > 0
 
 
-def test_the_log_of_a_run_that_broke_off_after_it_began_is_kept(session: Any, tmp_path: Path) -> None:
-    recorder = recorded(tmp_path)
-    session._began = True
-    recorder.put("/run", 1, {"instruction": "go"})
-    session._close_recorder(recorder, None, Deadline(5.0))
-    assert recorder.path.exists() and recorder.path.stat().st_size > 0
-
-
-def test_a_run_that_never_began_leaves_no_log(session: Any, tmp_path: Path) -> None:
-    recorder = recorded(tmp_path)
-    session._close_recorder(recorder, None, Deadline(5.0))
-    assert not recorder.path.exists()
+def test_a_run_that_never_began_leaves_no_log(rig: Rig, tmp_path: Path) -> None:
+    with pytest.raises(ArmedError):
+        rig.run(record=tmp_path / "flight.mcap")
+    assert list(tmp_path.iterdir()) == []
 
 
 # Waiting for the robot
 
 
-class Boot:
-    """A robot that is switched on after so many looks; every wait is over at once, on a clock that the test turns."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, after_s: float, then: Callable[[], None] | None = None) -> None:
-        self.now_ns, self.after_s, self.then = 0, after_s, then
-        self.camera = SimpleNamespace(last_error="")
-        self.history = SimpleNamespace(newest=lambda: None)
-        monkeypatch.setattr(module, "Deadline", lambda seconds: Deadline(seconds, clock=lambda: self.now_ns))
-        monkeypatch.setattr(module.time, "sleep", self._sleep)
-
-    def _sleep(self, seconds: float) -> None:
-        self.now_ns += round(seconds * 1e9)
-        if self.then is not None and self.now_ns >= 5e9:
-            self.then()
-
-    def poll(self) -> None:
-        """As the bridge."""
-
-    @property
-    def ready(self) -> bool:
-        return self.now_ns >= self.after_s * 1e9
+def test_a_robot_that_boots_in_five_minutes_is_waited_for_where_an_operator_arms_it(rig: Rig) -> None:
+    rig.ready_s = 300.0
+    with pytest.raises(ArmedError):
+        rig.run(OPERATOR_ROBOT)
+    assert rig.waited == {"waiting for the robot: no state yet"}
 
 
-def asks_operator(session: Any) -> Any:
-    session._robot = replace(ROBOT, safety=replace(ROBOT.safety, operator_arm=True))
-    return session
-
-
-def test_a_robot_that_boots_in_five_minutes_is_waited_for_where_an_operator_arms_it(
-    session: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    boot = Boot(monkeypatch, after_s=300.0)
-    asks_operator(session)._await_inputs(boot, boot)
-    assert set(session._reporter.waited) == {"waiting for the robot: no state yet"}
-
-
-def test_without_an_operator_it_is_a_refusal_after_ten_seconds(session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    boot = Boot(monkeypatch, after_s=300.0)
+def test_without_an_operator_it_is_a_refusal_after_ten_seconds(rig: Rig) -> None:
+    rig.ready_s = 300.0
     with pytest.raises(RefusedError, match="no state from the robot in 10 s"):
-        session._await_inputs(boot, boot)
+        rig.run()
 
 
-def test_a_stop_ends_the_waiting_for_the_robot(session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    boot = Boot(monkeypatch, after_s=300.0, then=session.request_stop)
+def test_a_stop_ends_the_waiting_for_the_robot(rig: Rig) -> None:
+    rig.ready_s, rig.at_5_s = 300.0, lambda: rig.session.request_stop()
     with pytest.raises(StoppedEarlyError):
-        asks_operator(session)._await_inputs(boot, boot)
+        rig.run(OPERATOR_ROBOT)
 
 
-def test_a_thread_that_dies_while_the_robot_is_waited_for_is_a_refusal(
-    session: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    boot = Boot(monkeypatch, after_s=300.0, then=lambda: session._end_by("camera thread died: OSError: gone"))
+def test_a_thread_that_dies_while_the_robot_is_waited_for_is_a_refusal(rig: Rig) -> None:
+    rig.ready_s, rig.at_5_s = 300.0, lambda: rig.on_death("camera thread died: OSError: gone")
     with pytest.raises(RefusedError, match="camera thread died"):
-        asks_operator(session)._await_inputs(boot, boot)
+        rig.run(OPERATOR_ROBOT)
 
 
 # The end
@@ -142,21 +206,26 @@ def test_a_thread_that_dies_while_the_robot_is_waited_for_is_a_refusal(
     [(BridgeUnavailable("gone"), "bridge lost: gone"), (OSError("no"), "control thread died: OSError: no")],
 )
 def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_known_and_before_the_end(
-    session: Any, error: Exception, fault: str
+    rig: Rig, error: Exception, fault: str
 ) -> None:
-    seen: list[tuple[list[str], bool]] = []
-
-    def body() -> None:
+    def fail() -> None:
         raise error
 
-    session._guard("control", body, lambda: seen.append((list(session._faults), session._finished.is_set())))()
-    assert seen == [([fault], False)]
-    assert session._finished.is_set()
+    rig.on_arm, rig.control = lambda: 7, fail
+    assert rig.run()["faults"] == [fault]
+    assert rig.events == ["robot stopped", f"stopping: {fault}", "bridge closed"]
 
 
-def test_an_input_thread_that_dies_ends_the_run(session: Any) -> None:
-    session._end_by("camera thread died: OSError: gone")
-    assert session._finished.is_set() and session._faults == ["camera thread died: OSError: gone"]
+def test_an_input_thread_that_dies_ends_the_run(rig: Rig) -> None:
+    stopped: list[bool] = []
+
+    def die() -> None:
+        rig.on_death("camera thread died: OSError: gone")
+        stopped.append(rig.stop_flag.wait(20))
+
+    rig.on_arm, rig.control = lambda: 7, die
+    assert rig.run()["faults"] == ["camera thread died: OSError: gone"]
+    assert stopped == [True]
 
 
 # What the monitors are told

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.deploy.install import main as install_main
@@ -56,7 +56,6 @@ def test_a_text_with_any_other_word_is_an_instruction(text: str) -> None:
     assert not is_stop_phrase(text)
 
 
-@settings(derandomize=True)
 @given(
     st.lists(st.sampled_from(sorted(STOP_WORDS | COMPANIONS)), min_size=1, max_size=6),
     st.sampled_from([" ", "  ", ", ", "! ", "\t", " – "]),

@@ -16,9 +16,8 @@ class Desk:
 
     def __init__(self) -> None:
         self.bench = Bench()
-        controller = self.bench.loop._controller.config
         watch = Watch(
-            WatchConfig.standard(controller, PERIOD_NS, image_px=PX),
+            WatchConfig.standard(self.bench.controller_config, PERIOD_NS, image_px=PX),
             Sources(
                 findings=self.bench.findings,
                 attitude=lambda: self.bench.attitude,

@@ -256,6 +256,7 @@ def test_the_directory_brings_its_tokenizer_if_the_ids_are_the_networks(vlm: Pat
     assert "vlm/tokenizer.json: not a tokenizer" in refusal(vlm)
 
 
+@pytest.mark.slow
 def test_nano_and_the_paper_size_have_a_tokenizer_and_other_ids_have_none() -> None:
     from tokenizers import Tokenizer
 

@@ -88,6 +88,7 @@ def within(relative: float) -> Limits:
     return dataclasses.replace(LIMITS, relative=relative)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_the_search_leaves_every_weight_as_it_was(model: TicVla, search: Search, graph: str) -> None:
     before = weights_sha256(model)
@@ -116,6 +117,7 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_the_same_inputs_give_the_same_decision(model: TicVla, samples: SampleSet) -> None:
     decisions = [
         Search(model, samples, trained=False).choose("language_model", ["fp16", "int8-b32", "int4-b32"], within(0.1))
@@ -124,6 +126,7 @@ def test_the_same_inputs_give_the_same_decision(model: TicVla, samples: SampleSe
     assert json.dumps(decisions[0].to_dict()) == json.dumps(decisions[1].to_dict())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_fewer_bits_mean_more_error(reference: Reference, graph: str) -> None:
     found = probe(reference, graph, Rounder(), activations=True)
@@ -131,6 +134,7 @@ def test_fewer_bits_mean_more_error(reference: Reference, graph: str) -> None:
     assert errors == sorted(errors) and errors[0] == 0 < errors[1] < errors[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", ["language_model", "language_model.decode"])
 def test_rounding_one_layer_from_its_kept_input_is_rounding_it_in_the_whole(reference: Reference, graph: str) -> None:
     found = probe(reference, graph, Rounder(), activations=True)
@@ -154,12 +158,14 @@ def test_rounding_one_block_of_the_encoder_from_its_kept_input_is_rounding_it_in
     assert torch.equal(whole, kept)
 
 
+@pytest.mark.slow
 def test_decoding_moves_the_plan_less_than_rounding_the_frames_too(reference: Reference) -> None:
     decode = probe(reference, "language_model.decode", Rounder(), activations=True).whole(Precision("int4-b32"))
     both = probe(reference, "language_model", Rounder(), activations=True).whole(Precision("int4-b32"))
     assert 0 < decode.relative < both.relative
 
 
+@pytest.mark.slow
 def test_decoding_is_held_to_the_tensors_of_the_gate(reference: Reference) -> None:
     """The gate has refused a decoding graph in which the text after exact frames looked well."""
     precision = Precision("int4-b32")
@@ -189,23 +195,27 @@ def test_the_vocabulary_matters_to_the_token_and_not_to_the_plan(reference: Refe
     assert reading.top1 is not None and reading.top1 < 1
 
 
+@pytest.mark.slow
 def test_wide_limits_take_the_smallest_candidate(search: Search) -> None:
     decision = search.choose("language_model", ["fp16", "int8-b32", "int4-b32"], within(10))
     assert decision.precision == Precision("int4-b32") and decision.within_limits
 
 
+@pytest.mark.slow
 def test_narrow_limits_take_the_most_exact_candidate(search: Search) -> None:
     decision = search.choose("language_model", ["fp32", "int8-b32", "int4-b32"], within(1e-6))
     assert decision.precision == Precision("fp32") and decision.within_limits
     assert "int4-b32 alone is" in decision.reason and "int8-b32 alone is" in decision.reason
 
 
+@pytest.mark.slow
 def test_when_even_the_most_exact_candidate_is_outside_it_says_so(search: Search) -> None:
     decision = search.choose("language_model", ["int8-b32", "int4-b32"], within(1e-6))
     assert decision.precision == Precision("int8-b32") and not decision.within_limits
     assert "outside the limits" in decision.reason
 
 
+@pytest.mark.slow
 def test_a_planted_sensitive_layer_is_found_and_raised(planted: TicVla, samples: SampleSet) -> None:
     search = Search(planted, samples, trained=True)
     candidates = ["fp16", "int4-b32"]
@@ -223,6 +233,7 @@ def test_a_planted_sensitive_layer_is_found_and_raised(planted: TicVla, samples:
     assert search.bytes_of("language_model", Precision("int4-b32")) < decision.weight_bytes < exact
 
 
+@pytest.mark.slow
 def test_the_table_ranks_every_group_of_layers(search: Search) -> None:
     decision = search.choose("language_model", ["fp16", "int4-b32"], LIMITS)
     rows = [row for row in decision.table if row.group != "*"]
@@ -232,6 +243,7 @@ def test_the_table_ranks_every_group_of_layers(search: Search) -> None:
     assert None not in loads and loads == sorted(loads, reverse=True)  # type: ignore[type-var]
 
 
+@pytest.mark.slow
 def test_the_reason_is_one_line_with_the_numbers(search: Search) -> None:
     decision: Decision = search.choose("vision_encoder", ["fp32", "int8"], LIMITS)
     assert "\n" not in decision.reason
@@ -304,6 +316,7 @@ def test_where_time_counts_a_smaller_variant_that_was_measured_slower_is_dropped
     assert kept == ("fp32",) and "slower than the more exact fp32 (2307 against 802 ms)" in dropped[0].reason
 
 
+@pytest.mark.slow
 def test_a_dropped_variant_is_in_the_reason(search: Search) -> None:
     decision = search.choose("language_model", ["fp16", "int8-b128", "int8-b32"], LIMITS)
     assert decision.precision.default == "int8-b128"

@@ -161,6 +161,7 @@ def test_one_clip_with_one_anchor_cannot_be_compared(calibration: CalibrationSet
         samples_from(one, NANO, Runtime(), NANO_TOKENIZER.read_bytes(), anchors_per_clip=1)
 
 
+@pytest.mark.slow
 def test_the_same_stages_have_no_error(model: TicVla, reference: StageOutputs, samples: SampleSet) -> None:
     error = task_error(reference, TorchStages(model), samples, new_tokens=4)
     assert (error.waypoint_cm, error.heading_deg, error.speed_mps, error.turn_radps, error.relative) == (0,) * 5
@@ -178,6 +179,7 @@ def test_a_prompt_in_one_call_gives_what_the_runtimes_chunks_give(
     assert np.concatenate(parts, axis=1) == pytest.approx(reference.kv[0], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_every_delay_has_figures_of_its_own(model: TicVla, reference: StageOutputs, samples: SampleSet) -> None:
     error = task_error(reference, BrokenKv(model, 0.5), samples)
     assert [delay_s for delay_s, _ in error.by_delay] == list(DELAYS_S)
@@ -187,6 +189,7 @@ def test_every_delay_has_figures_of_its_own(model: TicVla, reference: StageOutpu
     assert set(error.to_dict()["by_delay_s"]) == {"0", "1", "2", "3", "5", "7", "10"}
 
 
+@pytest.mark.slow
 def test_forgetting_the_age_of_the_state_hurts_more_the_older_it_is(
     model: TicVla, few_reference: StageOutputs, few: SampleSet
 ) -> None:
@@ -195,6 +198,7 @@ def test_forgetting_the_age_of_the_state_hurts_more_the_older_it_is(
     assert means[0] == 0 and means == sorted(means) and means[-1] > means[1] > 0
 
 
+@pytest.mark.slow
 def test_the_more_the_cache_is_broken_the_larger_the_error(
     model: TicVla, few_reference: StageOutputs, few: SampleSet
 ) -> None:
@@ -206,6 +210,7 @@ def test_the_more_the_cache_is_broken_the_larger_the_error(
     assert errors[0].visual_cosine == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_fewer_bits_mean_more_error(model: TicVla, few_reference: StageOutputs, few: SampleSet, graph: str) -> None:
     def of(precision: str) -> float:

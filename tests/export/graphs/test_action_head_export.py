@@ -55,6 +55,7 @@ def nodes(model: TicVla, directory: Path) -> list[onnx.NodeProto]:
 # The same mathematics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", HEADS)
 def test_a_graph_of_nano_size_plans_as_the_network_does(tmp_path: Path, head: str) -> None:
     assert check(lively(with_head(NANO, head)), tmp_path, EXACT, "fused") < 1e-4

@@ -377,6 +377,7 @@ def trained(head: str, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor) -
     return action
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", HEADS)
 def test_a_head_learns_what_to_do_where(head: str) -> None:
     inputs, kv = instants(2), states(2, 6)
@@ -386,6 +387,7 @@ def test_a_head_learns_what_to_do_where(head: str) -> None:
     assert float((found - TWO_WAYS).abs().max()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", ["diffusion", "flow"])
 def test_where_two_ways_are_as_good_one_is_taken_and_not_their_middle(head: str) -> None:
     inputs = tuple(x.expand(8, *x.shape[1:]) for x in instants(1))

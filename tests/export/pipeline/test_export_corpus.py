@@ -123,6 +123,7 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", DAMAGED, ids=lambda case: case.replace(" ", "-"))
 def test_a_damaged_directory_does_not_verify_and_is_not_touched(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str

@@ -25,6 +25,7 @@ def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced
     assert (out / "flight.mcap").read_bytes() == b"evidence"
 
 
+@pytest.mark.slow
 def test_a_failed_swap_puts_the_old_directory_back(
     cache: StageCache, artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -53,6 +54,7 @@ def test_an_existing_directory_that_is_not_ours_is_not_touched(
     assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["nano.partial", "nano.old.partial"])
 def test_a_directory_of_the_users_beside_the_output_stays(artifacts_dir: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
@@ -63,6 +65,7 @@ def test_a_directory_of_the_users_beside_the_output_stays(artifacts_dir: Path, t
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["nano", name])
 
 
+@pytest.mark.slow
 def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     (tmp_path / "nano").symlink_to("disk")
@@ -71,6 +74,7 @@ def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path)
     load_artifacts(tmp_path / "disk")
 
 
+@pytest.mark.slow
 def test_an_older_directory_of_ours_is_replaced_if_its_files_are_as_it_says(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

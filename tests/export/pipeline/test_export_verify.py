@@ -70,6 +70,7 @@ def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
     assert "tokenizer.json: not the tokenizer" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_thresholds_that_were_set_are_kept_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     setting = "gates.action_expert.max_abs=0.5"
     assert main(["--out", str(tmp_path / "nano"), "--set", setting]) == 0
@@ -77,6 +78,7 @@ def test_thresholds_that_were_set_are_kept_and_said(tmp_path: Path, capsys: pyte
     assert f"note: thresholds were set when it was built: {setting}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_directory_for_a_target_of_the_users_own_says_whose_thresholds_it_is_held_to(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,6 +94,7 @@ def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: 
     assert "other weights" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shipped", "code", "says"), [(False, 2, "give that with"), (True, 1, "other weights than")])
 def test_verify_of_a_checkpoint_takes_the_checkpoint(
     artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, says: str

@@ -31,23 +31,27 @@ def with_points(points: list[Measured]) -> Target:
     return dataclasses.replace(load_target("cpu", "nano"), measured=tuple(points))
 
 
+@pytest.mark.slow
 def test_every_stage_gets_a_point(points: list[Measured]) -> None:
     assert len(points) == len(STAGES)
     assert {point.graph for point in points} == set(load_target("cpu", "nano").graph_names)
 
 
+@pytest.mark.slow
 def test_a_plan_with_these_points_is_measured_throughout(points: list[Measured]) -> None:
     made = plan(with_points(points), PRESETS["nano"])
     assert {stage.whole.tag for stage in made.stages} == {MEASURED}
     assert all("this machine, 2026-11-21" in stage.whole.source for stage in made.stages)
 
 
+@pytest.mark.slow
 def test_the_plan_takes_the_measured_times(points: list[Measured]) -> None:
     made = plan(with_points(points), PRESETS["nano"])
     encoder = next(point for point in points if point.graph == "vision_encoder")
     assert next(s for s in made.stages if s.stage == "vision_encoder").whole.ms == encoder.ms
 
 
+@pytest.mark.slow
 def test_what_is_printed_can_be_appended_to_a_target_file(points: list[Measured]) -> None:
     point = dataclasses.replace(points[0], overrides={"blocks.*.fc1": "int8"}, machine='a "quoted" name')
     tables = tomllib.loads(points_toml([point, *points[1:]]))

@@ -35,6 +35,7 @@ def stage(made: Plan, name: str) -> dict:
     return made.to_dict()["per_graph"][name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["orin", "rtx4060"])
 def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> None:
     made = planned(name)
@@ -44,6 +45,7 @@ def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> Non
     assert made.tagged == MODELLED
 
 
+@pytest.mark.slow
 def test_two_calls_give_the_same_plan() -> None:
     assert json.dumps(planned("orin").to_dict()) == json.dumps(planned("orin").to_dict())
 
@@ -75,11 +77,13 @@ def test_an_override_counts_for_its_layer_alone() -> None:
     assert heavier == pytest.approx(BIG.language.vocab * BIG.language.hidden / 2)
 
 
+@pytest.mark.slow
 def test_a_slower_mode_makes_a_longer_tick() -> None:
     ticks = [planned("orin", f"power.mode={mode}", tokens=8).tick.ms for mode in ("40W", "25W", "15W")]
     assert ticks == sorted(ticks)
 
 
+@pytest.mark.slow
 def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
     made = planned("orin", "power.mode=25W")
     assert not made.fits
@@ -117,6 +121,7 @@ def test_less_power_means_less_reasoning_but_the_same_tick() -> None:
     assert poor.tick.ms == rich.tick.ms
 
 
+@pytest.mark.slow
 def test_tokens_are_cut_so_that_the_state_stays_young_enough() -> None:
     made = planned("orin", "runtime.max_delay_s=6")
     assert 0 < made.tokens < target("orin").runtime.max_new_tokens
@@ -131,6 +136,7 @@ def test_a_state_that_gets_too_old_without_any_new_token_is_refused() -> None:
     assert any("the ceiling is 1 s" in reason for reason in made.reasons)
 
 
+@pytest.mark.slow
 def test_memory_that_is_not_there_is_refused() -> None:
     made = planned("rtx4060", "device.memory_gib=4")
     assert any("memory" in reason and "exceeds the 3.00 GiB" in reason for reason in made.reasons)
@@ -200,6 +206,7 @@ def test_a_measured_point_replaces_the_model_and_says_where_it_was_taken() -> No
     assert "the board in the laboratory, 2026-11-21" in entry["source"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -217,6 +224,7 @@ def test_a_point_of_anything_else_replaces_nothing(changes: dict) -> None:
     assert entry["tagged"] == MODELLED
 
 
+@pytest.mark.slow
 def test_a_point_at_another_length_only_scales_the_model() -> None:
     point = {"graph": "language_model", "precision": "int4-b32", "form": "fused", "provider": "cuda"}
     overridden = {"lm_head": "int8-b32"}
@@ -303,6 +311,7 @@ def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_and_
     assert ratios == {"orin": pytest.approx(0.65, abs=0.01), "rtx4060": pytest.approx(0.89, abs=0.01)}
 
 
+@pytest.mark.slow
 def test_against_the_paper_a_generation_alone_is_far_shorter() -> None:
     """0.12 of the paper's reasoning time on Orin NX, 0.085 on the RTX 4060, with 1,134 tokens read and 48 new: the
     paper does not say how many it generates, and an eager PyTorch decoder is bound by launches, which a roofline
@@ -328,6 +337,7 @@ def test_arguments_that_make_no_plan_are_refused(arguments: dict, line: str) -> 
         plan(target("orin"), BIG, **arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["orin", "cpu"])
 def test_a_person_sees_every_stage_and_the_verdict(name: str) -> None:
     console = Console(file=io.StringIO(), width=160)
@@ -339,6 +349,7 @@ def test_a_person_sees_every_stage_and_the_verdict(name: str) -> None:
     assert text.count(MODELLED) >= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["orin", "rtx4060"])
 @pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
 def test_the_engines_of_a_board_cover_the_context_of_both_models(name: str, config: TicVlaConfig) -> None:
@@ -362,6 +373,7 @@ def test_an_engine_that_the_context_would_outgrow_is_refused_before_anything_is_
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_16_bit_weights_take_32_in_memory_where_activations_do() -> None:
     sizes = {
         (name, kind): planned(

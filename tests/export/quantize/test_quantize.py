@@ -31,6 +31,7 @@ def test_per_channel_rounding_is_within_half_a_step(weight: np.ndarray) -> None:
     assert (np.abs(q.dequantised() - weight) <= q.scales[:, None] * 0.5001 + 1e-30).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", BLOCKED)
 @given(weight=weights)
 def test_block_rounding_never_leaves_a_block_worse_than_plain_rounding(precision: str, weight: np.ndarray) -> None:

@@ -11,6 +11,8 @@ from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages.idl import Request_
 
+pytestmark = pytest.mark.process
+
 # Says how much memory it has once it has found a reader of the topic that it is told.
 _LISTENER = """
 import re, sys, time

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import signal
+import socket
 import stat
 import struct
 import subprocess
@@ -28,13 +29,15 @@ from firmware_bridge.bridge import Bridge, is_pressed
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import load_robot_config
-from firmware_bridge.core.link import VERSION, BridgeStatus, Velocity, encode
+from firmware_bridge.core.link import MAX_DATAGRAM_BYTES, VERSION, Arm, BridgeStatus, Velocity, decode, encode
 from firmware_bridge.operate import operate
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 from tests.support.notify_socket import notify_socket
 from tests.support.processes import GO2_SIM, REPOSITORY, HostStall, Running, check_stop_latency, running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
+
+pytestmark = pytest.mark.process
 
 STOP_BOUND_NS = 300_000_000
 ZERO = (0.0, 0.0, 0.0)
@@ -103,6 +106,7 @@ def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(
         runner.process.kill()
 
 
+@pytest.mark.slow
 def test_a_frozen_runner_that_thaws_does_not_drive_again(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -154,6 +158,7 @@ def test_nothing_is_sent_before_arm(robot: FakeGo2, bridge: Running, socket_path
     assert robot.heard == []
 
 
+@pytest.mark.slow
 def test_a_second_client_is_turned_away_and_the_first_drives_on(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -165,6 +170,7 @@ def test_a_second_client_is_turned_away_and_the_first_drives_on(
         assert robot.is_driven()
 
 
+@pytest.mark.slow
 def test_a_new_client_may_arm_again_after_the_first_has_died(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -176,18 +182,18 @@ def test_a_new_client_may_arm_again_after_the_first_has_died(
 
 
 def test_garbage_on_the_socket_is_ignored(robot: FakeGo2, bridge: Running, socket_path: Path) -> None:
-    client = BridgeClient(socket_path)
-    for data in (b"\0", b"TVEB" + b"\xff" * 600, b"x" * 511):
-        client._socket.send(data)
-    client.arm()
-    wait_for(lambda: client.poll().state == "armed", 20, "armed")
-    client.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+        client.connect(str(socket_path))
+        for data in (b"\0", b"TVEB" + b"\xff" * 600, b"x" * 511, encode(Arm())):
+            client.send(data)
+        wait_for(lambda: decode(client.recv(MAX_DATAGRAM_BYTES)).state == "armed", 20, "armed")
 
 
 def test_the_socket_is_the_users_alone(bridge: Running, socket_path: Path) -> None:
     assert stat.S_IMODE(socket_path.stat().st_mode) == 0o600
 
 
+@pytest.mark.slow
 def test_a_second_bridge_on_the_socket_is_refused(bridge: Running, dds_domain: int, socket_path: Path) -> None:
     command = [sys.executable, "-m", "firmware_bridge.bridge", "--robot", str(GO2_SIM), "--socket", str(socket_path)]
     command += ["--domain", str(dds_domain)]
@@ -235,6 +241,7 @@ def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
     assert "another client commands the robot (sport 1008)" in bridge.stderr()
 
 
+@pytest.mark.slow
 def test_somebody_who_only_asks_is_no_commander(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -264,6 +271,7 @@ def test_a_hand_on_the_remote_is_zero_within_60_ms(
     assert said in bridge.stderr()
 
 
+@pytest.mark.slow
 def test_a_late_move_is_answered_within_40_ms_and_motion_after_a_stop_by_another_stop_move(
     robot: FakeGo2, bridge: Running, socket_path: Path
 ) -> None:
@@ -286,6 +294,7 @@ def test_a_late_move_is_answered_within_40_ms_and_motion_after_a_stop_by_another
     client.close()
 
 
+@pytest.mark.slow
 def test_a_stop_move_that_is_never_answered_holds_nothing_up(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -319,6 +328,7 @@ def test_a_killed_bridges_successor_stops_the_moving_robot_first(
         wait_for(lambda: "the robot was moving" in successor.stderr(), 5, "the reason")
 
 
+@pytest.mark.slow
 def test_a_bridge_that_was_frozen_does_not_drive_on(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -363,6 +373,7 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 
+@pytest.mark.slow
 def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
     robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path
 ) -> None:
@@ -413,6 +424,7 @@ def test_an_operators_command_without_a_bridge_is_refused_in_one_line(
     assert "no bridge listens" in error and error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_ten_thousand_hostile_datagrams_neither_crash_it_nor_move_the_robot_too_fast_nor_make_it_late(
     robot: FakeGo2, bridge: Running, socket_path: Path
 ) -> None:
@@ -529,6 +541,7 @@ WIRE_TABLES = {"idl.py", "idl_low.py", "ids.py"}
 READS_THE_ROBOT_FILE = {"config.py"}
 
 
+@pytest.mark.slow
 def test_the_bridge_process_stays_small_enough_to_be_read_in_an_afternoon() -> None:
     """All of ours that it imports, but for the wire's tables and the reading of the robot file before it starts."""
     ours = "[m.__file__ for name, m in sys.modules.items() if name.startswith('firmware_bridge')]"

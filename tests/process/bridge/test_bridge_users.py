@@ -19,6 +19,8 @@ from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
 from firmware_bridge.peer import is_trusted_listener
 from tests.support.processes import GO2_SIM, REPOSITORY, Running, running
 
+pytestmark = pytest.mark.process
+
 BRIDGE, RUNNER, OPERATOR, STRANGER = 64901, 64902, 64903, 64904
 """User numbers that no machine gives to anybody."""
 SERVICE = Path("/run/tic-vla-edge/bridge.sock")

@@ -27,6 +27,8 @@ from tests.support.processes import (
 )
 from tools.bench.stop import received_moves
 
+pytestmark = pytest.mark.process
+
 BOUND_NS = 300_000_000
 
 
@@ -87,6 +89,7 @@ def _finish(runner: Running) -> None:
     runner.process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 def test_the_robot_is_told_zero_within_300_ms(rig: Rig, number: signal.Signals) -> None:
     with HostStall() as host:
@@ -96,7 +99,8 @@ def test_the_robot_is_told_zero_within_300_ms(rig: Rig, number: signal.Signals) 
 
 def test_only_what_the_machine_stood_still_inside_the_window_is_granted() -> None:
     host = HostStall()
-    host._stalls = [(0, 10), (20, 40), (90, 95)]
+    for due_ns, woken_ns in ((0, 10), (20, 40), (90, 95)):
+        host.add(due_ns, woken_ns)
     assert host.between_ns(5, 30) == 5 + 10
     check_stop_latency(25, bound_ns=10, since_ns=5, host=host)
     with pytest.raises(AssertionError, match="allowed"):

@@ -29,6 +29,8 @@ from tests.support.processes import (
 from tests.support.robot.fake_go2 import FakeGo2
 from tools.bench.stop import received_moves
 
+pytestmark = pytest.mark.process
+
 ZERO = (0.0, 0.0, 0.0)
 
 

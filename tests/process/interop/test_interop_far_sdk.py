@@ -19,6 +19,7 @@ from tests.support.processes import REPOSITORY, read_trace
 
 FAR_PYTHON = os.environ.get("TIC_VLA_FAR_PYTHON", "")
 pytestmark = [
+    pytest.mark.process,
     pytest.mark.skipif(
         not FAR_PYTHON,
         reason="TIC_VLA_FAR_PYTHON is not set: install the binding with tools/interop/install_far_sdk.sh",

@@ -17,10 +17,13 @@ import pytest
 from tests.support.processes import hil_arguments, running
 
 SDK_PYTHON = os.environ.get("TIC_VLA_SDK_PYTHON", "")
-pytestmark = pytest.mark.skipif(
-    not SDK_PYTHON,
-    reason="TIC_VLA_SDK_PYTHON is not set: install the maker's SDK with tools/interop/install_unitree_sdk.sh",
-)
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(
+        not SDK_PYTHON,
+        reason="TIC_VLA_SDK_PYTHON is not set: install the maker's SDK with tools/interop/install_unitree_sdk.sh",
+    ),
+]
 
 
 @pytest.fixture(scope="module")

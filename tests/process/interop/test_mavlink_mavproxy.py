@@ -15,9 +15,12 @@ import pytest
 from tests.process.interop.mavlink_sessions import SESSIONS, Session, run_session
 
 MAVPROXY = os.environ.get("TIC_VLA_MAVPROXY", "")
-pytestmark = pytest.mark.skipif(
-    not MAVPROXY, reason="TIC_VLA_MAVPROXY is not set: install MAVProxy with tools/interop/install_mavproxy.sh"
-)
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(
+        not MAVPROXY, reason="TIC_VLA_MAVPROXY is not set: install MAVProxy with tools/interop/install_mavproxy.sh"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

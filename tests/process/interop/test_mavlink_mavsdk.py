@@ -14,9 +14,12 @@ import pytest
 from tests.process.interop.mavlink_sessions import SESSIONS, Session, run_session
 
 PYTHON = os.environ.get("TIC_VLA_MAVSDK_PYTHON", "")
-pytestmark = pytest.mark.skipif(
-    not PYTHON, reason="TIC_VLA_MAVSDK_PYTHON is not set: install MAVSDK with tools/interop/install_mavsdk.sh"
-)
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(
+        not PYTHON, reason="TIC_VLA_MAVSDK_PYTHON is not set: install MAVSDK with tools/interop/install_mavsdk.sh"
+    ),
+]
 CLIENT = [PYTHON, str(SESSIONS / "mavsdk_session.py")]
 
 

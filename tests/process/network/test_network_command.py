@@ -18,6 +18,8 @@ from sim_hil.network.impairment import Impairment
 from sim_hil.network.relay import Relay
 from tests.support.processes import REPOSITORY
 
+pytestmark = pytest.mark.process
+
 UDP = '[[links]]\nname = "l"\nkind = "udp"\nleft = "127.0.0.1:0"\nright = "127.0.0.1:9"\n'
 FRAMES = '[[links]]\nname = "l"\nkind = "frames"\nleft = "-"\nright = "-"\n'
 COMMANDS = ["--left", "true", "--right", "true"]
@@ -131,6 +133,7 @@ class TestExitCodes:
         assert result.exists()
 
 
+@pytest.mark.slow
 def test_the_command_is_told_changes_over_its_socket_and_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "l.toml").write_text(
         '[[links]]\nname = "l"\nkind = "udp"\nleft = "127.0.0.1:0"\nright = "127.0.0.1:9"\n'

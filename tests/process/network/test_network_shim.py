@@ -50,6 +50,7 @@ class TestImpairment:
         assert arrivals(rule, seed=4) == arrivals(rule, seed=4)
         assert arrivals(rule, seed=4) != arrivals(rule, seed=5)
 
+    @pytest.mark.slow
     @given(st.lists(st.floats(0, 1), min_size=50, max_size=50))
     def test_which_packets_are_lost_does_not_depend_on_when_they_come(self, gaps: list[float]) -> None:
         rule = Impairment(loss_percent=30, loss_burst=3, duplicate_percent=20)
@@ -303,6 +304,7 @@ class TestCable:
         )  # fmt: skip
         return done, json.loads((folder / "r.json").read_text())["links"]["cable"]
 
+    @pytest.mark.slow
     def test_dds_finds_its_robot_over_a_bad_cable_and_feels_it(self, tmp_path: Path) -> None:
         hil = "--robot go2 --scene corridor --protocol unitree --camera none --domain 0 --interface eth0"
         client = Path(__file__).with_name("network_dds_client.py")
@@ -316,10 +318,12 @@ class TestCable:
         assert seen["calls"] > 3
         assert tally["there"]["lost"] > 0 and tally["there"]["delivered"] > 50
 
+    @pytest.mark.slow
     def test_a_signal_that_ends_the_right_command_is_its_exit_status(self, tmp_path: Path) -> None:
         done, _ = self.between(tmp_path, "delay_ms = 1", "sleep 60", "sh -c 'kill -9 $$'")
         assert done.returncode == 137, done.stderr
 
+    @pytest.mark.slow
     def test_the_machines_own_network_is_left_alone(self, tmp_path: Path) -> None:
         before = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
         done, _ = self.between(tmp_path, "delay_ms = 1", "sleep 60", "sh -c 'ip -o addr show eth0; exit 7'")

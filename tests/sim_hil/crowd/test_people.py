@@ -54,6 +54,7 @@ def test_people_walk_at_walking_speed_without_jumping(corridor: Scene) -> None:
     assert 0.5 < np.mean(steps) < 1.4
 
 
+@pytest.mark.slow
 def test_people_turn_round_gradually(corridor: Scene) -> None:
     poses = _walk(People(corridor, 4, 2), 40.0)
     for a, b in itertools.pairwise(poses):
@@ -61,6 +62,7 @@ def test_people_turn_round_gradually(corridor: Scene) -> None:
         assert np.abs(turn).max() * UPDATE_HZ < 3.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_nobody_is_stuck_for_long(corridor: Scene, seed: int) -> None:
     poses = np.array(_walk(People(corridor, 8, seed), 40.0))[:, :, :2]
@@ -77,6 +79,7 @@ def test_routes_leave_room_for_a_person_to_walk_beside_the_line(corridor: Scene)
                 assert min(_box_gap(box, x, y) for box in boxes) > 0.48
 
 
+@pytest.mark.slow
 def test_people_keep_clear_of_walls_and_of_each_other(corridor: Scene) -> None:
     boxes = [box for _, box in corridor.obstacles()]
     for poses in _walk(People(corridor, 8, 6), 30.0)[::5]:
@@ -85,6 +88,7 @@ def test_people_keep_clear_of_walls_and_of_each_other(corridor: Scene) -> None:
             assert all(hypot(x - ox, y - oy) > 0.44 for ox, oy, _ in poses[:index])
 
 
+@pytest.mark.slow
 def test_people_walk_round_a_standing_robot_without_touching_it(corridor: Scene) -> None:
     # One person on a straight route, the robot lengthwise in the middle of it.
     scene = replace(corridor, routes=(Route(((3.0, 0.0), (15.0, 0.0))),))
@@ -98,6 +102,7 @@ def test_people_walk_round_a_standing_robot_without_touching_it(corridor: Scene)
         assert hypot(x - 9.0 - along, y) > 0.35
 
 
+@pytest.mark.slow
 def test_people_never_overlap_a_robot_that_walks_at_them(corridor: Scene) -> None:
     scene = replace(corridor, routes=(Route(((2.0, 0.0), (9.0, 0.0))),))
     simulation = Simulation(scene, people=1, seed=1)
@@ -125,6 +130,7 @@ def test_limbs_swing_with_walking_and_rest_at_the_start(corridor: Scene) -> None
     assert 0 <= people.render_rows()[0, 3] < 1
 
 
+@pytest.mark.slow
 def test_a_scene_without_routes_is_walked_all_over(corridor: Scene) -> None:
     poses = np.array(_walk(People(replace(corridor, routes=()), 6, 0), 60.0))
     assert np.ptp(poses[:, :, 0], axis=0).max() > 10.0

@@ -38,6 +38,7 @@ def _walk(people: People, seconds: float) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_a_crowd_repeats_itself_whether_or_not_it_is_looked_at(hospital: Scene) -> None:
     watched, alone = People(hospital, 45, 1), People(hospital, 45, 1)
     for _ in range(120):
@@ -48,6 +49,7 @@ def test_a_crowd_repeats_itself_whether_or_not_it_is_looked_at(hospital: Scene) 
     assert watched.render_rows().shape == (45, RENDER_FIELDS)
 
 
+@pytest.mark.slow
 def test_nobody_gets_into_walls_or_other_people(hospital: Scene) -> None:
     people = People(hospital, 60, 2)
     free = CrowdMap(hospital)
@@ -62,6 +64,7 @@ def test_nobody_gets_into_walls_or_other_people(hospital: Scene) -> None:
             assert gaps.min() > 0.4
 
 
+@pytest.mark.slow
 def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
     people = People(hospital, 60, 4)
     longest = np.zeros(60)
@@ -71,6 +74,7 @@ def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
     assert (longest > 15.0).mean() <= 0.04
 
 
+@pytest.mark.slow
 def test_people_speed_up_gently_and_brake_within_what_legs_can_do(hospital: Scene) -> None:
     people = People(hospital, 30, 0)
     before, changes = people.velocities(), []
@@ -84,6 +88,7 @@ def test_people_speed_up_gently_and_brake_within_what_legs_can_do(hospital: Scen
     assert (accelerations > 1.9).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_people_stand_sit_walk_and_talk(hospital: Scene) -> None:
     rows = _walk(People(hospital, 60, 5), 20.0)
     assert rows[:, :, 6].max() == 1.0
@@ -92,6 +97,7 @@ def test_people_stand_sit_walk_and_talk(hospital: Scene) -> None:
         assert (rows[:, :, 7] == gesture).any()
 
 
+@pytest.mark.slow
 def test_a_queue_stands_in_line_and_is_served_in_order(hall: Scene) -> None:
     counter = Place("counter", (20.0, 0.0), 0.0, "queue", 5)
     people = People(replace(hall, places=(counter,)), 6, 3)
@@ -113,6 +119,7 @@ def test_a_queue_stands_in_line_and_is_served_in_order(hall: Scene) -> None:
     assert len(served) >= 3
 
 
+@pytest.mark.slow
 def test_who_sits_is_on_the_seat_and_looks_where_it_looks(hall: Scene) -> None:
     seats = tuple(Place(f"seat {k}", (4.0 + 3 * k, 1.6), -pi / 2, "sit") for k in range(6))
     rows = _walk(People(replace(hall, places=seats), 6, 1), 60.0)
@@ -124,6 +131,7 @@ def test_who_sits_is_on_the_seat_and_looks_where_it_looks(hall: Scene) -> None:
     assert np.percentile(turned, 90) < 0.2
 
 
+@pytest.mark.slow
 def test_groups_stay_together(hospital: Scene) -> None:
     people = People(hospital, 60, 6)
     crowd = people._crowd
@@ -139,6 +147,7 @@ def test_groups_stay_together(hospital: Scene) -> None:
     assert np.percentile(gaps, 75) < 3.0
 
 
+@pytest.mark.slow
 def test_two_streams_get_past_each_other_in_a_narrow_corridor(hall: Scene) -> None:
     side = [Wall(f"side {y}", (2.0, y), (26.0, y), 0.1, 2.5, "wall_wainscot") for y in (-1.3, 1.3)]
     narrow = replace(hall, walls=(*hall.walls, *side), places=())
@@ -158,6 +167,7 @@ def test_a_person_on_a_platform_stands_on_it(hall: Scene) -> None:
     assert np.allclose(rows[:, :, 5][on_it], 0.2) and np.allclose(rows[:, :, 5][off_it], 0.0)
 
 
+@pytest.mark.slow
 def test_streets_are_crossed_at_the_crossing_rather_than_anywhere() -> None:
     scene = load_scene("sidewalk")
     people = People(scene, 50, 0)

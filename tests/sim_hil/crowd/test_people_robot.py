@@ -109,6 +109,7 @@ def test_nobody_runs_into_a_robot_that_stands_in_the_middle_of_a_corridor(seed: 
     assert passes >= 2  # and they do get past it
 
 
+@pytest.mark.slow
 def test_who_has_room_leaves_the_robot_more_than_who_has_none(hall: Scene) -> None:
     tight = [Wall(f"side {y}", (2.0, y), (26.0, y), 0.1, 2.5, "wall_wainscot") for y in (-1.15, 1.15)]
     closest = []

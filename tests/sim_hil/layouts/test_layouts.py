@@ -61,6 +61,7 @@ def test_it_holds_what_its_environment_is_known_by_and_is_about_as_large(kind: s
     assert sorted(scene.floor_max_m) >= sorted(0.7 * size for size in SIZE_M[kind])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", layouts.KINDS)
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another(kind: str, made: dict[str, Scene]) -> None:
     assert layouts.generate(kind, SEED) == made[kind]
@@ -73,6 +74,7 @@ def test_a_scene_file_gives_the_scene_back(kind: str, made: dict[str, Scene]) ->
     assert parse_scene(scene_to_toml(made[kind]), "again") == made[kind]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", layouts.KINDS)
 def test_the_benchmarks_scene_is_what_its_reserved_seed_gives(kind: str) -> None:
     assert load_scene(kind) == layouts.generate(kind, layouts.BENCHMARK_SEEDS[kind], reserved=True)

@@ -101,6 +101,7 @@ def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tup
     assert np.linalg.norm(after.position_m - before.position_m) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.3, 0.5, 0.8])
 def test_forward_speed_is_tracked_within_a_tenth_and_straight(simulation: Simulation, speed: float) -> None:
     _stand(simulation)
@@ -114,6 +115,7 @@ def test_forward_speed_is_tracked_within_a_tenth_and_straight(simulation: Simula
     assert abs(degrees(simulation.truth().rpy_rad[2] - yaw)) < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.6, -0.6])
 def test_turning_rate_is_tracked_within_a_fifth(simulation: Simulation, rate: float) -> None:
     _stand(simulation)
@@ -123,6 +125,7 @@ def test_turning_rate_is_tracked_within_a_fifth(simulation: Simulation, rate: fl
     assert np.abs(velocity[:2]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.5, (0.0, 0.2, 0.0))
@@ -152,6 +155,7 @@ def test_stop_move_takes_effect_at_once(simulation: Simulation) -> None:
     assert simulation.truth().commanded == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_commands_beyond_the_robots_range_are_clipped_and_do_not_topple_it(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 3.0, (99.0, -99.0, 99.0))
@@ -159,6 +163,7 @@ def test_commands_beyond_the_robots_range_are_clipped_and_do_not_topple_it(simul
     assert not simulation.fell
 
 
+@pytest.mark.slow
 def test_stand_down_lies_down(simulation: Simulation) -> None:
     _stand(simulation)
     assert simulation.sport(SportAction.STAND_DOWN) == 0
@@ -167,6 +172,7 @@ def test_stand_down_lies_down(simulation: Simulation) -> None:
     assert truth.mode == 5 and truth.body_height_m < 0.12
 
 
+@pytest.mark.slow
 def test_a_walking_robot_comes_to_rest_before_it_lies_down(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 2.0, (1.0, 0.0, 0.0))
@@ -195,6 +201,7 @@ def test_a_robot_that_is_kept_from_resting_lies_down_all_the_same() -> None:
     assert controller.mode == 5
 
 
+@pytest.mark.slow
 def test_a_repeated_stand_up_or_down_does_not_start_over(simulation: Simulation) -> None:
     for action, arrived in ((SportAction.STAND_UP, 6), (SportAction.STAND_DOWN, 5)):
         for _ in range(4):
@@ -203,6 +210,7 @@ def test_a_repeated_stand_up_or_down_does_not_start_over(simulation: Simulation)
         assert simulation.truth().mode == arrived
 
 
+@pytest.mark.slow
 def test_stand_down_overrides_a_stand_up_that_runs(simulation: Simulation) -> None:
     simulation.sport(SportAction.STAND_UP)
     _run(simulation, 1.0)
@@ -211,6 +219,7 @@ def test_stand_down_overrides_a_stand_up_that_runs(simulation: Simulation) -> No
     assert simulation.truth().mode == 5
 
 
+@pytest.mark.slow
 def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> None:
     _stand(simulation)
     simulation.sport(SportAction.DAMP)
@@ -226,10 +235,11 @@ def test_damp_goes_limp_and_recovery_stands_up_again(simulation: Simulation) -> 
     assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roll", [pi, 1.6, -2.5])
 def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: float) -> None:
     pybullet.resetBasePositionAndOrientation(
-        simulation.robot.body, (0, 0, 0.3), pybullet.getQuaternionFromEuler((roll, 0, 0.4)), simulation._client
+        simulation.robot.body, (0, 0, 0.3), pybullet.getQuaternionFromEuler((roll, 0, 0.4)), simulation.client
     )
     simulation.sport(SportAction.DAMP)
     _run(simulation, 1.0)
@@ -242,6 +252,7 @@ def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: f
     assert truth.body_height_m == pytest.approx(0.31, abs=0.02)
 
 
+@pytest.mark.slow
 def test_walking_into_a_wall_is_noticed_and_does_not_topple_the_robot(corridor: Scene) -> None:
     simulation = Simulation(replace(corridor, start=(26.0, 0.0, 0.0)), people=0, seed=0)
     _stand(simulation)
@@ -251,6 +262,7 @@ def test_walking_into_a_wall_is_noticed_and_does_not_topple_the_robot(corridor: 
     simulation.close()
 
 
+@pytest.mark.slow
 def test_velocities_agree_with_positions(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.5, (0.5, 0.0, 0.3))
@@ -272,6 +284,7 @@ def test_feet_carry_the_robot_where_kinematics_says_they_are(simulation: Simulat
     assert np.sign(truth.foot_position_body_m[:, 1]).tolist() == [-1, 1, -1, 1]
 
 
+@pytest.mark.slow
 def test_same_seed_and_calls_give_the_same_motion(corridor: Scene) -> None:
     ends = []
     for _ in range(2):
@@ -283,6 +296,7 @@ def test_same_seed_and_calls_give_the_same_motion(corridor: Scene) -> None:
     assert np.array_equal(ends[0], ends[1])
 
 
+@pytest.mark.slow
 def test_joints_stay_within_the_motors_speeds_and_torques_at_full_speed(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.5, (1.1, 0.0, 0.0))
@@ -306,17 +320,17 @@ def test_a_motor_drives_less_and_less_towards_its_top_speed_but_always_brakes(jo
 def test_a_joint_without_torque_is_held_by_its_dry_friction(simulation: Simulation) -> None:
     """Weightless, a torque below the friction (0.2 N.m) moves nothing and one above it does."""
     body, calf = simulation.robot.body, simulation.robot._joints[2]
-    pybullet.setGravity(0, 0, 0, physicsClientId=simulation._client)
-    pybullet.resetBasePositionAndOrientation(body, (0, 0, 1), (0, 0, 0, 1), physicsClientId=simulation._client)
-    pybullet.resetJointState(body, calf, -1.8, physicsClientId=simulation._client)
+    pybullet.setGravity(0, 0, 0, physicsClientId=simulation.client)
+    pybullet.resetBasePositionAndOrientation(body, (0, 0, 1), (0, 0, 0, 1), physicsClientId=simulation.client)
+    pybullet.resetJointState(body, calf, -1.8, physicsClientId=simulation.client)
     turned = []
     for torque in (0.15, 0.4):
         for _ in range(50):
             pybullet.setJointMotorControl2(
-                body, calf, pybullet.TORQUE_CONTROL, force=torque, physicsClientId=simulation._client
+                body, calf, pybullet.TORQUE_CONTROL, force=torque, physicsClientId=simulation.client
             )
-            pybullet.stepSimulation(physicsClientId=simulation._client)
-        turned.append(pybullet.getJointState(body, calf, physicsClientId=simulation._client)[0] + 1.8)
+            pybullet.stepSimulation(physicsClientId=simulation.client)
+        turned.append(pybullet.getJointState(body, calf, physicsClientId=simulation.client)[0] + 1.8)
     assert abs(turned[0]) < 1e-3 and turned[1] > 0.05
 
 
@@ -335,7 +349,7 @@ def test_a_running_simulation_keeps_no_files(
 
 def test_a_simulation_whose_window_was_closed_says_so_and_can_still_be_closed(simulation: Simulation) -> None:
     simulation.step()
-    pybullet.disconnect(physicsClientId=simulation._client)  # what closing the window does
+    pybullet.disconnect(physicsClientId=simulation.client)  # what closing the window does
     for call in (simulation.step, simulation.truth):
         with pytest.raises(SimulationClosedError, match="window") as raised:
             call()

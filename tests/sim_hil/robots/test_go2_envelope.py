@@ -24,6 +24,7 @@ def course() -> Iterator[Course]:
         yield course
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "rate_hz"),
     [
@@ -41,6 +42,7 @@ def test_the_envelope_is_tracked_within_a_tenth(command: Command, rate_hz: int) 
     assert row.tilt_rad < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ground", "settle_s"), [("bumps", 3.0), ("ramp", 5.0)])
 @pytest.mark.parametrize("rate_hz", [500, 480])
 def test_bumps_and_ramps_are_walked_over_at_speed(ground: str, settle_s: float, rate_hz: int) -> None:
@@ -52,6 +54,7 @@ def test_bumps_and_ramps_are_walked_over_at_speed(ground: str, settle_s: float, 
         assert course.robot.pose()[0][2] > (0.7 if ground == "ramp" else 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [500, 480])
 def test_random_commands_do_not_topple_it(rate_hz: int) -> None:
     endured = endure(rate_hz, 7, 30.0)
@@ -59,6 +62,7 @@ def test_random_commands_do_not_topple_it(rate_hz: int) -> None:
     assert endured.path_m > 4.0 and endured.commands > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, 4, 6])
 def test_a_light_push_is_taken_and_a_hard_one_topples_it_until_it_gets_up(index: int) -> None:
     pushed = push_over(index, 500)
@@ -77,6 +81,7 @@ def test_the_feet_grip_and_the_rest_of_the_robot_slides(course: Course) -> None:
     assert grips == {name: FOOT_GRIP if name in feet else SHELL_GRIP for name in grips}
 
 
+@pytest.mark.slow
 def test_a_robot_that_has_fallen_is_limp_and_stays_down_until_it_is_asked_to_stand(course: Course) -> None:
     course.stand()
     course.push((0.0, 600.0, 300.0), 0.1)
@@ -101,6 +106,7 @@ def test_a_go2_is_a_robot(course: Course) -> None:
     )
 
 
+@pytest.mark.slow
 def test_nothing_of_a_turning_robot_leaves_its_circle_and_nothing_of_a_running_one_its_length(course: Course) -> None:
     robot = course.robot
     course.stand()
@@ -112,6 +118,7 @@ def test_nothing_of_a_turning_robot_leaves_its_circle_and_nothing_of_a_running_o
             assert reach.max() + 0.022 <= (robot.radius_m if axis is None else robot.half_length_m)
 
 
+@pytest.mark.slow
 def test_the_feet_carry_the_weight_of_a_trotting_robot_in_pairs(course: Course) -> None:
     course.stand()
     course.walk((0.6, 0.0, 0.0), 1.5)
@@ -124,6 +131,7 @@ def test_the_feet_carry_the_weight_of_a_trotting_robot_in_pairs(course: Course) 
     assert (down[:, 0] == down[:, 3]).mean() > 0.8 and (down[:, 0] != down[:, 1]).mean() > 0.6
 
 
+@pytest.mark.slow
 def test_motors_keep_their_limits_at_full_speed(course: Course) -> None:
     course.stand()
     course.walk((1.5, 0.0, 0.0), 1.5)
@@ -134,6 +142,7 @@ def test_motors_keep_their_limits_at_full_speed(course: Course) -> None:
         assert (np.abs(truth.joint_tau_nm.reshape(4, 3)) <= TORQUE_LIMITS_NM).all()
 
 
+@pytest.mark.slow
 def test_the_imu_feels_gravity_along_the_slope_and_nothing_in_the_air() -> None:
     with Course("ramp", 500) as course:
         course.stand()

@@ -76,6 +76,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(scenes())
 def test_writing_a_scene_and_reading_it_back_gives_the_same_scene(scene: Scene) -> None:

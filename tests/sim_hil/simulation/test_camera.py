@@ -186,6 +186,7 @@ def test_a_squeezed_picture_shows_what_the_wide_one_shows(world: CameraWorld) ->
     assert np.abs(world.render(_state(10, 0, 0, person), 128, 128).astype(int) - squeezed.astype(int)).mean() > 12
 
 
+@pytest.mark.slow
 def test_two_processes_see_the_same_to_the_last_bit() -> None:
     program = (
         "import hashlib, numpy as np; from sim_hil.simulation.camera import CameraWorld;"

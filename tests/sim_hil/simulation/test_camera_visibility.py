@@ -58,6 +58,7 @@ def hospital() -> Iterator[tuple[CameraWorld, Scene]]:
     world.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(8))
 def test_a_hospitals_picture_is_the_same_with_and_without_what_walls_hide(
     hospital: tuple[CameraWorld, Scene], index: int, monkeypatch: pytest.MonkeyPatch

@@ -93,7 +93,7 @@ def test_only_people_near_the_robot_have_a_body() -> None:
         (x, y, _), _ = simulation.pose()
         near = [(px, py) for px, py, _ in simulation.people() if hypot(px - x, py - y) < 2.0]
         bodies = [
-            pybullet.getBasePositionAndOrientation(body, physicsClientId=simulation._client)[0][:2]
+            pybullet.getBasePositionAndOrientation(body, physicsClientId=simulation.client)[0][:2]
             for body in simulation._person_bodies
         ]
         inside = [place for place in bodies if place[0] < 28.0]

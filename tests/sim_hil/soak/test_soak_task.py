@@ -23,6 +23,7 @@ def office() -> Scene:
     return load_scene("office")
 
 
+@pytest.mark.slow
 def test_a_task_begins_where_the_robot_is_and_can_be_walked(office: Scene) -> None:
     journey = Journey(office, seed=1, leg=1, speed_mps=0.8)
     grid = NavGrid(office, clearance_m=footprint_m("go2"))
@@ -41,6 +42,7 @@ def test_the_same_seed_gives_the_same_tasks(office: Scene) -> None:
     assert second.begin() == at and first.next(at) == second.next(at)
 
 
+@pytest.mark.slow
 def test_a_slow_robot_has_more_time_and_shorter_ways(office: Scene) -> None:
     for speed_mps in (0.8, 0.1):
         journey = Journey(office, seed=4, leg=2, speed_mps=speed_mps)
@@ -49,6 +51,7 @@ def test_a_slow_robot_has_more_time_and_shorter_ways(office: Scene) -> None:
         assert task.shortest_m <= max(8.0, 60 * speed_mps)
 
 
+@pytest.mark.slow
 def test_from_every_free_place_there_is_a_task(office: Scene) -> None:
     """Also where no way can be told well: a soak goes on wherever the robot has got to."""
     journey = Journey(office, seed=1, leg=1, speed_mps=0.1)
@@ -63,6 +66,7 @@ def test_from_every_free_place_there_is_a_task(office: Scene) -> None:
             assert journey.next(at) is not None, at
 
 
+@pytest.mark.slow
 def test_numbers_count_up(office: Scene) -> None:
     journey = Journey(office, seed=1, leg=1, speed_mps=0.8)
     at = journey.begin()

@@ -11,7 +11,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
-from transformers import InternVLConfig, InternVLForConditionalGeneration
 
 from export.checkpoint import CheckpointError, load_checkpoint
 from export.model.config import ActionConfig, LanguageConfig, TicVlaConfig, VisionConfig
@@ -40,6 +39,9 @@ CONFIG = TicVlaConfig(
 
 def hf_model(tied: bool = False) -> Any:
     """The same network by transformers; every weight, bias and norm is random."""
+    # Imported here: it takes seconds, and every worker imports this module to collect its tests.
+    from transformers import InternVLConfig, InternVLForConditionalGeneration
+
     vision, language = CONFIG.vision, CONFIG.language
     config = InternVLConfig(
         vision_config={

@@ -201,9 +201,7 @@ class World:
             rules.held = True
             rules.forget_permission()
         if any(isinstance(message, Stop) for message in operator):
-            if rules.released and self._last_move_ns is not None:
-                self._last_move_ns = now_ns  # the zeros come back within a period
-            rules.released = False
+            self._end_release()
         elif any(isinstance(message, Arm) for message in operator):
             waiting = rules.asked_ns is not None and now_ns - rules.asked_ns <= _WAITING_NS
             if rules.held and waiting and idle and not stop:
@@ -239,7 +237,7 @@ class World:
             assert rules.arming_is_permitted, "armed after an emergency stop without an operator"
             rules.held = False
         if status.state in _DRIVING:
-            rules.released = False
+            self._end_release()
         if status.state == "armed" or status.state not in _DRIVING:
             rules.arming_is_permitted = False
         assert bool(outputs.latch) == rules.held, "the latch that is handed out is wrong"
@@ -255,6 +253,11 @@ class World:
             assert all(move == ZERO for move in moves)
         if moves:
             self._last_move_ns = now_ns
+
+    def _end_release(self) -> None:
+        if self.rules.released and self._last_move_ns is not None:
+            self._last_move_ns = self.bench.now_ns  # the zeros come back within a period
+        self.rules.released = False
 
     def _check_limits(self, move: Move) -> None:
         last, step = self._last_move, LIMITS.accel_mps2 / 50

@@ -91,6 +91,7 @@ class StageContract:
         with pytest.raises(self.error, match="another recipe"):
             self.train(tmp_path, self.other, resume=True)
 
+    @pytest.mark.slow
     def test_two_processes_have_the_loss_curve_of_one(self, tmp_path: Path, whole: Run) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))

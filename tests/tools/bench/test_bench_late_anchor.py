@@ -12,6 +12,7 @@ from edge.artifacts.manifest import Artifacts
 from tools.bench import late_anchor
 
 
+@pytest.mark.slow
 def test_every_variant_gets_as_many_generations_and_every_sample_is_kept(artifacts: Artifacts) -> None:
     niceness = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     result = late_anchor.run(artifacts, rounds=2, alone_s=0.5)

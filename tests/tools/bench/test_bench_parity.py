@@ -46,6 +46,7 @@ def test_a_graph_gives_the_last_positions_logits_alone() -> None:
     assert missed(theirs, theirs | {"logits": theirs["logits"][-1:]}) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--frames", "0"], ["--frames", "9"], ["--model", "7b"], ["--json", "/"]])
 def test_bad_arguments_are_refused_before_anything_is_built(arguments: list[str]) -> None:
     assert main(arguments) == 2

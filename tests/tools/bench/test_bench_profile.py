@@ -10,6 +10,7 @@ import pytest
 from tools.bench.profile import main
 
 
+@pytest.mark.slow
 def test_every_graph_is_profiled_by_operator(artifacts_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "profile.json"
     assert main(["--artifacts", str(artifacts_dir), "--context", "200", "--threads", "1", "--json", str(out)]) == 0

@@ -218,6 +218,7 @@ def test_the_middle_of_calls_is_one_of_them() -> None:
     assert middle([4.0, 1.0]) == 4.0
 
 
+@pytest.mark.slow
 def test_in_each_round_everybody_is_asked_once_and_the_order_turns(tmp_path: Path) -> None:
     with worker("ok", tmp_path) as a, worker("large", tmp_path) as b:
         for w in (a, b):
@@ -229,6 +230,7 @@ def test_in_each_round_everybody_is_asked_once_and_the_order_turns(tmp_path: Pat
     assert orders[1:] in ([], [["large", "ok"]])
 
 
+@pytest.mark.slow
 def test_a_contender_that_fails_leaves_the_field_and_the_others_go_on(tmp_path: Path) -> None:
     lost: list[str] = []
     with worker("ok", tmp_path) as a, worker("fails-later", tmp_path) as b:
@@ -290,6 +292,7 @@ def test_bad_input_is_refused_in_one_line(
     assert message in text and text.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_ours_alone_needs_no_environment_of_peers(tmp_path: Path, artifacts_dir: Path) -> None:
     out = tmp_path / "out"
     command = ["--artifacts", str(artifacts_dir), "--out", str(out), "--only", "ours*", "--threads", "1"]

@@ -81,7 +81,7 @@ class Worker:
         """Process id."""
         return self._process.pid
 
-    def _send(self, message: Mapping[str, Any]) -> None:
+    def _send(self, message: Mapping[str, object]) -> None:
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(message) + "\n")
@@ -89,7 +89,7 @@ class Worker:
         except (OSError, ValueError) as error:
             raise WorkerError(f"{self.name}: the worker is gone; its log: {self.log}") from error
 
-    def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(self, message: Mapping[str, object]) -> dict[str, Any]:
         """Send a message and wait for its answer; raises WorkerError."""
         self._send(message)
         assert self._process.stdout is not None

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
@@ -179,7 +180,7 @@ def _record(
 
 
 def look(
-    eye: VisualOdometry, picture: np.ndarray, stamp_ns: int, attitude: Attitude
+    eye: VisualOdometry, picture: NDArray[np.uint8], stamp_ns: int, attitude: Attitude
 ) -> tuple[VisualMotion | None, float]:
     """One frame through JPEG into the visual odometry; how long decoding and step took, ms of this thread's time."""
     bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)

@@ -35,6 +35,7 @@ from tools.train.encoder.poses import body_state
 from tools.train.samples.augment import encoded
 from tools.train.scenes.scenarios import Scenario
 from tools.train.scenes.sites import Site
+from tools.train.scenes.trace_sentences import aspects_json
 from tools.train.scenes.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
@@ -287,11 +288,11 @@ class _Tour:
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
         return people[(gaps < _VIEW_M) & (np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDING_MPS)]
 
-    def trace(self) -> Mapping[str, Any]:
+    def trace(self) -> Mapping[str, object]:
         """Return the true reasoning text of this instant."""
         means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
         people, velocities = self._world.people(), self._world.velocities()
-        return self._tracer.trace(self.body.pose, people, velocities, means).to_json()
+        return aspects_json(self._tracer.trace(self.body.pose, people, velocities, means))
 
     def step(self) -> None:
         """Advance robot and people by 0.1 s."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Final
 
+from edge.state.reasoning_text import AHEAD, SeenPerson, parse_people
 from tools.train.collect.collection import Collection, fill, job_count
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.drives.dataset import DatasetWriter
@@ -33,7 +33,8 @@ _OF_DRIVES: Final = frozenset(  # fields of CollectConfig that tours use too
     )
 )  # fmt: skip
 # Waiting for a person and passing around one are the driver's choices, which a tour does not model.
-_IN_THE_WAY: Final = re.compile(r"\bperson ahead [0-2] m\b")
+_IN_THE_WAY_M: Final = 2
+"""Distance of a person ahead up to which an anchor is left out, m."""
 
 
 def build_tours(
@@ -67,7 +68,11 @@ def _key(config: TourConfig, collect: CollectConfig, seed: int) -> str:
 def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:
     """Yield the tours' anchors without a person in the way; only frames at whole seconds have images and text."""
     for drive in tours.drives(ids, pictures=False):
-        clear = {int(trace["k"]) for trace in drive.traces if not _IN_THE_WAY.search(str(trace["motion"]))}
+        clear = {int(trace["k"]) for trace in drive.traces if not _is_blocked(parse_people(str(trace["motion"])))}
         for anchor in anchors_of(drive):
             if anchor.k in clear:
                 yield replace(anchor, around=(), by_seconds=True)
+
+
+def _is_blocked(people: Sequence[SeenPerson]) -> bool:
+    return any(person.side == AHEAD and person.distance_m <= _IN_THE_WAY_M for person in people)

@@ -41,6 +41,7 @@ from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, Tour
 from tools.train.config.scenes import SHARES
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
 from tools.train.scenes.scenarios import Scenario, ScenarioError, training_episodes
+from tools.train.scenes.trace_sentences import aspects_json
 from tools.train.scenes.traces import Tracer
 
 MODULE: Final = "tools.train.collect.worker"
@@ -75,7 +76,7 @@ class Order:
         return dict(plain(self))
 
     @staticmethod
-    def of_json(content: Mapping[str, Any]) -> Order:
+    def of_json(content: Mapping[str, object]) -> Order:
         """Build the order that `as_json` wrote. Raises FieldError."""
         return build(Order, content, "order")
 
@@ -225,7 +226,7 @@ def _trace_at(scenario: Scenario) -> TraceAt:
 
     def trace_at(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
         means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
-        return tracer.trace(world.pose(), world.people(), world.people_velocities(), means).to_json()
+        return aspects_json(tracer.trace(world.pose(), world.people(), world.people_velocities(), means))
 
     return trace_at
 

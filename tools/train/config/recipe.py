@@ -109,7 +109,7 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
         raise RecipeError(f"recipe {path}: {error}") from error
 
 
-def recipe_of(tables: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+def recipe_of(tables: Mapping[str, object], overrides: Sequence[str] = ()) -> Recipe:
     """Build a recipe from its tables. Raises RecipeError, FieldError, ModelConfigError."""
     known = ("schema", "name", "seed", "model", "dagger", *STAGES)
     for key in tables:

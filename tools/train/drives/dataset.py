@@ -106,7 +106,7 @@ class DatasetWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _append(self, content: Mapping[str, Any]) -> None:
+    def _append(self, content: Mapping[str, object]) -> None:
         with (self.folder / LINES).open("a", encoding="utf-8") as file:
             file.write(json.dumps(content) + "\n")
             file.flush()

@@ -84,7 +84,7 @@ def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] =
     return path
 
 
-def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, Any]] = ()) -> str:
+def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, object]] = ()) -> str:
     """Return the card's text; it depends on the run's files alone."""
     found = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
     results = {name: result for name, result in found.items() if ADOPTED not in result}
@@ -187,7 +187,7 @@ def _row(where: str, summary: Mapping[str, Any]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _data(run_dir: RunDir, collected: Mapping[str, Any] | None) -> str:
+def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
     rounds = [run_dir.result(path.parent.name) for path in sorted(run_dir.out.glob("dagger-*/result.json"))]
     own = [result for result in rounds if result is not None and ADOPTED not in result]
     lines: list[str] = []
@@ -234,7 +234,7 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
     return "\n".join(lines) + "\n"
 
 
-def _facts(result: Mapping[str, Any], under: str = "") -> list[str]:
+def _facts(result: Mapping[str, object], under: str = "") -> list[str]:
     """Format a result as one line per value; lists are omitted."""
     lines = []
     for key, value in sorted(result.items()):

@@ -82,7 +82,7 @@ class RolloutOrder:
     first: int = 0
     tasks_per_scene: int = TASKS_PER_SCENE
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the content that `of_json` reads."""
         return {**asdict(self), "delays": self.delays.as_json()}
 

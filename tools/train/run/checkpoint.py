@@ -20,7 +20,7 @@ class CheckpointFileError(ValueError):
     """A file that is damaged or not a checkpoint; one line."""
 
 
-def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, Any]) -> None:
+def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, object]) -> None:
     """Write tensors (any device, dtype kept) and JSON atomically. On OSError the old file remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")

@@ -17,6 +17,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 import torch
 import torch.distributed as dist
+from numpy.typing import NDArray
 
 _PATIENCE: Final = timedelta(days=7)
 """Timeout of collective operations: the first rank may record drives for hours. torchrun ends all ranks if one dies."""
@@ -38,7 +39,7 @@ class Ranks:
         """Whether this process writes files, logs and plots."""
         return self.rank == 0
 
-    def share(self, batch: np.ndarray) -> np.ndarray:
+    def share(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return this rank's part of a global batch of indices: every `world`-th from `rank` on."""
         return batch[self.rank :: self.world]
 
@@ -164,7 +165,7 @@ class BatchOrder:
         """Total number of batches."""
         return self.steps_per_epoch * self.epochs
 
-    def indices(self, step: int) -> np.ndarray:
+    def indices(self, step: int) -> NDArray[np.int64]:
         """Return the sample indices, int64, of the global batch of `step`, which counts from 0."""
         epoch, within = divmod(step, self.steps_per_epoch)
         order = np.random.default_rng((self.seed, 0xBA7C, epoch)).permutation(self.count)

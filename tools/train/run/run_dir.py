@@ -185,7 +185,7 @@ class RunDir:
         path = self.out / stage / "result.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
-    def finish(self, stage: str, result: Mapping[str, Any]) -> None:
+    def finish(self, stage: str, result: Mapping[str, object]) -> None:
         """Write the result of a stage, which marks it as finished."""
         write_whole(self.stage(stage) / "result.json", json.dumps(result, indent=1, sort_keys=True) + "\n")
 

@@ -31,8 +31,8 @@ FIRST_SEED: Final = 1_000_000  # smallest seed of an episode, far above the benc
 MAX_SEED: Final = 9_999
 KEPT_SEEDS: Final = range(9_001, 9_005)
 """Seeds of evaluation and reinforcement learning; no drive is collected with them."""
-_GROUPS: Final = 100_000  # layouts of one seed
-_LAYOUT_TRIES: Final = 4  # layouts tried for one scenario
+GROUPS: Final = 100_000  # layouts of one seed
+LAYOUT_TRIES: Final = 4  # layouts tried for one scenario
 _DRAWS: Final = 60  # tasks drawn at most for one scenario
 _LEAST_WAY_M: Final = 1.0  # least straight distance from the start to the success radius around the goal
 _LEAST_LEG_M: Final = 2.0  # shortest leg before a turn
@@ -124,8 +124,8 @@ def training_episodes(
             f"expected a seed of 0..{MAX_SEED}, a count and a start of 0 or more, one task a scene or more,"
             f" found {seed}, {count}, {start} and {tasks_per_scene}"
         )
-    if start + count > _GROUPS * tasks_per_scene:
-        raise ScenarioError(f"one seed has {_GROUPS} layouts: expected fewer scenarios, found {start + count}")
+    if start + count > GROUPS * tasks_per_scene:
+        raise ScenarioError(f"one seed has {GROUPS} layouts: expected fewer scenarios, found {start + count}")
     group, skip = divmod(start, tasks_per_scene)
     left = count
     while left > 0:
@@ -159,15 +159,15 @@ def scenario_group(
 def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, number: int) -> Scenario:
     """Find a scenario in the group's layout, or in the next one if it has none."""
     why = ""
-    for attempt in range(_LAYOUT_TRIES):
-        layout_seed = RESERVED_BELOW + (seed * _LAYOUT_TRIES + attempt) * _GROUPS + group
+    for attempt in range(LAYOUT_TRIES):
+        layout_seed = RESERVED_BELOW + (seed * LAYOUT_TRIES + attempt) * GROUPS + group
         try:
             if attempt not in sites:
                 sites[attempt] = Site(kind, layout_seed)
             return _scenario(sites[attempt], seed, number)
         except (LayoutError, RouteError) as error:
             why = str(error)
-    raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {_LAYOUT_TRIES} layouts; the last: {why}")
+    raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {LAYOUT_TRIES} layouts; the last: {why}")
 
 
 def _scenario(site: Site, seed: int, number: int) -> Scenario:

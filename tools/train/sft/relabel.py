@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.cli import write_whole
+from edge.state.reasoning_text import ReasoningText
 from sim_hil.benchmark.language.route import RouteError
 from sim_hil.benchmark.language.tasks import begins_ahead, make_task
 from sim_hil.benchmark.policies.expert import NEAR, along, driving_of, from_here
@@ -37,11 +38,10 @@ from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import Anchor, anchors_of
-from tools.train.scenes import trace_sentences as words
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario, ScenarioError, is_sound, scenario_of
 from tools.train.scenes.sites import Site, SiteError
-from tools.train.scenes.trace_sentences import Trace
+from tools.train.scenes.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
 from tools.train.scenes.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
@@ -57,7 +57,7 @@ _TAG: Final = 0x2E7E11
 
 
 class RelabelError(ValueError):
-    """InstructionRelabels that cannot be read; one line: what, expected, found, what to do."""
+    """Relabels that cannot be read; one line: what, expected, found, what to do."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,11 @@ class InstructionRelabels:
             raise KeyboardInterrupt
 
     def anchors(self, drive: Drive) -> list[Anchor]:
-        """Those of a drive under its other instructions at which nobody is near; raises RelabelError before `build`."""
+        """Return a drive's relabelled anchors without a person near. Raises RelabelError before `build`."""
         found = self._read(drive.id)
         if found is None:
-            raise RelabelError(f"{self._path(drive.id)}: not the retellings of this drive; build them first")
-        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == words.NOBODY}
+            raise RelabelError(f"{self._path(drive.id)}: not the relabels of this drive; build them first")
+        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == NO_PEOPLE}
         return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
 
     def _read(self, drive_id: str) -> list[InstructionRelabel] | None:
@@ -243,16 +243,15 @@ def relabel_along(
             break
         means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
-        traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
+        traces.append({"k": k, **aspects_json(_with_people(alone, aspects_of_json(own)))})
     told = tuple(scenario.told_json())
     return InstructionRelabel(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
 
 
-def _among(alone: Trace, own: Trace) -> Trace:
-    """A trace of an empty place, with the people of another one of the same instant."""
-    things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
-    people = [] if own.motion == words.NOBODY else own.motion.split(", ")
-    return Trace.of(own.situation, things, people, alone.progress, alone.plan)
+def _with_people(alone: ReasoningText, own: ReasoningText) -> ReasoningText:
+    """The text of an instant without people, with situation and people of another text of the same instant."""
+    assert own.situation is not None and alone.progress is not None and alone.plan is not None
+    return five_aspects(own.situation, alone.objects or (), own.people or (), alone.progress, alone.plan)
 
 
 def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:

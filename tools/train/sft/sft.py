@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from tokenizers import Tokenizer
 
+from edge.state.reasoning_text import format_text
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.tours import build_tours, tour_anchors
@@ -350,7 +351,7 @@ def _key(
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
         "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
-        "more": hashlib.sha256("\n".join(each.reasoning for each in more).encode()).hexdigest(),
+        "more": hashlib.sha256("\n".join(format_text(each.reasoning) for each in more).encode()).hexdigest(),
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 

@@ -163,6 +163,7 @@ def hash_of(**changes: object) -> str:
         return world.outcome().trajectory_sha256
 
 
+@pytest.mark.slow
 def test_the_same_episode_gives_the_same_bytes_again_and_in_another_process() -> None:
     here = hash_of()
     program = "from tests.sim_hil.benchmark.env.test_benchmark_world import hash_of; print(hash_of())"

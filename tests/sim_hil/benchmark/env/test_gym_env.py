@@ -29,6 +29,7 @@ def env() -> Iterator[DynaNavEnv]:
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_gymnasiums_own_check_passes() -> None:
     env = DynaNavEnv(EPISODES, camera=(48, 32), render_mode="rgb_array")
@@ -50,6 +51,7 @@ def test_the_episode_named_is_begun_with_the_wording_named(env: DynaNavEnv) -> N
     assert (info["episode"], info["instruction"]) == ("long", "Go straight on.")
 
 
+@pytest.mark.slow
 def test_without_a_name_the_seed_draws_the_episode(env: DynaNavEnv) -> None:
     drawn = [env.reset(seed=seed)[1]["episode"] for seed in range(3)]
     assert drawn == [env.reset(seed=seed)[1]["episode"] for seed in range(3)] and len(set(drawn)) == 2

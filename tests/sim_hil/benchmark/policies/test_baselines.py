@@ -76,6 +76,7 @@ def test_point_goal_stops_while_it_touches_something() -> None:
     assert policy.act(seen())[0] > 0.5 and policy.act(seen(touching=True))[0] == 0.0
 
 
+@pytest.mark.slow
 def test_point_goal_reaches_a_goal_in_the_open_and_hits_what_stands_between() -> None:
     episode = corridor_episode(start=(-8.0, 0.0, 0.0), goal_xy=(-3.0, 1.5))
     for things, success in (((), True), ((block(-5.5, 0.7, 0.5, 1.5),), False)):

@@ -61,6 +61,7 @@ def test_it_goes_round_what_bars_the_way_without_touching_it(round_a_wall: Drive
     assert round_a_wall.outcome.spl > 0.9
 
 
+@pytest.mark.slow
 def test_it_reaches_its_goal_among_people_without_coming_near_them(crowded: Drive) -> None:
     assert crowded.outcome.success and not crowded.outcome.collided
 
@@ -84,6 +85,7 @@ def test_where_it_says_that_it_will_be_is_where_it_is(round_a_wall: Drive) -> No
     assert np.median(errors) < 0.5
 
 
+@pytest.mark.slow
 def test_the_same_episode_is_driven_alike(crowded: Drive) -> None:
     again = driven(people=6, seed=1, goal_xy=(12.0, 0.0), timeout_s=60.0, shortest_m=12.0)
     assert again.outcome.trajectory_sha256 == crowded.outcome.trajectory_sha256

@@ -56,6 +56,7 @@ def test_it_drives_at_the_speed_it_is_given_and_tells_what_it_chose() -> None:
     assert np.allclose(np.arctan2(ways[:, 1], ways[:, 0]), choice.headings_rad[1:], atol=0.05)
 
 
+@pytest.mark.slow
 def test_it_keeps_further_from_walls_and_things_if_it_is_to() -> None:
     episode = corridor_episode(robot="carter", start=(*START, 0.0), goal_xy=GOAL, timeout_s=60.0, shortest_m=16.0)
 

@@ -34,6 +34,7 @@ def _seen(x_m: float = 0.0) -> Observation:
     return Observation(0.0, image, (0.1, 0.0, 0.2), SE2(x_m, 0.0, 0.0), False, False)
 
 
+@pytest.mark.slow
 def test_the_graph_is_the_network(file: Path) -> None:
     config = tiny_model()
     net = build_point_goal(config, torch.Generator().manual_seed(1)).eval()
@@ -51,6 +52,7 @@ def test_the_graph_is_the_network(file: Path) -> None:
     assert np.allclose(found, wanted.numpy(), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_goal_is_told_in_the_robots_frame(file: Path) -> None:
     policy, episode = PointGoalNetPolicy(file, robot_config()), corridor_episode()
     policy.reset(episode, "not read", None, 0)
@@ -60,6 +62,7 @@ def test_the_goal_is_told_in_the_robots_frame(file: Path) -> None:
     assert policy.notes()["waypoints"] == [[goal.x_m, goal.y_m]]
 
 
+@pytest.mark.slow
 def test_what_it_commands_is_within_the_robots_limits(file: Path) -> None:
     policy, limits = PointGoalNetPolicy(file, robot_config()), robot_config().limits
     policy.reset(corridor_episode(), "", None, 0)
@@ -68,6 +71,7 @@ def test_what_it_commands_is_within_the_robots_limits(file: Path) -> None:
         assert 0.0 <= vx <= limits.vx_max_mps and vy == 0.0 and abs(wz) <= limits.wz_max_radps
 
 
+@pytest.mark.slow
 def test_another_onnx_file_is_refused(file: Path, tmp_path: Path) -> None:
     model = onnx.load(str(file))
     del model.metadata_props[:]

@@ -27,6 +27,7 @@ def problems(validator: Validator, **changes: object) -> str:
     return "\n".join(validator.problems(replace(SOUND, **changes)))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_shipped_suite_is_sound() -> None:
     # An episode a task and, of the large outdoor scene, two tasks: the command checks all 85.
     chosen: dict[str, Episode] = {}

@@ -234,6 +234,7 @@ def drawn(request: pytest.FixtureRequest) -> list[Task]:
     return found
 
 
+@pytest.mark.slow
 def test_training_scenes_yield_tasks_whose_wordings_are_true(drawn: list[Task]) -> None:
     assert len(drawn) == 3
     for index, task in enumerate(drawn):
@@ -241,6 +242,7 @@ def test_training_scenes_yield_tasks_whose_wordings_are_true(drawn: list[Task]) 
             assert untrue(text, task.told) == [], text
 
 
+@pytest.mark.slow
 def test_a_task_begins_with_its_way_ahead_and_ends_at_its_landmark(drawn: list[Task]) -> None:
     for task in drawn:
         ahead = next(p for p in task.path[1:] if np.hypot(p[0] - task.start[0], p[1] - task.start[1]) > 0.2)

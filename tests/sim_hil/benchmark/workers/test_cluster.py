@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -19,7 +20,9 @@ from sim_hil.benchmark.workers.jobs import POLL_S, RunWatcher, run_all
 from tests.support.benchmark import dynanav_fakes as fakes
 from tests.support.processes import REPOSITORY
 
-pytest.importorskip("ray", reason="needs the packages of the extra 'cluster' (ray)")
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="needs the packages of the extra 'cluster' (ray)"
+)
 
 OBJECT_STORE_BYTES = 80 * 2**20
 
@@ -45,6 +48,7 @@ def cluster_address() -> Iterator[str]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+@pytest.mark.slow
 def test_a_killed_workers_episode_is_run_again_and_none_is_lost_or_counted_twice(
     cluster_address: str, tmp_path: Path
 ) -> None:
@@ -144,6 +148,7 @@ def test_a_cluster_whose_processors_come_back_is_not_given_up(bare: NoProcessors
     assert jobs.wait(0.2) == () and jobs.free() == 0
 
 
+@pytest.mark.slow
 def test_a_node_with_other_code_refuses_its_episodes(tmp_path: Path) -> None:
     told, files = run_on_node(json.dumps(fakes.task("a", tmp_path).as_json()), "0" * 64, None)
     content = json.loads(told)

@@ -132,6 +132,7 @@ def test_what_no_further_attempt_can_mend_ends_the_run_with_its_line(tmp_path: P
     assert caught.value.code == 2
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_slow_to_exit_is_waited_for_without_spinning(tmp_path: Path) -> None:
     jobs, waits, ended = LocalJobs(1, FAKE_WORKER), 0, []
     jobs.start(fakes.task("lingers", tmp_path))

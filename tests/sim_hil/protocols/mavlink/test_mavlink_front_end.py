@@ -120,6 +120,7 @@ def test_a_second_station_watches_and_does_not_drive(rig: Rig) -> None:
         other.close()
 
 
+@pytest.mark.slow
 def test_a_client_that_dies_stops_it_and_disarms_it(rig: Rig) -> None:
     rig.make_ready()
     rig.run(1.0, lambda: rig.client.drive(0.4, 0.0))

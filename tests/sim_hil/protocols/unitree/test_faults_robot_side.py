@@ -206,8 +206,9 @@ def test_the_reported_velocity_is_that_of_the_reported_pose() -> None:
 @pytest.fixture
 def injector(tmp_path: Path):
     sent: list[bytes] = []
-    injector = FaultInjector(tmp_path / "faults", remote=Remote(), camera=sent.append)
-    injector.sent = sent
+    remote = Remote()
+    injector = FaultInjector(tmp_path / "faults", remote=remote, camera=sent.append)
+    injector.sent, injector.remote = sent, remote
     client = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     client.bind(str(tmp_path / "client"))
     client.connect(str(tmp_path / "faults"))
@@ -253,10 +254,10 @@ def test_keys_held_on_the_remote_are_in_both_messages_and_let_go_by_clear(inject
     server, client = injector
     client.send(command("remote-keys", keys=0x220).line())
     server.poll(1)
-    assert server._remote.keys == 0x220 and server._remote.as_bytes()[2:4] == b"\x20\x02"
+    assert server.remote.keys == 0x220 and server.remote.as_bytes()[2:4] == b"\x20\x02"
     client.send(b'{"fault": "clear"}')
     server.poll(2)
-    assert server._remote.as_bytes() == bytes(40)
+    assert server.remote.as_bytes() == bytes(40)
 
 
 def test_no_two_pictures_of_the_same_scene_are_alike() -> None:
@@ -266,6 +267,7 @@ def test_no_two_pictures_of_the_same_scene_are_alike() -> None:
     assert noise.add(np.zeros((18, 32, 3), np.uint8)).max() < 10
 
 
+@pytest.mark.slow
 def test_without_the_flag_the_code_that_injects_is_not_even_loaded() -> None:
     loaded = "any('_fault' in m or '.fault_injector' in m for m in sys.modules)"
     code = f"import sim_hil.hil.command, sim_hil.protocols.unitree.videohub, sys; print({loaded})"

@@ -70,6 +70,7 @@ class TestAvoidance:
         assert math.hypot(sx, sy) <= max(allowed_mps(free_m), 0.0) + 1e-9
         assert sz == wz and abs(sx * vy - sy * vx) < 1e-9 and sx * vx >= 0.0
 
+    @pytest.mark.slow
     def test_it_walks_up_to_a_wall_and_stops_before_it(self, stage: Stage) -> None:
         assert stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}') == (0, "")
         wall_x = stage.pose().x_m + 2.2

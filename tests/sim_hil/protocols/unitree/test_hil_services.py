@@ -102,6 +102,7 @@ class TestPostures:
         assert (desk.behaviour.mode, desk.behaviour.progress) == (1, 0.0)
         assert desk.behaviour.ready
 
+    @pytest.mark.slow
     def test_it_stands_on_three_legs_while_it_waves_and_does_not_fall(self, stage: Stage) -> None:
         stage.ask(1016)
         lowest = []
@@ -109,6 +110,7 @@ class TestPostures:
         assert min(lowest) > 0.9 and stage.behaviour.mode == 1
         assert math.hypot(*stage.pose().as_tuple()[:2]) < 0.1
 
+    @pytest.mark.slow
     def test_it_sits_ignores_velocities_and_rises(self, stage: Stage) -> None:
         assert stage.ask(1009) == (0, "")
         stage.run(2.0)
@@ -120,6 +122,7 @@ class TestPostures:
         stage.run(1.5)
         assert stage.behaviour.mode == 1 and abs(stage.tilt[1]) < 0.1
 
+    @pytest.mark.slow
     def test_it_lies_down_from_a_sit(self, stage: Stage) -> None:
         stage.ask(1009)
         stage.run(2.0)
@@ -127,6 +130,7 @@ class TestPostures:
         stage.run(4.0)
         assert stage.behaviour.mode == 5
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("axis", "angle"), [("x", 0.4), ("z", -0.4)])
     def test_euler_turns_the_body_and_zero_turns_it_back(self, stage: Stage, axis: str, angle: float) -> None:
         before = stage.tilt
@@ -139,6 +143,7 @@ class TestPostures:
         stage.run(1.5)
         assert np.allclose(stage.tilt, before, atol=0.1)
 
+    @pytest.mark.slow
     def test_a_velocity_ends_a_turned_body_and_is_obeyed(self, stage: Stage) -> None:
         stage.ask(1007, x=0.3, y=0, z=0)
         stage.run(1.5)
@@ -146,6 +151,7 @@ class TestPostures:
         stage.run(2.5, lambda: stage.ask(1008, x=0.5, y=0, z=0))
         assert stage.pose().x_m - where.x_m > 0.4
 
+    @pytest.mark.slow
     def test_one_velocity_that_ends_a_turned_body_moves_nothing_after_its_second(self, stage: Stage) -> None:
         stage.ask(1007, x=0.3, y=0, z=0)
         stage.run(1.5)
@@ -153,6 +159,7 @@ class TestPostures:
         stage.run(1.0)
         assert stage.behaviour.commanded == (0.0, 0.0, 0.0)
 
+    @pytest.mark.slow
     def test_a_pose_keeps_its_mode_however_it_is_turned_until_it_is_ended(self, stage: Stage) -> None:
         stage.ask(1028, data=True)
         stage.run(1.5)

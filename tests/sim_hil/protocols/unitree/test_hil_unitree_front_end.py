@@ -19,6 +19,8 @@ from sim_hil.simulation.physics import Simulation
 from tests.support.processes import wait_for
 from tests.support.robot.front_end_contract import FrontEndContract, Report, Rig, options
 
+pytestmark = pytest.mark.process
+
 
 class UnitreeClient:
     """A client of the sport service that shares the front end's participant: DDS allows one a process."""

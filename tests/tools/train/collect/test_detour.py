@@ -12,6 +12,8 @@ from tests.support.train.training_scenarios import all_scenarios, scenarios
 from tools.train.collect.detour import Detour, draw_detour, wrong_opening
 from tools.train.scenes.scenarios import Scenario
 
+pytestmark = pytest.mark.slow
+
 DRAWS = 12
 
 

@@ -249,6 +249,7 @@ def test_a_look_smaller_than_the_policys_picture_is_refused() -> None:
         CameraSettings(64)
 
 
+@pytest.mark.slow
 def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_frame() -> None:
     lingering = _drive(_expert_command, linger_s=6.0)
     pose = lingering.arrays["pose"]
@@ -258,6 +259,7 @@ def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_fra
     assert np.max(np.hypot(*lingering.arrays["future"][-10, :, :2].T)) < 0.3
 
 
+@pytest.mark.slow
 def test_on_a_detour_it_leaves_its_way_and_the_label_is_what_brings_it_back() -> None:
     aside = _drive(_expert_command, detour=Detour((1.3, 0.5), 3.5, 1.0), timeout_s=60.0)
     by, pose = aside.arrays["by"], aside.arrays["pose"]

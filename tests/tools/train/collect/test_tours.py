@@ -29,7 +29,6 @@ from tools.train.run.job import QuietProgress
 from tools.train.samples.anchors import Anchor
 from tools.train.samples.mirror import Joined, Seconds, SecondsDataset, Views
 from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.trace_sentences import TURN_BACK, stop
 
 STRAIGHT = np.stack((np.arange(0, 8, 0.1), np.zeros(80)), axis=1)
 
@@ -57,6 +56,7 @@ def with_a_detour(tour_world: TourWorld) -> Recorded:
     return _tour(tour_world, scenarios("office")[0], TourConfig(stray_share=1.0))
 
 
+@pytest.mark.slow
 def test_it_begins_where_the_episode_does_and_stays_where_it_arrives(straight_there: Recorded) -> None:
     episode, pose = scenarios("office")[0].episode, straight_there.arrays["pose"]
     assert tuple(pose[0]) == pytest.approx(episode.start)
@@ -65,18 +65,21 @@ def test_it_begins_where_the_episode_does_and_stays_where_it_arrives(straight_th
     assert np.max(np.hypot(*straight_there.arrays["plan_xy"][-1].T)) < 0.3
 
 
+@pytest.mark.slow
 def test_it_moves_no_faster_than_a_policy_may_and_only_where_the_robot_fits(straight_there: Recorded) -> None:
     scenario, pose = scenarios("office")[0], straight_there.arrays["pose"]
     assert np.max(np.hypot(*np.diff(pose[:, :2], axis=0).T)) <= 0.08 + 1e-9
     assert all(scenario.site.robot_grid(scenario.episode.robot).is_free(x, y) for x, y, _ in pose)
 
 
+@pytest.mark.slow
 def test_whole_seconds_have_pictures_and_a_trace_and_nothing_in_between_has(straight_there: Recorded) -> None:
     lengths = np.diff(straight_there.arrays["jpeg_end"], prepend=0)
     assert np.array_equal(lengths > 0, np.arange(len(lengths)) % 10 == 0)
     assert len(straight_there.traces) == np.sum(lengths > 0)
 
 
+@pytest.mark.slow
 def test_the_waypoint_of_three_seconds_lies_on_the_way_ahead(straight_there: Recorded) -> None:
     path = np.array(scenarios("office")[0].task.path)
     dense = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(path)])
@@ -87,6 +90,7 @@ def test_the_waypoint_of_three_seconds_lies_on_the_way_ahead(straight_there: Rec
     assert np.median(gaps) < 0.6
 
 
+@pytest.mark.slow
 def test_it_goes_off_the_way_and_comes_back_to_it(straight_there: Recorded, with_a_detour: Recorded) -> None:
     progress, goal = progress_of(scenarios("office")[0]), scenarios("office")[0].episode.goal_xy
 
@@ -97,17 +101,20 @@ def test_it_goes_off_the_way_and_comes_back_to_it(straight_there: Recorded, with
     assert hypot(*(with_a_detour.arrays["pose"][-1, :2] - np.array(goal))) < 1.05
 
 
+@pytest.mark.slow
 def test_it_says_turn_back_where_the_way_on_lies_behind_it(with_a_detour: Recorded) -> None:
     plans = with_a_detour.arrays["plan_xy"][::10, 0]
     behind = np.abs(np.arctan2(plans[:, 1], plans[:, 0])) > 2.0
-    says = np.array([trace["plan"] == TURN_BACK for trace in with_a_detour.traces])
+    says = np.array([trace["plan"] == "turn back" for trace in with_a_detour.traces])
     assert behind.any() and says[behind].all() and not says.all()
 
 
+@pytest.mark.slow
 def test_where_it_has_arrived_it_says_to_stop(straight_there: Recorded) -> None:
-    assert straight_there.traces[-1]["plan"] == stop(0.0)
+    assert straight_there.traces[-1]["plan"] == "stop now"
 
 
+@pytest.mark.slow
 def test_nobody_begins_where_it_does(tour_world: TourWorld) -> None:
     for scenario in scenarios("office"):
         tour_world.fill(scenario.episode)
@@ -115,6 +122,7 @@ def test_nobody_begins_where_it_does(tour_world: TourWorld) -> None:
         assert gaps.min() > 2.0
 
 
+@pytest.mark.slow
 def test_other_numbers_make_other_tours_and_more_of_them_the_same(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive("a", 40)])
     config = CollectConfig(kinds={"corridor": 1.0}, jobs=1)
@@ -128,6 +136,7 @@ def test_other_numbers_make_other_tours_and_more_of_them_the_same(tmp_path: Path
     assert made(linger_s=1.0).folder != two.folder
 
 
+@pytest.mark.slow
 def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
     config = CollectConfig(kinds={"warehouse": 1.0}, jobs=1)
     numbers = TourConfig(count=1, per_layout=1, people_most=0)
@@ -146,6 +155,7 @@ def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
     assert not len(build_tours(same, numbers, config, 3, ranks=SINGLE, progress=QuietProgress()))
 
 
+@pytest.mark.slow
 def test_the_same_numbers_give_the_same_tour(straight_there: Recorded) -> None:
     with closing(TourWorld(scenarios("office")[0].site, 10)) as fresh:
         again = _tour(fresh, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
@@ -174,6 +184,7 @@ def test_a_halted_body_comes_to_rest() -> None:
     assert gone == body.speed_mps == 0.0
 
 
+@pytest.mark.slow
 def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) -> None:
     (tmp_path / "drives").mkdir()
     config = CollectConfig(kinds={"corridor": 1.0})

@@ -41,6 +41,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return trained(tmp_path_factory.mktemp("whole"))
 
 
+@pytest.mark.slow
 def test_it_learns_to_see_better_than_whoever_does_not_look(tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, epochs=25, look_steps=25, optim=OptimConfig(lr=5e-3, warmup_steps=0))
     _, lines, result = trained(tmp_path, config=config)
@@ -68,6 +69,7 @@ def test_its_log_has_a_line_a_step_and_looks_at_held_out_pictures(whole: Run) ->
     assert whole.result["steps"] == STEPS and whole.result["pictures"] == 40
 
 
+@pytest.mark.slow
 def test_the_result_names_the_encoder_that_was_left(tmp_path: Path) -> None:
     weights, _, result = trained(tmp_path)
     network = build(tiny_model(), 1)

@@ -74,7 +74,7 @@ def test_held_out_layouts_are_never_learned_from_however_often_one_is_tried_agai
 
 
 def test_no_layout_is_the_benchmarks_or_one_that_drives_are_recorded_in() -> None:
-    highest = scenarios.RESERVED_BELOW + (scenarios.MAX_SEED + 1) * scenarios._LAYOUT_TRIES * scenarios._GROUPS
+    highest = scenarios.RESERVED_BELOW + (scenarios.MAX_SEED + 1) * scenarios.LAYOUT_TRIES * scenarios.GROUPS
     for seed in (0, 1, 999, 2**31 - 1):
         for shard in plan(FramesConfig(count=3_000, held=500), seed, 8):
             assert shard.layout_seed >= FIRST_LAYOUT > highest and not is_reserved(shard.layout_seed)
@@ -137,6 +137,7 @@ def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, object]) -> Non
         FramesConfig(**wrong)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_what_processes_have_made_can_be_read_as_one_list(filled: Path, shards: list[Shard]) -> None:
     frames = FrameSet(filled, shards)
     assert len(frames) == 24
@@ -149,6 +150,7 @@ def test_what_processes_have_made_can_be_read_as_one_list(filled: Path, shards: 
         frames.picture(24)
 
 
+@pytest.mark.slow
 def test_pictures_show_people_and_landmarks(filled: Path, shards: list[Shard]) -> None:
     labels = FrameSet(filled, shards).labels
     assert (labels["rank"] == LANDMARK).any()
@@ -156,6 +158,7 @@ def test_pictures_show_people_and_landmarks(filled: Path, shards: list[Shard]) -
     assert (labels["thing"] == PERSON).any()
 
 
+@pytest.mark.slow
 def test_the_same_shard_comes_out_alike_in_another_process(filled: Path, shards: list[Shard], tmp_path: Path) -> None:
     assert list(render(tmp_path, shards[0]))[-1] == 12
     name = shards[0].name
@@ -163,6 +166,7 @@ def test_the_same_shard_comes_out_alike_in_another_process(filled: Path, shards:
     assert made(tmp_path, shards[0]) == made(filled, shards[0])
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_made_again(filled: Path, shards: list[Shard]) -> None:
     stamps = [path_of(filled, shard.name).stat().st_mtime_ns for shard in shards]
     fill(filled, shards, 2, QuietProgress(), never)

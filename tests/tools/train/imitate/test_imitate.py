@@ -61,6 +61,7 @@ def run_of(dataset: Dataset, job: StageJob) -> Run:
     return Run(network.state_dict(), list(job.run_dir.lines()), result)
 
 
+@pytest.mark.slow
 def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_path: Path, dataset: Dataset) -> None:
     job = imitate_job(tmp_path, LONG)
     _, result = trained(dataset, job)
@@ -118,6 +119,7 @@ VARIANTS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "config"), VARIANTS, ids=[str({**a, **b})[:60] for a, b in VARIANTS])
 def test_every_variant_of_the_paper_can_be_trained(
     tmp_path: Path, dataset: Dataset, model: dict[str, Any], config: dict[str, Any], monkeypatch: pytest.MonkeyPatch
@@ -133,6 +135,7 @@ def test_every_variant_of_the_paper_can_be_trained(
     assert not torch.equal(network.action.state_dict()["queries"], before["queries"])
 
 
+@pytest.mark.slow
 def test_a_devices_profile_says_under_which_ages_is_trained(tmp_path: Path, dataset: Dataset) -> None:
     path = tmp_path / "orin.json"
     path.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
@@ -141,6 +144,7 @@ def test_a_devices_profile_says_under_which_ages_is_trained(tmp_path: Path, data
     assert result["mean_age_s"] == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 def test_the_point_goal_baseline_learns_from_where_the_goal_is(tmp_path: Path, dataset: Dataset) -> None:
     config = dataclasses.replace(LONG, policy=POINT_GOAL)
     job = imitate_job(tmp_path, config)
@@ -162,6 +166,7 @@ def test_drives_without_states_cannot_be_learned_from(tmp_path: Path, dataset: D
         fit(job, policy, dataset, MadeUpTokens(), Nobody(dataset), of="test")
 
 
+@pytest.mark.slow
 def test_the_stage_reads_the_runs_drives_and_goes_on_after_a_round_of_dagger(tmp_path: Path) -> None:
     side_dataset(tmp_path / "collect")
     config = dataclasses.replace(CONFIG, samples=16, evaluate=ImitateEvalConfig(samples=4, batch=4))
@@ -178,6 +183,7 @@ def test_the_stage_reads_the_runs_drives_and_goes_on_after_a_round_of_dagger(tmp
     assert 0 < (after[name] - before[name]).abs().max() < 4e-3
 
 
+@pytest.mark.slow
 def test_imitation_goes_on_with_the_language_model_that_has_gone_on(tmp_path: Path) -> None:
     side_dataset(tmp_path / "collect")
     config = dataclasses.replace(CONFIG, samples=16, evaluate=ImitateEvalConfig(samples=4, batch=4))
@@ -193,6 +199,7 @@ def load(path: Path) -> dict[str, torch.Tensor]:
     return load_file(path)
 
 
+@pytest.mark.slow
 def test_the_point_goal_stage_leaves_its_own_weights(tmp_path: Path) -> None:
     side_dataset(tmp_path / "collect")
     config = dataclasses.replace(CONFIG, policy=POINT_GOAL, samples=16)

@@ -112,6 +112,7 @@ def test_a_policy_loses_by_others_words_what_it_had_by_its_own(samples: Samples)
     assert result["all"]["other_words"]["fde_m"]["3s"] > 0.05
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers_and_picture(samples: Samples, tmp_path: Path) -> None:
     def result(seed: int) -> dict[str, Any]:
         return evaluate(lambda batch: batch.target + 0.1, samples, FEW, seed=seed, device=CPU)

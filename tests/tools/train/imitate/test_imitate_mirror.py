@@ -73,6 +73,7 @@ class MirroredSeconds:
         return np.broadcast_to(np.arange(13, dtype=np.float16)[:, None, None], (13, 4, 32))
 
 
+@pytest.mark.slow
 def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dataset: Dataset) -> None:
     plain = [DriveFrames.of(drive, 30, EVEN.weights) for drive in dataset.drives(dataset.train)]
     reflected = MirroredDrives.of(dataset).drives(dataset.train, pictures=False)
@@ -112,6 +113,7 @@ def test_other_frames_of_the_mirror_have_no_tokens() -> None:
         MirrorTokens(MirroredSeconds()).frames("left-a")[15]
 
 
+@pytest.mark.slow
 def test_a_run_learns_from_the_mirror_if_it_is_told_to(tmp_path: Path) -> None:
     losses = []
     for share in (0.0, 0.5):

@@ -211,6 +211,7 @@ def adopted(run_dir: RunDir, tmp_path: Path, after: str) -> list[str]:
     return [step.name for step in steps_of("all", NEWEST) if not is_done(run_dir, step)]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_the_weights_that_imitation_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
     left = adopted(run_dir, tmp_path, "imitate")
     assert left == ["dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate"]
@@ -471,6 +472,7 @@ def test_the_card_of_an_ablation_says_that_it_is_one_of_another_run(trained: Run
     assert "--from" not in card(trained, TINY, trained.model_path)
 
 
+@pytest.mark.slow
 def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
     first = ship(trained, TINY, tmp_path / "weights")
     for number, after in enumerate(("imitate", "imitate-1")):

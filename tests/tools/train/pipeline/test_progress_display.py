@@ -25,6 +25,7 @@ def run_dir(tmp_path: Path) -> RunDir:
     return RunDir.open(tmp_path / "run", TINY)
 
 
+@pytest.mark.slow
 def test_curves_are_drawn_of_every_stage_that_has_more_than_a_point(run_dir: RunDir) -> None:
     for step in range(200):
         run_dir.log("sft", step, loss=100.0 / (1 + step), lr=1e-3, val_loss=5.0)

@@ -152,6 +152,7 @@ class _Recorder:
         """Nothing."""
 
 
+@pytest.mark.slow
 def test_a_policy_receives_the_time_to_the_nanosecond() -> None:
     episode = corridor_episode(timeout_s=1.2)
     scenario: Any = SimpleNamespace(

@@ -142,6 +142,7 @@ def _train(updates: int, config: PpoConfig) -> tuple[_OneNumber, list[float]]:
     return learner, seen
 
 
+@pytest.mark.slow
 def test_ppo_finds_the_action_that_pays() -> None:
     learner, seen = _train(40, PpoConfig(action_lr=0.02, value_lr=0.02, entropy=0.0))
     assert learner.mean.detach().tolist() == pytest.approx([0.7, 0.7], abs=0.1)

@@ -15,7 +15,7 @@ import torch
 from edge.inference.latency_profile import LatencyProfile
 from export.model.network import TicVla
 from export.model.weights import WeightsInfo, save_weights
-from tests.tools.train.rl.test_rl_tail import LIMITS, _config, _episode, _network
+from tests.tools.train.rl.test_rl_tail import LIMITS, tiny_config, tiny_episode, tiny_network
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import PpoConfig, RlConfig
 from tools.train.rl import rollout
@@ -33,13 +33,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _job(out: Path, config: RlConfig, *, resume: bool = False, stop: StopFlag | None = None) -> StageJob:
-    recipe = Recipe("test", 0, _config(), rl=config)
+    recipe = Recipe("test", 0, tiny_config(), rl=config)
     out.mkdir(parents=True, exist_ok=True)
     return StageJob(recipe, RunDir(out), resume=resume, seed=7, stop=stop or StopFlag())
 
 
 def _imitated(job: StageJob) -> Path:
-    return finish_network(job, "imitate", _network())
+    return finish_network(job, "imitate", tiny_network())
 
 
 FINAL = {"final-start": -1, "final-best": -2}
@@ -57,7 +57,7 @@ def _driver(network: TicVla, success: Callable[[int], bool], stop: tuple[StopFla
         folder = Path(order.out)
         folder.mkdir(parents=True, exist_ok=True)
         iteration = FINAL.get(folder.name) or int(folder.name.split("-")[-1])
-        steps, end = _episode(network, 8, order.seed % 97, reward=0.3)
+        steps, end = tiny_episode(network, 8, order.seed % 97, reward=0.3)
         if not order.explore:
             end = rollout.EpisodeEnd(**{**vars(end), "success": success(iteration)})
         rollout.save(folder / "0.safetensors", [(steps, end)])
@@ -69,26 +69,27 @@ def _driver(network: TicVla, success: Callable[[int], bool], stop: tuple[StopFla
 def _improved(out: Path, config: RlConfig, drive: Any, *, resume: bool = False) -> tuple[TicVla, dict[str, Any]]:
     job = _job(out, config, resume=resume)
     before = _imitated(job)
-    network = _network()
+    network = tiny_network()
     learner = TailLearner(network, LIMITS, config.log_std)
     return network, improve(job, learner, before, out / "artifacts", drive)
 
 
 def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
-    _, result = _improved(tmp_path, config, _driver(_network(), lambda _: True))
+    _, result = _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
     lines = [line for line in RunDir(tmp_path).lines() if line["stage"] == STAGE]
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
     assert ["eval_success" in line for line in lines] == [False, True, False, True]
     assert result["iterations"] == 4 and result["steps"] == 32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("last", "gained"), [(True, 1.0), (False, 0.0)])
 def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
     last: bool, gained: float, tmp_path: Path
 ) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
-    driver = _driver(_network(), lambda k: k == 2 or (last and k == 4))
+    driver = _driver(tiny_network(), lambda k: k == 2 or (last and k == 4))
 
     def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
         driven = driver(order, **options)
@@ -105,13 +106,14 @@ def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
     assert [end["success"] for end in ends] == [last] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ended", [4, 9])  # in between, and before the last call: the best on fresh scenarios
 def test_a_run_that_was_ended_goes_on_exactly(ended: int, tmp_path: Path) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=1, ppo=PPO, fall_back=1.0)
-    whole, result = _improved(tmp_path / "whole", config, _driver(_network(), lambda k: k in (4, -2)))
+    whole, result = _improved(tmp_path / "whole", config, _driver(tiny_network(), lambda k: k in (4, -2)))
     with pytest.raises(KeyboardInterrupt):
-        _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k in (4, -2), (StopFlag(), ended)))
-    parts, again = _improved(tmp_path / "parts", config, _driver(_network(), lambda k: k in (4, -2)), resume=True)
+        _improved(tmp_path / "parts", config, _driver(tiny_network(), lambda k: k in (4, -2), (StopFlag(), ended)))
+    parts, again = _improved(tmp_path / "parts", config, _driver(tiny_network(), lambda k: k in (4, -2)), resume=True)
     assert again == result and result["kept"] == "best"
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, parts.state_dict()[name]), name
@@ -119,9 +121,9 @@ def test_a_run_that_was_ended_goes_on_exactly(ended: int, tmp_path: Path) -> Non
 
 def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
-    network, result = _improved(tmp_path, config, _driver(_network(), lambda k: k == 0))
+    network, result = _improved(tmp_path, config, _driver(tiny_network(), lambda k: k == 0))
     assert result["best"] == result["before"]
-    began = _network().state_dict()
+    began = tiny_network().state_dict()
     tails = [name for name in began if name.startswith(("action.layers.2.", "action.head.", "action.out."))]
     assert tails and all(torch.equal(network.state_dict()[name], began[name]) for name in tails)
     (last,) = [line for line in RunDir(tmp_path).lines() if line["step"] == 2]
@@ -130,7 +132,7 @@ def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
 
 def test_a_reset_policy_has_a_new_optimiser(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig(ppo=PPO))
-    state = State(job, TailLearner(_network(), LIMITS, (-1.0, -1.0)), RlConfig(ppo=PPO, fall_back=0.1))
+    state = State(job, TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), RlConfig(ppo=PPO, fall_back=0.1))
     state.best = Score(0.8, 0.1, 0.5)
     state.begin()
     before = state.optimiser
@@ -140,7 +142,7 @@ def test_a_reset_policy_has_a_new_optimiser(tmp_path: Path) -> None:
 
 def test_a_gain_below_the_margin_is_ignored(tmp_path: Path) -> None:
     config = RlConfig(ppo=PPO, keep_margin=0.06)
-    state = State(_job(tmp_path, config), TailLearner(_network(), LIMITS, (-1.0, -1.0)), config)
+    state = State(_job(tmp_path, config), TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), config)
     state.best = Score(0.5, 0.2, 0.4)
     state.begin()
     state.judge(Score(0.55, 0.0, 0.5))
@@ -156,13 +158,14 @@ def test_success_counts_first_and_collisions_where_it_is_no_less() -> None:
     assert not some.ahead_of(some)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fresh", "kept"), [((-2,), "best"), ((-1,), "start"), ((-1, -2), "start"), ((), "start")])
 def test_the_best_is_kept_only_if_it_is_ahead_on_fresh_scenarios(
     fresh: tuple[int, ...], kept: str, tmp_path: Path
 ) -> None:
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
-    network, result = _improved(tmp_path, config, _driver(_network(), lambda k: k == 2 or k in fresh))
-    began, now = _network().state_dict(), network.state_dict()
+    network, result = _improved(tmp_path, config, _driver(tiny_network(), lambda k: k == 2 or k in fresh))
+    began, now = tiny_network().state_dict(), network.state_dict()
     same = all(torch.equal(now[name], began[name]) for name in began if name.startswith("action."))
     assert result["kept"] == kept and same == (kept == "start")
     assert set(result["final"]) == {"start", "best"}
@@ -170,7 +173,7 @@ def test_the_best_is_kept_only_if_it_is_ahead_on_fresh_scenarios(
 
 def test_evaluation_and_final_scenarios_differ_and_spread_over_layouts(tmp_path: Path) -> None:
     orders: list[RolloutOrder] = []
-    driver = _driver(_network(), lambda k: k == 2)
+    driver = _driver(tiny_network(), lambda k: k == 2)
 
     def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
         orders.append(order)
@@ -187,16 +190,16 @@ def test_evaluation_and_final_scenarios_differ_and_spread_over_layouts(tmp_path:
 
 def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> None:
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
-    _improved(tmp_path, config, _driver(_network(), lambda _: True))
+    _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
     other = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, reward_scale=0.5)
-    job = StageJob(Recipe("test", 0, _config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
+    job = StageJob(Recipe("test", 0, tiny_config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
     with pytest.raises(RlError, match="another recipe"):
         improve(
             job,
-            TailLearner(_network(), LIMITS, other.log_std),
+            TailLearner(tiny_network(), LIMITS, other.log_std),
             tmp_path / "imitate" / "model.safetensors",
             tmp_path,
-            _driver(_network(), bool),
+            _driver(tiny_network(), bool),
         )
 
 
@@ -205,7 +208,7 @@ def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Pat
     (tmp_path / "orin.json").write_text(json.dumps(profile.as_json()))
     config = RlConfig(iterations=1, warmup_iterations=0, ppo=PPO, delay_profile=str(tmp_path / "orin.json"))
     received: list[LatencyProfile] = []
-    driver = _driver(_network(), lambda _: True)
+    driver = _driver(tiny_network(), lambda _: True)
 
     def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
         received.append(RolloutOrder.of_json(json.loads(json.dumps(order.to_json()))).delays)
@@ -217,7 +220,7 @@ def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Pat
 
 def test_progress_is_shown_after_every_episode(tmp_path: Path) -> None:
     config = RlConfig(iterations=1, episodes=4, evaluate_episodes=2, warmup_iterations=0, ppo=PPO)
-    driver = _driver(_network(), lambda _: True)
+    driver = _driver(tiny_network(), lambda _: True)
     progress = Mock()
 
     def drive(order: RolloutOrder, *, finished: Callable[[bool], None], **others: Any) -> rollout.Rollout:
@@ -226,7 +229,7 @@ def test_progress_is_shown_after_every_episode(tmp_path: Path) -> None:
         return driver(order, **others)
 
     job = replace(_job(tmp_path, config), progress=progress)
-    learner = TailLearner(_network(), LIMITS, config.log_std)
+    learner = TailLearner(tiny_network(), LIMITS, config.log_std)
     improve(job, learner, _imitated(job), tmp_path / "artifacts", drive)
     updates = [call.args for call in progress.update.call_args_list]
     assert [(done, of) for done, of in updates if of == 4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
@@ -239,14 +242,14 @@ def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
 
 def test_an_untrained_action_expert_is_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
-    finish_network(job, "sft", _network())
+    finish_network(job, "sft", tiny_network())
     with pytest.raises(RlError, match=r"sft/model.safetensors: the action expert is untrained"):
         run(job)
 
 
 def test_start_weights_with_an_untrained_action_expert_are_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
-    save_weights(_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
+    save_weights(tiny_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
     with pytest.raises(RlError, match="is untrained"):
         run(job)
 

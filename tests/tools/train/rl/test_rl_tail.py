@@ -36,13 +36,13 @@ LIMITS = CommandLimits(1.0, 1.0)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def _config() -> TicVlaConfig:
+def tiny_config() -> TicVlaConfig:
     tiny = tiny_model()
     return dataclasses.replace(tiny, action=dataclasses.replace(tiny.action, layers=3))
 
 
-def _network(seed: int = 0) -> TicVla:
-    network = build(_config(), seed).eval()
+def tiny_network(seed: int = 0) -> TicVla:
+    network = build(tiny_config(), seed).eval()
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():  # away from a head that says the same whatever it sees
         network.action.out.weight.normal_(0.0, 0.05, generator=generator)
@@ -59,7 +59,7 @@ def _whole(network: TicVla, visual: torch.Tensor, state: torch.Tensor, latency: 
 
 
 def test_prefix_and_tail_are_the_whole_expert() -> None:
-    network = _network()
+    network = tiny_network()
     c = network.config
     visual, kv = _random(1, c.vision.tokens, c.vision.token_dim), _random(1, 11, c.kv_dim, seed=2)
     state, latency = _random(1, 3, seed=3), _random(1, 4, seed=4)
@@ -71,7 +71,7 @@ def test_prefix_and_tail_are_the_whole_expert() -> None:
 
 
 def test_padding_changes_nothing() -> None:
-    network = _network()
+    network = tiny_network()
     c, expert = network.config, network.action
     visual = _random(2, c.vision.tokens, c.vision.token_dim)
     state, latency = _random(2, 3, seed=3), _random(2, 4, seed=4)
@@ -86,7 +86,7 @@ def test_padding_changes_nothing() -> None:
 
 
 def test_the_last_layer_and_the_head_alone_are_trained() -> None:
-    network = _network()
+    network = tiny_network()
     freeze_all_but_tail(network.action)
     trained = {name for name, each in network.action.named_parameters() if each.requires_grad}
     assert trained == set(tail_parameters(network.action))
@@ -94,7 +94,7 @@ def test_the_last_layer_and_the_head_alone_are_trained() -> None:
 
 
 def test_another_networks_tail_is_refused() -> None:
-    network = _network()
+    network = tiny_network()
     tensors = {name: each.detach().clone() for name, each in tail_parameters(network.action).items()}
     load_tail(network.action, tensors)
     tensors.pop("out.bias")
@@ -103,13 +103,13 @@ def test_another_networks_tail_is_refused() -> None:
 
 
 def test_an_expert_guided_by_waypoints_is_refused() -> None:
-    tiny = _config()
+    tiny = tiny_config()
     config = dataclasses.replace(tiny, action=dataclasses.replace(tiny.action, semantic_interface="waypoints"))
     with pytest.raises(ActionTailError, match="waypoints"):
         check_tail(build(config, 0).action)
 
 
-def _episode(network: TicVla, steps: int, seed: int, *, reward: float = 0.1) -> tuple[EpisodeSteps, EpisodeEnd]:
+def tiny_episode(network: TicVla, steps: int, seed: int, *, reward: float = 0.1) -> tuple[EpisodeSteps, EpisodeEnd]:
     """Made-up steps whose frozen parts are the network's own; two generations of different lengths."""
     c, expert = network.config, network.action
     kept = EpisodeSteps()
@@ -134,19 +134,19 @@ def _episode(network: TicVla, steps: int, seed: int, *, reward: float = 0.1) -> 
 
 def _rollout(network: TicVla, folder: Path) -> rollout.Rollout:
     empty = EpisodeSteps(), EpisodeEnd("none", "office", 0, 0, "stuck", False, False, False, 0.0, 0.0, 15.0)
-    rollout.save(folder / "0.safetensors", [_episode(network, 6, 1), empty])
-    rollout.save(folder / "1.safetensors", [_episode(network, 4, 2)])
+    rollout.save(folder / "0.safetensors", [tiny_episode(network, 6, 1), empty])
+    rollout.save(folder / "1.safetensors", [tiny_episode(network, 4, 2)])
     return rollout.read([folder / "0.safetensors", folder / "1.safetensors"])
 
 
 def test_a_rollout_is_read_as_it_was_driven(tmp_path: Path) -> None:
-    network = _network()
+    network = tiny_network()
     found = _rollout(network, tmp_path)
     assert [end.id for end in found.ends] == ["e1", "none", "e2"]
     assert [(steps.start, steps.stop, number) for steps, number, _ in found.episodes()] == [(0, 6, 0), (6, 10, 1)]
     assert found.arrays["generation"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3]
     assert [len(each) for each in found.semantic] == [4, 7, 4, 7]
-    assert np.array_equal(found.arrays["visual"][6], _episode(network, 4, 2)[0].visual[0])
+    assert np.array_equal(found.arrays["visual"][6], tiny_episode(network, 4, 2)[0].visual[0])
 
 
 def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
 
 
 def test_the_learner_commands_what_the_whole_expert_would(tmp_path: Path) -> None:
-    network = _network()
+    network = tiny_network()
     learner = TailLearner(network, LIMITS, (-1.0, -1.0))
     found = _rollout(network, tmp_path)
     learner.take(found)
@@ -174,7 +174,7 @@ def test_the_learner_commands_what_the_whole_expert_would(tmp_path: Path) -> Non
 
 
 def test_an_update_moves_the_tail_and_the_value_and_nothing_else(tmp_path: Path) -> None:
-    network = _network()
+    network = tiny_network()
     before = {name: each.detach().clone() for name, each in network.named_parameters()}
     learner = TailLearner(network, LIMITS, (-1.0, -1.0))
     learner.take(_rollout(network, tmp_path))
@@ -189,7 +189,7 @@ def test_an_update_moves_the_tail_and_the_value_and_nothing_else(tmp_path: Path)
 
 
 def test_a_penalty_on_leaving_the_imitated_commands_is_zero_where_nothing_has_moved(tmp_path: Path) -> None:
-    network = _network()
+    network = tiny_network()
     learner = TailLearner(network, LIMITS, (-1.0, -1.0), imitation=1.0)
     learner.take(_rollout(network, tmp_path))
     assert float(learner.act(torch.arange(4))[2].detach()) == 0.0
@@ -199,7 +199,7 @@ def test_a_penalty_on_leaving_the_imitated_commands_is_zero_where_nothing_has_mo
 
 
 def test_a_plan_that_leaves_beyond_the_limits_pays_though_its_command_is_the_same(tmp_path: Path) -> None:
-    network = _network()
+    network = tiny_network()
     with torch.no_grad():  # straight ahead, faster than the robot can
         network.action.out.weight.zero_()
         network.action.out.bias.copy_(torch.tensor([0.3, 0.0, 0.0]).repeat(len(network.action.out.bias) // 3))

@@ -34,6 +34,7 @@ def _rl(out: Path, weights: Path, *more: str) -> int:
     return cli.main(["rl", "--preset", "tiny", "--out", str(out), *start, *settings, *more])
 
 
+@pytest.mark.slow
 def test_an_iteration_drives_learns_and_is_evaluated(tmp_path: Path, weights: Path) -> None:
     run_dir = RunDir(tmp_path / "run")
     assert _rl(run_dir.out, weights) == EXIT_DONE
@@ -44,6 +45,7 @@ def test_an_iteration_drives_learns_and_is_evaluated(tmp_path: Path, weights: Pa
     assert run_dir.model_path.is_file() and [line["step"] for line in run_dir.lines()] == [1]
 
 
+@pytest.mark.slow
 def test_a_point_goal_policy_that_has_learned_nothing_is_not_handed_over(
     tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

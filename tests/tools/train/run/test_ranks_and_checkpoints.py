@@ -316,6 +316,7 @@ def codes(ended: list[tuple[int, str]]) -> list[int]:
     return [code for code, _ in ended]
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     alone = train_ranks.train(SINGLE)
     assert codes(two_ranks("tests.support.train.train_ranks", str(tmp_path))) == [0, 0]
@@ -324,6 +325,7 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     assert together[0] == pytest.approx(alone, rel=1e-4) and alone[-1] < alone[0]
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_the_others_alone(tmp_path: Path) -> None:
     assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "done")) == [0, 0]
     steps = ["collect", "encoder", "sft", "imitate", "dagger", "sft", "imitate", "rl", "evaluate"]
@@ -335,6 +337,7 @@ def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_th
     assert (tmp_path / "run" / "imitate-0").is_dir() and (tmp_path / "run" / "evaluate" / "result.json").is_file()
 
 
+@pytest.mark.slow
 def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_path: Path) -> None:
     assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
     before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
@@ -344,6 +347,7 @@ def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_pa
     assert (tmp_path / "1.txt").read_text().split().count("encoder") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", ["collect", "dagger", "set-up"])
 def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tmp_path: Path, failing: str) -> None:
     line = f"{failing} has failed"
@@ -357,6 +361,7 @@ def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tm
     assert "Traceback" not in said + heard
 
 
+@pytest.mark.slow
 def test_run_as_a_module_it_says_what_is_wrong_in_one_line() -> None:
     command = [sys.executable, "-m", "tools.train.cli", "all", "--preset", "nope", "--out", "never"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)

@@ -10,7 +10,7 @@ import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
-from edge.motion.guidance import waypoints_now
+from edge.state.semantic import waypoints_now
 from export.model.config import TicVlaConfig
 from export.model.network import build
 from export.model.tokenizers.nano import NANO_TOKENIZER
@@ -188,6 +188,7 @@ def chance_of_frames(samples: Samples, count: int) -> np.ndarray:
     return seen / seen.sum()
 
 
+@pytest.mark.slow
 def test_every_frame_with_a_label_is_drawn_as_often_whatever_its_age_may_be(dataset: Dataset) -> None:
     samples = of(dataset, SampleConfig(group=8, standing_start=0.5, weights=EVEN))
     seen = chance_of_frames(samples, 4000)

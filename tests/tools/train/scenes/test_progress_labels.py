@@ -54,6 +54,7 @@ def test_whoever_takes_the_kth_opening_has_passed_k_less_one(kind: str, way) -> 
             assert before[-1].passed == max(0, step.ordinal - 1), scenario.episode.id
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [_told_way, _expert_way])
 def test_progress_never_falls_back_along_the_way(way) -> None:  # type: ignore[no-untyped-def]
     for scenario in all_scenarios():
@@ -134,6 +135,7 @@ def test_the_next_turn_is_as_far_as_the_way_to_it() -> None:
         assert progress.next_step(SE2(*scenario.task.start)) is first
 
 
+@pytest.mark.slow
 def test_on_the_way_nobody_has_strayed() -> None:
     for scenario in all_scenarios():
         progress = progress_of(scenario)

@@ -37,6 +37,7 @@ def _content(scene: Scene) -> str:
 # -- apart from the benchmark ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_training_scene_has_the_content_of_a_benchmark_scene() -> None:
     held = {_content(load_scene(name)) for name in {episode.scene for episode in SUITE}}
     assert not held & {_content(scenario.scene) for scenario in all_scenarios()}
@@ -48,6 +49,7 @@ def test_a_scene_of_other_content_but_the_same_walls_would_be_noticed() -> None:
     assert _content(hospital) != _content(replace(hospital, objects=hospital.objects[1:]))
 
 
+@pytest.mark.slow
 def test_no_layout_seed_is_reserved_for_the_benchmark() -> None:
     assert all(scenario.layout_seed >= 100 for scenario in all_scenarios())
     assert not {scenario.layout_seed for scenario in all_scenarios()} & set(BENCHMARK_SEEDS.values())

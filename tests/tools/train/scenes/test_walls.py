@@ -63,6 +63,7 @@ def around(walls: Walls, k: int = 30) -> tuple[torch.Tensor, torch.Tensor]:
 KNOWN = torch.ones(1, 30, dtype=torch.bool)
 
 
+@pytest.mark.slow
 @given(k=st.integers(0, 129), heading=st.floats(-1.2, 1.2), metres=st.floats(0.1, 3.0))
 def test_room_is_what_the_scene_leaves_before_and_behind_the_robot(
     walls: Walls, grid: NavGrid, k: int, heading: float, metres: float
@@ -95,6 +96,7 @@ def test_a_plan_into_a_wall_is_pushed_out_of_it(walls: Walls) -> None:
     assert after.min() > before.min()
 
 
+@pytest.mark.slow
 @given(heading=st.floats(-1.2, 1.2), metres=st.floats(0.1, 3.0))
 def test_what_the_expert_does_costs_nothing(walls: Walls, heading: float, metres: float) -> None:
     plan = straight(heading, metres)
@@ -189,6 +191,7 @@ def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(t
     assert len(plans_into_walls(into, unknown)) == 0
 
 
+@pytest.mark.slow
 def test_imitation_tells_how_often_plans_lead_into_walls(tmp_path: Path) -> None:
     held = side_drive("left-v", VAL_LAYOUT, scene=f"office-{VAL_LAYOUT}")
     held = dataclasses.replace(held, pose=held.pose * (1.0, 0.3, 1.0) + np.array((20.5, 7.0, 0.0)))

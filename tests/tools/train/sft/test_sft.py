@@ -63,6 +63,7 @@ def run_of(dataset: Dataset, job: StageJob) -> Run:
     return Run(network.state_dict(), list(job.run_dir.lines()), result)
 
 
+@pytest.mark.slow
 def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Path, dataset: Dataset) -> None:
     job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=12, optim=OptimConfig(lr=1e-2, warmup_steps=0)))
     _, result = trained(dataset, job)
@@ -74,6 +75,7 @@ def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Pat
     assert held[-1] < 0.7 * held[0]
 
 
+@pytest.mark.slow
 def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
     whole: Run,
 ) -> None:
@@ -128,6 +130,7 @@ def test_the_stage_reads_the_runs_drives_and_leaves_the_runs_network(tmp_path: P
     assert (tmp_path / "sft" / "model.safetensors").read_bytes() == job.run_dir.model_path.read_bytes()
 
 
+@pytest.mark.slow
 def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
     silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
@@ -139,6 +142,7 @@ def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> 
     assert 0 < (after[name] - before[name]).abs().max() < steps * CONFIG.optim.lr * 0.1
 
 
+@pytest.mark.slow
 def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
     write_dataset(tmp_path / "collect", [drive_along(scenarios("corridor")[0]), made_up_drive("b")])
     silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
@@ -174,6 +178,7 @@ def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
     assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
 
 
+@pytest.mark.slow
 def test_after_a_round_of_dagger_a_share_of_the_tours_is_learned_again_and_none_is_made(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
     silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
@@ -203,6 +208,7 @@ def test_the_recipes_numbers_are_checked() -> None:
         SftConfig(batch=0)
 
 
+@pytest.mark.slow
 def test_tours_are_made_and_learned_from_beside_the_drives(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
     silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)

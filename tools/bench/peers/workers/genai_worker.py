@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import onnxruntime_genai as genai
+from numpy.typing import NDArray
 
 from tools.bench.peers.workers.serve import Load, Task, language_task, serve
 from tools.bench.peers.workload import DECODE_STEPS, Workload
@@ -26,7 +27,7 @@ class Decoder:
         self._params.set_search_options(do_sample=False, max_length=workload.semantic_tokens + 8)
         self._generator: genai.Generator | None = None
 
-    def prefill(self, ids: np.ndarray) -> int:
+    def prefill(self, ids: NDArray[np.int64]) -> int:
         """Start over with a prompt [S]; returns the next token."""
         self._generator = genai.Generator(self._model, self._params)
         self._generator.append_tokens(ids.astype(np.int32))

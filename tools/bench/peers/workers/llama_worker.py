@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import llama_cpp as llama
 import numpy as np
+from numpy.typing import NDArray
 
 from tools.bench.peers.workers.serve import Load, Task, language_task, serve
 from tools.bench.peers.workload import DECODE_STEPS, Workload
@@ -46,14 +47,14 @@ class Decoder:
             raise RuntimeError("llama.cpp cannot make a context")
         self._vocab = workload.config.language.vocab
 
-    def _decode(self, ids: np.ndarray) -> int:
+    def _decode(self, ids: NDArray[np.int64]) -> int:
         tokens = (ctypes.c_int32 * len(ids))(*ids.tolist())
         if llama.llama_decode(self._context, llama.llama_batch_get_one(tokens, len(ids))):
             raise RuntimeError("llama_decode failed")
         logits = llama.llama_get_logits_ith(self._context, -1)
         return int(np.ctypeslib.as_array(logits, shape=(self._vocab,)).argmax())
 
-    def prefill(self, ids: np.ndarray) -> int:
+    def prefill(self, ids: NDArray[np.int64]) -> int:
         """Start over with a prompt [S]; returns the next token."""
         llama.llama_memory_clear(llama.llama_get_memory(self._context), True)
         return self._decode(ids)

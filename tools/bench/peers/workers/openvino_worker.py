@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import openvino as ov
+from numpy.typing import NDArray
 
 from tools.bench.peers.workers.serve import Load, Task, action_task, encoder_task, language_task, serve, tick_task
 from tools.bench.peers.workload import DECODE_STEPS, Workload
@@ -20,7 +21,7 @@ class Decoder:
         self._request = compiled.create_infer_request()
         self._length = 0
 
-    def _infer(self, ids: np.ndarray) -> int:
+    def _infer(self, ids: NDArray[np.int64]) -> int:
         new = ids.shape[1]
         self._length += new
         feeds: dict[str, Any] = {
@@ -32,7 +33,7 @@ class Decoder:
         self._request.infer(feeds, share_inputs=True, share_outputs=True)
         return int(self._request.get_output_tensor(0).data[0, -1].argmax())
 
-    def prefill(self, ids: np.ndarray) -> int:
+    def prefill(self, ids: NDArray[np.int64]) -> int:
         """Start over with a prompt [1, S]; returns the next token."""
         self._request.reset_state()
         self._length = 0

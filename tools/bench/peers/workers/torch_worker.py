@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from transformers import DynamicCache, Qwen2ForCausalLM
 
@@ -44,7 +45,7 @@ class Decoder:
             out = self._model(input_ids=ids, past_key_values=self._cache, use_cache=True, logits_to_keep=1)
         return int(out.logits[0, -1].argmax())
 
-    def prefill(self, ids: np.ndarray) -> int:
+    def prefill(self, ids: NDArray[np.int64]) -> int:
         """Start over with a prompt [1, S]; returns the next token."""
         self._cache = DynamicCache(config=self._model.config)
         return self._next(torch.from_numpy(ids))

@@ -19,7 +19,7 @@ from firmware_bridge.unitree.rpc import RpcClient
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
 from sim_hil.protocols.unitree.services.leases import APPLY
 from sim_hil.protocols.unitree.state import OdometryFrame, sport_mode_state
-from tests.process.stop_rig import L2, REST_MPS, B, HostStall, Peer, Rig, report
+from tests.process.bridge.stop_rig import L2, REST_MPS, B, HostStall, Peer, Rig, report
 from tests.support.processes import Running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2, standing
 
@@ -28,6 +28,8 @@ Series = dict[str, list[float]]
 REPETITIONS = pytest.mark.parametrize(
     "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
 )
+
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture(scope="module")

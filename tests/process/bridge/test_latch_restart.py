@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.process.stop_rig import L2, B, HostStall, Rig
+from tests.process.bridge.stop_rig import L2, B, HostStall, Rig
 from tests.support.processes import Running, check_stop_latency, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
+
+pytestmark = pytest.mark.process
 
 MANY = 20
 
