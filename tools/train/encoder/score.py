@@ -81,28 +81,28 @@ class Score:
         self._pairs: dict[str, list[NDArray[np.float32]]] = {}
         self._pictures = 0
 
-    def add(self, said: Arrays, labels: Arrays) -> None:
+    def add(self, found: Arrays, labels: Arrays) -> None:
         """Add predictions and labels of some images, arrays [n, ...]."""
         self._pictures += len(labels["thing"])
         thing, rank = labels["thing"], labels["rank"]
-        np.add.at(self._confusion, (thing.ravel(), said["thing"].ravel()), 1)
-        right = said["thing"] == thing
-        self._share("main_accuracy", said["main"] == labels["main"])
+        np.add.at(self._confusion, (thing.ravel(), found["thing"].ravel()), 1)
+        right = found["thing"] == thing
+        self._share("main_accuracy", found["main"] == labels["main"])
         self._share("landmark_recall", right[rank == LANDMARK])
         self._share("door_recall", right[rank == DOOR])
-        self._share("colour_accuracy", (said["colour"] == labels["colour"])[labels["colour"] != NONE])
-        self._share("place_accuracy", said["place"] == labels["place"])
-        turned = (said["facing"].astype(int) - labels["facing"].astype(int)) % OCTANTS
+        self._share("colour_accuracy", (found["colour"] == labels["colour"])[labels["colour"] != NONE])
+        self._share("place_accuracy", found["place"] == labels["place"])
+        turned = (found["facing"].astype(int) - labels["facing"].astype(int)) % OCTANTS
         self._share("facing_within_octant", np.isin(turned, (0, 1, OCTANTS - 1))[labels["facing"] != NONE])
-        opens, told = labels["open_kind"] > 0, said["open_kind"] > 0
-        self._share("opening_recall", told[opens])
-        self._share("opening_precision", opens[told])
-        self._share("opening_kind_accuracy", (said["open_kind"] == labels["open_kind"])[opens])
-        self._share("landmark_bearing", _bearings(said["share"], thing, rank))
-        self._pair("near", said["near_m"], labels["near_m"])
-        self._pair("thing", said["thing_m"][rank > BACKGROUND], labels["thing_m"][rank > BACKGROUND])
-        self._pair("free", said["free_m"], labels["free_m"])
-        self._pair("open", said["open_m"][opens], labels["open_m"][opens])
+        opens, predicted = labels["open_kind"] > 0, found["open_kind"] > 0
+        self._share("opening_recall", predicted[opens])
+        self._share("opening_precision", opens[predicted])
+        self._share("opening_kind_accuracy", (found["open_kind"] == labels["open_kind"])[opens])
+        self._share("landmark_bearing", _bearings(found["share"], thing, rank))
+        self._pair("near", found["near_m"], labels["near_m"])
+        self._pair("thing", found["thing_m"][rank > BACKGROUND], labels["thing_m"][rank > BACKGROUND])
+        self._pair("free", found["free_m"], labels["free_m"])
+        self._pair("open", found["open_m"][opens], labels["open_m"][opens])
 
     def result(self) -> dict[str, Any]:
         """Return shares from 0 to 1 and distances in m; None for scores without cases."""
@@ -121,8 +121,8 @@ class Score:
             if self._confusion[c].sum() >= _LEAST_CELLS
         }
         for name, bins in (("near", _NEAR_BINS), ("thing", _NEAR_BINS), ("free", _FREE_BINS), ("open", _FREE_BINS)):
-            said, true = self._distances(name)
-            off = np.abs(said - true)
+            predicted, true = self._distances(name)
+            off = np.abs(predicted - true)
             found[f"{name}_relative_error"] = float(np.median(off / np.maximum(true, 0.1))) if len(true) else None
             found[f"{name}_error_m"] = {
                 (f"{low:g}+" if isinf(high) else f"{low:g}-{high:g}"): float(off[inside].mean())
@@ -136,8 +136,8 @@ class Score:
         counts[0] += int(right.sum())
         counts[1] += int(right.size)
 
-    def _pair(self, name: str, said: NDArray[Any], true: NDArray[Any]) -> None:
-        both = np.stack((said.ravel(), true.ravel())).astype(np.float32)
+    def _pair(self, name: str, predicted: NDArray[Any], true: NDArray[Any]) -> None:
+        both = np.stack((predicted.ravel(), true.ravel())).astype(np.float32)
         self._pairs.setdefault(name, []).append(both)
 
     def _distances(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -154,8 +154,8 @@ def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> N
         named = ranks == LANDMARK
         for kind in np.unique(kinds[named]):
             true = np.flatnonzero((named & (kinds == kind)).any(axis=0))
-            said = int(one[..., kind].argmax()) % side
-            hits.append(bool(np.abs(angles[true] - angles[said]).min() <= BEARING_RAD))
+            best = int(one[..., kind].argmax()) % side
+            hits.append(bool(np.abs(angles[true] - angles[best]).min() <= BEARING_RAD))
     return np.array(hits, bool)
 
 

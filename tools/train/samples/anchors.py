@@ -114,8 +114,8 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
     memory, seen = PathMemory(), 0
     found: list[Anchor] = []
     earlier: list[Progress] = []
-    said = [Progress(**trace["progress"]) for trace in drive.traces]
-    last = len(said) - 1
+    labels = [Progress(**trace["progress"]) for trace in drive.traces]
+    last = len(labels) - 1
     for number, trace in enumerate(drive.traces):
         k = int(trace["k"])
         if k >= len(drive):
@@ -123,7 +123,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         while seen <= k:
             memory.put(seen * _NS // RATE_HZ, drive.T_odom_base(seen))
             seen += 1
-        earlier.append(said[number])
+        earlier.append(labels[number])
         if k % every:
             continue
         near = [i if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1)]
@@ -143,7 +143,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 earlier=tuple(earlier),
                 around=tuple(None if i is None else _points(drive, i) for i in near),
                 moved=tuple(None if i is None else _from(drive.T_odom_base(i), T_odom_base) for i in near),
-                decides=turns_back or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
+                decides=turns_back or labels[max(0, number - _NEAR)] != labels[min(number + _NEAR, last)],
             )
         )
     return found
@@ -221,14 +221,14 @@ def confused(progress: Progress) -> list[Progress | None]:
         others.append(Progress(step - 1, steps, 0))
     if not progress.is_last_leg and passed > 0:
         others.append(Progress(step, steps, passed - 1))
-    for told in (steps - 1, steps + 1):
-        if 0 <= told <= MAX_COUNT:
-            at = min(step, told + 1)
-            others.append(Progress(at, told, passed if at == step <= told else 0))
+    for other in (steps - 1, steps + 1):
+        if 0 <= other <= MAX_COUNT:
+            at = min(step, other + 1)
+            others.append(Progress(at, other, passed if at == step <= other else 0))
     return others
 
 
-def told_points(anchor: Anchor) -> str:
+def waypoint_line(anchor: Anchor) -> str:
     """Format the waypoint line."""
     return format_waypoints(anchor.points)
 
@@ -264,8 +264,8 @@ class Prompts:
 
     def of(self, anchor: Anchor, drawn: Drawn) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return (prompt, answer) ids. Raises ValueError if they exceed the model's context."""
-        said = told_points(anchor)[len(WAYPOINTS_START) :] if drawn.waypoints_only else format_text(anchor.reasoning)
-        prompt, answer = self.prompt(anchor, drawn), self.answer(said)
+        text = waypoint_line(anchor)[len(WAYPOINTS_START) :] if drawn.waypoints_only else format_text(anchor.reasoning)
+        prompt, answer = self.prompt(anchor, drawn), self.answer(text)
         if len(prompt) + len(answer) > self._most:
             raise ValueError(
                 f"drive {anchor.drive_id}, frame {anchor.k}: prompt of {len(prompt)} and answer of {len(answer)} "

@@ -150,8 +150,8 @@ def _batch(
     image_id, device = language.config.img_context_id, language.embed.weight.device
     batch = collate(rows, img_context_id=image_id, device=device)
     if wanted[0].own:
-        said = decode(language, batch, max_new_tokens)
-        states, texts = [each.last_layer_kv for each in said], [each.ids for each in said]
+        decoded = decode(language, batch, max_new_tokens)
+        states, texts = [each.last_layer_kv for each in decoded], [each.ids for each in decoded]
     else:
         # The end token of an answer is not fed: a generation stops before it.
         kv = run(language, batch.input_ids, batch.visual_tokens, None).last_layer_kv

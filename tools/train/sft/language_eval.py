@@ -57,10 +57,10 @@ class Score:
         if true_side is not None:
             found["sides"] += 1
             found["side right"] += side_of(answer) == true_side
-        said, there = landmarks_of(answer), landmarks_of(anchor.reasoning)
-        found["landmarks said"] += said.total()
-        found["landmarks there"] += there.total()
-        found["landmarks right"] += (said & there).total()
+        found_names, true_names = landmarks_of(answer), landmarks_of(anchor.reasoning)
+        found["landmarks said"] += found_names.total()
+        found["landmarks there"] += true_names.total()
+        found["landmarks right"] += (found_names & true_names).total()
         if waypoints is not None:
             pairs = zip(waypoints, anchor.points, strict=True)
             self._errors_m.append([hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs])
@@ -185,8 +185,8 @@ class Speaker:
                 device=language.embed.weight.device,
             )
             answers = decode(language, batch, self._config.max_new_tokens, [constraints[i] for i in chosen])
-            for i, said in zip(chosen, answers, strict=True):
-                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
+            for i, decoded in zip(chosen, answers, strict=True):
+                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(decoded.ids)
         return texts
 
 

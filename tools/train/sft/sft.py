@@ -380,7 +380,9 @@ class _State:
             return {}
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
-            raise SftError(f"{self._path}: checkpoint of other data, encoder or recipe; delete it to start again")
+            raise SftError(
+                f"{self._path}: checkpoint of other data, another encoder or another recipe; delete it to start again"
+            )
         self._network.language.load_state_dict(checkpoint.under("language", tensors))
         self._optimiser.restore(tensors)
         self._rewind(int(meta["step"]))

@@ -184,7 +184,7 @@ def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir,
 
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
     path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    with pytest.raises(NetworkFileError, match="language is not the recipe's"):
+    with pytest.raises(NetworkFileError, match="language differs from the recipe's"):
         read_network(path, with_overrides(TINY.model, {"language.layers": "2"}), 9)
     path.write_bytes(b"nothing")
     with pytest.raises(NetworkFileError, match="not weights of edge-train"):

@@ -85,7 +85,7 @@ def test_links_among_their_files_are_followed(run_dir: RunDir, theirs: Dataset) 
 
 def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
     theirs.path("b").write_bytes(b"half")
-    with pytest.raises(DriveError, match="not the file that the index lists"):
+    with pytest.raises(DriveError, match="differs from the indexed file"):
         take_drives(run_dir, theirs.folder)
     assert not run_dir.begun("collect")
 
