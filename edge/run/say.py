@@ -75,9 +75,10 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
         code = operate(STOP, *bridges)[0] if bridges else EXIT_REFUSED
         answer = None if asking is None else _stop_answer(asking, path)
     runners = None if answer is None else Path(str(answer.get("bridge")))
-    if runners is not None and (code != EXIT_DONE or runners not in bridges) and bridge in (None, runners):
-        # The runner names its bridge: what is known of that one alone decides.
-        code = operate(STOP, runners)[0]
+    if runners is not None and (code != EXIT_DONE or runners not in bridges):
+        # The runner names its bridge: it decides, together with a bridge that the user named.
+        runners_code = operate(STOP, runners)[0]
+        code = runners_code if bridge is None else max(code, runners_code)
     if code == EXIT_DONE and (bridge is not None or runners is not None):
         sys.stdout.write("stopped: the bridge confirms it; before the robot moves again: `edge-bridge arm`, new run\n")
         return EXIT_DONE
