@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
 from sim_hil.benchmark.language.openings import opening_class
-from sim_hil.benchmark.language.route import Step, Told
+from sim_hil.benchmark.language.route import RouteDescription, Step
 
 _TURN = "(?:turn|go|head|bear)"
 _CORRIDOR = "(?:(?:main|cross|back) aisle|corridor|hallway|hall|passage|aisle|row|sidewalk|pavement)"
@@ -103,7 +103,7 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     )
 
 
-def untrue(text: str, told: Told) -> list[str]:
+def untrue(text: str, told: RouteDescription) -> list[str]:
     """Return the false or missing claims of an instruction about a route, one line each; empty if it is correct."""
     try:
         claims = read(text)
@@ -167,7 +167,7 @@ def _counted_as(kind: str) -> str:
     return "passage" if kind == "sidewalk" else opening_class(kind)
 
 
-def _wrong_pass(claim: Claim, told: Told, steps: list[Step], taken: int) -> list[str]:
+def _wrong_pass(claim: Claim, told: RouteDescription, steps: list[Step], taken: int) -> list[str]:
     """Check that a landmark is passed on the next segment, or on one that continues straight from it."""
     stretches = [told.passed] if taken >= len(steps) else [steps[taken].passed]
     index = told.steps.index(steps[taken]) if taken < len(steps) else len(told.steps)

@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
-from sim_hil.benchmark.language.route import Passed, Step, Told
+from sim_hil.benchmark.language.route import Passed, RouteDescription, Step
 
 HELD_OUT_SHARE = 0.2  # share of the sentence patterns that is reserved for the benchmark
 MAX_WORDS = 60  # maximum length of a wording, for small language models
@@ -45,7 +45,7 @@ class _Writer:
         return bool(self.rng.uniform() < share)
 
 
-def wordings(told: Told, count: int, seed: int, *, held_out: bool) -> list[str]:
+def wordings(told: RouteDescription, count: int, seed: int, *, held_out: bool) -> list[str]:
     """Return `count` different wordings of a route, from the benchmark's patterns (`held_out`) or training's.
 
     Deterministic per seed. Raises WordingError if the grammar does not yield enough.
@@ -80,7 +80,7 @@ def is_held_out(text: str) -> bool:
     return int.from_bytes(digest[:4], "big") < HELD_OUT_SHARE * 2**32
 
 
-def _compose(w: _Writer, told: Told) -> str:
+def _compose(w: _Writer, told: RouteDescription) -> str:
     clauses = _steps(w, told)
     goal = told.goal_bare if w.chance(0.5) else told.goal_name
     style = w.pick("route", "route", "route", "goal", "short")
@@ -160,7 +160,7 @@ def _pass(w: _Writer, thing: Passed) -> str:
     )  # fmt: skip
 
 
-def _last_leg(w: _Writer, told: Told) -> list[str]:
+def _last_leg(w: _Writer, told: RouteDescription) -> list[str]:
     """Return the clauses about the route after the last turn."""
     out = []
     if told.passed and w.chance(0.35):
@@ -174,7 +174,7 @@ def _last_leg(w: _Writer, told: Told) -> list[str]:
     return out
 
 
-def _stop(w: _Writer, told: Told, goal: str) -> str:
+def _stop(w: _Writer, told: RouteDescription, goal: str) -> str:
     side = ""
     if told.goal_side in ("left", "right") and w.chance(0.4):
         side = w.pick(f" on your {told.goal_side}", f" on the {told.goal_side}")
@@ -188,7 +188,7 @@ def _stop(w: _Writer, told: Told, goal: str) -> str:
     )  # fmt: skip
 
 
-def _steps(w: _Writer, told: Told) -> list[str]:
+def _steps(w: _Writer, told: RouteDescription) -> list[str]:
     out: list[str] = []
     for index, step in enumerate(told.steps):
         leave = index == 0 and told.leaves_room

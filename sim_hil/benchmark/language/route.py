@@ -71,7 +71,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Told:
+class RouteDescription:
     """Description of a route: steps, then the goal; `goal_side`: left, right, ahead, or "" if not mentioned."""
 
     steps: tuple[Step, ...]
@@ -104,7 +104,7 @@ class _Leg:
     kind: str
 
 
-def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> Told:
+def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> RouteDescription:
     """Describe a path to a landmark; `grid`: any grid of the scene. Raises RouteError if that is not possible."""
     runs = _runs(scene, path)
     legs = _legs(runs)
@@ -115,7 +115,7 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
     linear = last.kind in LINEAR
     length = sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(path))
     last_m = hypot(last.end[0] - last.start[0], last.end[1] - last.start[1])
-    return Told(
+    return RouteDescription(
         steps=tuple(_without(step, goal.label) for step in steps),
         goal_label=goal.label,
         goal_name=goal.landmark,

@@ -9,7 +9,7 @@ from math import atan2, degrees, hypot, pi
 import numpy as np
 
 from sim_hil.benchmark.language.instruction_reading import read
-from sim_hil.benchmark.language.route import Passed, Told
+from sim_hil.benchmark.language.route import Passed, RouteDescription
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, Vec2
@@ -38,7 +38,7 @@ def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
     return poses
 
 
-def named_landmarks(texts: Sequence[str], told: Told) -> tuple[str, ...]:
+def named_landmarks(texts: Sequence[str], told: RouteDescription) -> tuple[str, ...]:
     """Return the labels of the landmarks named in any of the texts: first the goal, then in order of the route."""
     names = {claim.name for text in texts for claim in read(text) if claim.name}
     along: list[Passed] = []
@@ -87,7 +87,7 @@ def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
     return float(np.maximum(worst, 0.0))
 
 
-def wrong_bends(told: Told, path: Sequence[Vec2]) -> list[str]:
+def wrong_bends(told: RouteDescription, path: Sequence[Vec2]) -> list[str]:
     """Return the described turns at which the path does not bend to that side.
 
     Turns onto a plaza or a yard are not checked, because the path may cross their open borders diagonally.

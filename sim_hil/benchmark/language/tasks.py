@@ -10,7 +10,7 @@ from math import atan2, cos, hypot, pi, sin
 import numpy as np
 
 from sim_hil.benchmark.language.openings import LINEAR, bounds_of
-from sim_hil.benchmark.language.route import RouteError, Told, tell
+from sim_hil.benchmark.language.route import RouteDescription, RouteError, tell
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Vec2, Vec3
 
@@ -33,7 +33,7 @@ class Task:
     goal: Vec2
     goal_label: str
     path: tuple[Vec2, ...]
-    told: Told
+    told: RouteDescription
 
 
 def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
