@@ -39,6 +39,7 @@ from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
 from edge.run.reasoning_loop import Mode
 from edge.run.session import RunSession
+from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.unitree.dds import DdsError
@@ -109,7 +110,19 @@ def parser() -> argparse.ArgumentParser:
         help="take further instructions at this local socket while it drives (edge-say TEXT --to PATH)",
     )
     p.add_argument(
-        "--no-stay", action="store_true", help="go on by the plan also where its answers have placed the stop"
+        "--decoding",
+        choices=[each.value for each in Decoding],
+        help="free: greedy, as in the paper; constrained: within rules (default: the manifest's; usually constrained)",
+    )
+    p.add_argument(
+        "--recovery",
+        choices=[each.value for each in RecoverySwitch],
+        help="off: only the plan moves the robot (default: the manifest's; usually on)",
+    )
+    p.add_argument(
+        "--stay",
+        action=argparse.BooleanOptionalAction,
+        help="stand where the texts have placed the stop (default: with --recovery on)",
     )
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
@@ -137,9 +150,16 @@ def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
         release_delay=parse_release_delay(args.release_delay),
         record=args.record,
         instructions=args.instructions,
-        stays=not args.no_stay,
+        switches=_switches(args),
     )
     return robot, options
+
+
+def _switches(args: argparse.Namespace) -> SwitchOptions:
+    try:
+        return SwitchOptions.parse(args.decoding, args.recovery, args.stay)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 @command_line("edge-run")

@@ -23,6 +23,7 @@ from edge.artifacts.files import (
 from edge.artifacts.provider_options import wrong_option
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
+from edge.state.switches import Decoding, RecoverySwitch
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 LANGUAGE_WHOLE = ("language_model",)
@@ -40,6 +41,7 @@ _POSITIVE = frozenset(
     }
 )
 
+_SWITCHES: Mapping[str, type[Decoding | RecoverySwitch]] = {"decoding": Decoding, "recovery": RecoverySwitch}
 _LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
 
 
@@ -118,6 +120,9 @@ class RuntimeConfig:
     reasoning_cores: tuple[int, ...]
     control_priority: int
     """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
+    decoding: Decoding = Decoding.CONSTRAINED
+    recovery: RecoverySwitch = RecoverySwitch.ON
+    """Switches that are in force unless a command's options say otherwise; older manifests lack them."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -300,10 +305,10 @@ def _session(graph: str, entry: Any) -> SessionConfig:
 
 def _runtime(section: dict[str, Any]) -> RuntimeConfig:
     fields = RuntimeConfig.__dataclass_fields__
-    if set(section) != set(fields):
+    if not set(fields) - set(_SWITCHES) <= set(section) <= set(fields):
         raise ArtifactError(f"{MANIFEST_NAME}: runtime has {sorted(section)}, expected {sorted(fields)}")
     lists = {key: section[key] for key in _LISTS}
-    numbers = {key: value for key, value in section.items() if key not in lists}
+    numbers = {key: value for key, value in section.items() if key not in (*lists, *_SWITCHES)}
     if not all(isinstance(values, list) and len(values) <= 1024 for values in lists.values()) or not all(
         isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6
         for v in [*numbers.values(), *(v for values in lists.values() for v in values)]
@@ -311,7 +316,16 @@ def _runtime(section: dict[str, Any]) -> RuntimeConfig:
         raise ArtifactError(f"{MANIFEST_NAME}: runtime values must be numbers that are not negative")
     values: dict[str, Any] = {key: value if key == "step_s" else int(value) for key, value in numbers.items()}
     values |= {key: tuple((float if key == "frame_offsets_s" else int)(v) for v in lists[key]) for key in _LISTS}
-    return RuntimeConfig(**values)
+    return RuntimeConfig(**values, **_switches(section))
+
+
+def _switches(section: Mapping[str, Any]) -> dict[str, Any]:
+    """The switches that a runtime section has; raises ArtifactError."""
+    try:
+        return {key: kind(section[key]) for key, kind in _SWITCHES.items() if key in section}
+    except ValueError as error:
+        known = {key: [each.value for each in kind] for key, kind in _SWITCHES.items()}
+        raise ArtifactError(f"{MANIFEST_NAME}: runtime: {error}; expected {known}") from error
 
 
 def check_contract(artifacts: Artifacts) -> None:

@@ -45,9 +45,12 @@ COMPRESSED_IMAGE: Schema = _record(
 SCHEMAS: Mapping[str, Schema] = {
     "/run": _record(
         "tic_vla.Run",
-        ("limits", "release"),
+        ("limits", "release", "decoding", "recovery", "stand_at_goal"),
         instruction=_TEXT,
         mode=_TEXT,
+        decoding=_TEXT,  # Switches: what was in force
+        recovery=_TEXT,
+        stand_at_goal=_BOOL,
         artifacts=_TEXT,
         manifest_sha256=_TEXT,
         release=_INT_OR_NULL,  # counter of the artifacts' signature

@@ -16,7 +16,7 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
-from edge.reasoning.decoding_rules import Known, TextGuide
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
 from edge.state.reasoning_text import MAX_TEXT_CHARS
 from edge.state.ring import EncodedFrame
@@ -172,9 +172,9 @@ class LanguageModel:
                 f"instruction makes a prompt of {needed} tokens, the model has room for {room}: shorten it"
             )
 
-    def guide(self, known: Known) -> TextGuide:
-        """What holds one generation to what is known before it."""
-        return TextGuide(known, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
+    def constraint(self, context: DecodingContext) -> TextConstraint:
+        """Return what constrains one generation's text to a context."""
+        return TextConstraint(context, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def generate(
         self,
@@ -182,10 +182,10 @@ class LanguageModel:
         *,
         max_new_tokens: int,
         cancelled: Callable[[], bool],
-        guide: TextGuide | None = None,
+        constraint: TextConstraint | None = None,
     ) -> Generation:
         """Run one generation; raises CancelledError between calls, ContextOverflowError for too long a prompt."""
-        return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens, guide=guide)
+        return self.begin(cancelled).finish(segments, max_new_tokens=max_new_tokens, constraint=constraint)
 
     def begin(
         self,
@@ -249,8 +249,10 @@ class GenerationRun:
             self._run(self._model.prefill_call, chunk)
         self._prefill_ns += time.monotonic_ns() - started_ns
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: TextGuide | None = None) -> Generation:
-        """Prefill the rest of the prompt, whose last token is text, and decode greedily what `guide` allows."""
+    def finish(
+        self, segments: Sequence[Segment], *, max_new_tokens: int, constraint: TextConstraint | None = None
+    ) -> Generation:
+        """Prefill the rest of the prompt, whose last token is text, and decode greedily what `constraint` allows."""
         model, runtime = self._model, self._model.runtime
         started_ns = time.monotonic_ns()
         *head, last = self._cut(segments)
@@ -266,12 +268,12 @@ class GenerationRun:
         line_at = 0
         room = runtime.max_context - prompt_tokens
         while len(new_ids) < min(max_new_tokens, room):
-            next_id = next_id if guide is None else guide.choose(next_id)
+            next_id = next_id if constraint is None else constraint.choose(next_id)
             if next_id == runtime.im_end_id:
                 break
             new_ids.append(next_id)
-            if guide is not None and model.text_of([next_id]).endswith("\n"):
-                self._hold_line(guide, new_ids, line_at)
+            if constraint is not None and model.text_of([next_id]).endswith("\n"):
+                self._constrain_line(constraint, new_ids, line_at)
                 line_at = len(new_ids)
             next_id = self._run(model.decode_call, Chunk((new_ids[-1],), None, 0))
         return Generation(
@@ -283,10 +285,10 @@ class GenerationRun:
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
         )
 
-    def _hold_line(self, guide: TextGuide, new_ids: list[int], line_at: int) -> None:
-        """Take a line back that is to be another one, and feed that up to its last token."""
+    def _constrain_line(self, constraint: TextConstraint, new_ids: list[int], line_at: int) -> None:
+        """Replace a complete line that the constraint does not allow, and feed the other one up to its last token."""
         ids = new_ids[line_at:]
-        others = guide.line(self._model.text_of(ids).rstrip("\n"))
+        others = constraint.replace_line(self._model.text_of(ids).rstrip("\n"))
         if others is None:
             return
         differ = (i for i, (token, other) in enumerate(zip(ids, others, strict=False)) if token != other)

@@ -14,8 +14,7 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.graph import Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, TickActivity, run_as
-from edge.motion.guidance import waypoints_now
-from edge.state.semantic import Context, SemanticState
+from edge.state.semantic import Context, SemanticState, waypoints_now
 
 FloatArray = npt.NDArray[np.float32]
 

@@ -13,9 +13,8 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
-from edge.motion.guidance import STRAIGHT_AHEAD
 from edge.state.ring import EncodedFrame
-from edge.state.semantic import SemanticState
+from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 
 COLD_TICKS: Final = 5
 """Pay for first-time allocation."""

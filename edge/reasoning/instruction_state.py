@@ -1,70 +1,141 @@
-"""What is remembered for as long as one instruction is followed: its way, the progress last said, where to stop.
+"""What is remembered while one instruction is followed: the path, the last progress, the next turn, where to stop.
 
-Shared by the reasoning thread and by the benchmark's virtual time, so that both tell the model the same. It is fed from
-the token ring, where every frame has the pose that it was captured at: what is remembered does not depend on how often
-a generation runs.
+Shared by the reasoning thread and by the benchmark's virtual time, so that both give the model the same prompt. It is
+fed from the token ring, where every frame has its pose at capture: what is remembered does not depend on how often a
+generation runs.
 """
 
 from __future__ import annotations
 
+import re
+from collections import deque
 from dataclasses import dataclass, replace
+from statistics import median
+from typing import Final
 
-from edge.core.geometry import SE2
-from edge.reasoning.arrival import Arrival
-from edge.reasoning.decoding_rules import DONE, NOTHING_KNOWN, Known, TextGuide
+from edge.core.geometry import SE2, wrap_angle
+from edge.reasoning.decoding_rules import DONE, DecodingContext, TextConstraint, TurnEstimator
 from edge.reasoning.path_memory import PERIOD_NS, PathMemory, Way
-from edge.reasoning.turn_estimate import TurnMemory
-from edge.state.reasoning_text import parse_progress
+from edge.state.reasoning_text import ReasoningText, Stop, parse_text
 from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.switches import Decoding
 
 MOST_FRAMES = 1 << 16
-"""More than a ring holds."""
+"""More frames than a ring holds."""
+NEAR_M: Final = 4.0
+"""Largest distance of goal and stop in a text that places a stop, m."""
+RECENT_TEXTS: Final = 3
+AGREEING_TEXTS: Final = 2
+"""This many of the RECENT_TEXTS have to place a stop."""
+SAME_HEADING_RAD: Final = 0.7
+"""Stops placed at a heading that differs by more than this, 40°, belong to another place."""
+STOP_NOW_M: Final = 0.5
+"""Distance of "stop now", which is written below 1 m."""
+DROPPING_TEXTS: Final = 5
+CONTRADICTING_TEXTS: Final = 4
+"""This many of the last DROPPING_TEXTS drop the stop when they plan no stop nearby."""
+COLOURS: Final = frozenset(("red", "orange", "yellow", "green", "blue", "purple", "white", "black", "grey", "brown"))
+
+
+class StopEstimator:
+    """Estimates where one instruction's texts plan to stop; for one thread."""
+
+    def __init__(self, instruction: str) -> None:
+        """`instruction` names the goal."""
+        self._words = _words(instruction)
+        self._stops: deque[SE2 | None] = deque(maxlen=RECENT_TEXTS)
+        self._contradicts: deque[bool] = deque(maxlen=DROPPING_TEXTS)
+        self.T_odom_stop: SE2 | None = None
+        """Where to stop, at the robot's heading when it was placed; None while it is unknown."""
+
+    def update(self, text: ReasoningText, T_odom_anchor: SE2) -> None:
+        """Take a complete text, as the model itself chose it, about a frame captured at a pose."""
+        goal_m, stop_m = self._goal_m(text), _stop_m(text)
+        last_leg = text.progress is not None and text.progress.is_last_leg
+        stops = stop_m is not None and stop_m <= NEAR_M and last_leg
+        self._contradicts.append(not stops or (goal_m is not None and goal_m > NEAR_M))
+        counts = stops and goal_m is not None and goal_m <= NEAR_M
+        self._stops.append(T_odom_anchor @ SE2(stop_m, 0.0, 0.0) if counts and stop_m is not None else None)
+        placed = [
+            stop
+            for stop in self._stops
+            if stop is not None and abs(wrap_angle(stop.theta_rad - T_odom_anchor.theta_rad)) <= SAME_HEADING_RAD
+        ]
+        if counts and len(placed) >= AGREEING_TEXTS:
+            x_m, y_m = median(stop.x_m for stop in placed), median(stop.y_m for stop in placed)
+            self.T_odom_stop = SE2(x_m, y_m, T_odom_anchor.theta_rad)
+            self._contradicts.clear()
+        elif sum(self._contradicts) >= CONTRADICTING_TEXTS:
+            self.T_odom_stop = None
+
+    def _goal_m(self, text: ReasoningText) -> float | None:
+        """Distance of the first object in view that the instruction names; None without any."""
+        return next((float(seen.distance_m) for seen in text.objects or () if self._names(seen.name)), None)
+
+    def _names(self, name: str) -> bool:
+        """Whether the instruction has the name's words; a colour that it leaves out need not be there."""
+        words = _words(name)
+        return self._has(words) or (words[0] in COLOURS and self._has(words[1:], uncoloured=True))
+
+    def _has(self, words: tuple[str, ...], *, uncoloured: bool = False) -> bool:
+        count = len(words)
+        return count > 0 and any(
+            self._words[start : start + count] == words
+            and not (uncoloured and start > 0 and self._words[start - 1] in COLOURS)
+            for start in range(len(self._words) - count + 1)
+        )
 
 
 class InstructionMemory:
-    """Way, progress and stop of one instruction; a new instruction gets a new one. For one thread."""
+    """Path, progress, turn and stop of one instruction; a new instruction gets a new memory. For one thread."""
 
-    def __init__(self, from_ns: int | None, instruction: str) -> None:
-        """`from_ns`: the newest frame's stamp when the instruction was given; None: it counts from the first frame."""
+    def __init__(self, from_ns: int | None, instruction: str, decoding: Decoding = Decoding.CONSTRAINED) -> None:
+        """`from_ns`: the newest frame's stamp when the instruction was given; None: the path begins at any frame."""
         self._from_ns = from_ns
+        self._decoding = decoding
         self._path = PathMemory()
-        self._known = NOTHING_KNOWN
-        self._turn = TurnMemory()
-        self._arrival = Arrival(instruction)
+        self._context = DecodingContext()
+        self._turn = TurnEstimator()
+        self._stop = StopEstimator(instruction)
 
     @property
     def stop(self) -> SE2 | None:
-        """T_odom_stop: where what was heard so far means to stop (`edge.reasoning.arrival`)."""
-        return self._arrival.T_odom_stop
+        """T_odom_stop: where the texts so far plan to stop; None while that is unknown."""
+        return self._stop.T_odom_stop
 
-    def known(self, anchor: EncodedFrame) -> Known:
-        """What is known before a generation with this newest frame."""
+    def context(self, anchor: EncodedFrame) -> DecodingContext:
+        """Return what a generation with this newest frame is given, and constrained to."""
+        if self._decoding is Decoding.FREE:
+            return DecodingContext(self._context.before)
         turn = self._turn
-        return replace(self._known, turn=turn.left(anchor.T_odom_base), may_be_done=turn.may_be_done)
+        return replace(
+            self._context, turn=turn.distances(anchor.T_odom_base), turn_may_be_done=turn.may_be_done
+        )  # fmt: skip
 
     def watch(self, ring: TokenRing) -> None:
-        """Take what has come into the ring, at most about once a second: call it more often than the ring is long."""
+        """Take the ring's new poses, at most about once a second; call it more often than the ring is long."""
         newest_ns, seen_ns = ring.newest_ns, self._path.newest_ns
         if newest_ns is not None and (seen_ns is None or newest_ns >= seen_ns + PERIOD_NS):
             self._take(ring, newest_ns)
 
     def way(self, ring: TokenRing, anchor: EncodedFrame) -> Way:
-        """The way until a generation's newest frame, told there; the frames after it are left for the next time."""
+        """Return the path up to a generation's newest frame, in its frame; later frames are left for the next call."""
         self._take(ring, anchor.stamp_ns)
-        # The ring may have forgotten it while it was waited for.
+        # The ring may have dropped it while the generation waited for it.
         self._put(anchor.stamp_ns, anchor.T_odom_base)
         return self._path.way(anchor.T_odom_base)
 
-    def heard(self, text: str, guide: TextGuide, anchor: EncodedFrame) -> None:
-        """Remember what a published generation says of its progress, and of its turn before it was held to it."""
-        self._known = self._known.after(text, guide)
-        progress = parse_progress(text)
-        if guide.plan_said and not guide.overruled:
-            self._arrival.heard(text, progress, anchor.T_odom_base)
-        if progress is None and not guide.plan_said:
-            return  # cut short before it came to that
-        overruled = guide.overruled or not guide.plan_said
-        self._turn.heard(progress, guide.look, anchor, overruled=overruled, claimed=guide.wanted == DONE)
+    def update(self, text: str, constraint: TextConstraint, anchor: EncodedFrame) -> None:
+        """Remember a published text's progress, and the model's own turn and stop."""
+        self._context = self._context.after(text, constraint)
+        parts = parse_text(text)
+        if constraint.has_plan and not constraint.overruled:
+            self._stop.update(parts, anchor.T_odom_base)
+        if parts.progress is None and not constraint.has_plan:
+            return  # the text was cut short before both
+        overruled = constraint.overruled or not constraint.has_plan
+        claimed = constraint.refused == DONE
+        self._turn.update(parts.progress, constraint.turn, anchor, overruled=overruled, claimed=claimed)
 
     def _take(self, ring: TokenRing, until_ns: int) -> None:
         for stamp_ns, T_odom_base in ring.newest(MOST_FRAMES):
@@ -79,8 +150,18 @@ class InstructionMemory:
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be thought about, and what is remembered of it."""
+    """One instruction to reason about, and its memory."""
 
     number: int
     instruction: str
     memory: InstructionMemory
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(re.findall(r"[a-z]+", text.lower()))
+
+
+def _stop_m(text: ReasoningText) -> float | None:
+    """Distance ahead at which a text plans to stop; None for another plan."""
+    action = None if text.plan is None else text.plan.action
+    return float(action.distance_m or STOP_NOW_M) if isinstance(action, Stop) else None

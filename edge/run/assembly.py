@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge.artifacts.manifest import Artifacts
@@ -29,7 +29,8 @@ from edge.safety.pre_arm import PreArm
 from edge.safety.supervisor import Supervisor
 from edge.state.ring import TokenRing
 from edge.state.semantic import SemanticSlot
-from firmware_bridge.core.config import RobotConfig
+from edge.state.switches import Switches, SwitchOptions
+from firmware_bridge.core.config import ConfigError, RobotConfig
 
 FRAME_MAX_AGE_MS = 500.0
 """Fault matrix row 1: zero velocity 500 ms after the camera's last good frame."""
@@ -48,8 +49,16 @@ class RunOptions:
     record: Path | None
     instructions: Path | None = None
     """Where further instructions are taken while it drives."""
-    stays: bool = True
-    """Whether it stands where its answers have placed the stop."""
+    switches: SwitchOptions = field(default_factory=SwitchOptions)
+    """Decoding rules and recoveries that were asked for."""
+
+    def switches_for(self, artifacts: Artifacts) -> Switches:
+        """Return what is in force with these artifacts; the robot stands at the goal by default. Raises ConfigError."""
+        runtime = artifacts.runtime
+        try:
+            return self.switches.over(runtime.decoding, runtime.recovery, stand_at_goal=True)
+        except ValueError as error:
+            raise ConfigError(f"{artifacts.directory}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -89,6 +98,7 @@ def assemble(
     artifacts, runtime = engines.artifacts, engines.artifacts.runtime
     period_ns = runtime.tick_period_ms * 1_000_000
     seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
+    switches = options.switches_for(artifacts)
     slot = SemanticSlot()
     ring = TokenRing(math.ceil(seconds * 1e9 / period_ns), engines.policy.tokens_shape)
     # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
@@ -124,6 +134,7 @@ def assemble(
         recorder=recorder,
         stop=stop,
         mode=options.mode,
+        decoding=switches.decoding,
         budget=power.budget,
         give_way=GiveWay(engines.activity) if engines.schedule.shared else None,
         role=engines.schedule.reasoning,
@@ -166,7 +177,7 @@ def assemble(
         supervisor=Supervisor(),
         on_tick=on_tick,
         offset_covariance=inputs.offset_covariance,
-        stays=options.stays,
+        switches=switches,
     )
     loops.append((control, reasoning))
     pre_arm = PreArm(

@@ -17,10 +17,7 @@ from edge.flightlog.recorder import Recorder
 from edge.inference.graph import GraphError
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan
-from edge.motion.guidance import waypoints_now
-from edge.motion.standstill_recovery import TURNING, Stalemate, StalemateConfig
-from edge.motion.stuck_recovery import BACKING_OFF, BackOff, BackOffConfig
-from edge.reasoning.arrival import ARRIVED, is_there
+from edge.motion.recovery import MOVING, Recovery
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
 from edge.safety.monitors.watch import Watch, WatchConfig
@@ -28,7 +25,8 @@ from edge.safety.supervisor import FaultEvent, State, Supervisor, SupervisorInpu
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.semantic import SemanticSlot, SemanticState, waypoints_now
+from edge.state.switches import Switches
 from firmware_bridge.client import BridgeStatus
 
 BRIDGE_SILENCE_NS = 500_000_000
@@ -68,7 +66,7 @@ class ControlStatistics:
     plans_not_finite: int = 0
     """Of `plans`, those that no robot can be driven by: see `edge.motion.controller.is_plan`."""
     reasons: dict[str, int] = field(default_factory=dict)
-    """Ticks by what decided their velocity: "ok", the reason for zero (ARRIVED among them), BACKING_OFF or TURNING."""
+    """Ticks by what decided their velocity: "ok", the reason for zero, or a recovery's (`edge.motion.recovery`)."""
     faults: dict[str, int] = field(default_factory=dict)
     """How often each fault of the table was raised."""
 
@@ -94,19 +92,16 @@ class ControlLoop:
         supervisor: Supervisor | None = None,
         on_tick: Callable[[bool], None] | None = None,
         offset_covariance: OffsetCovariance | None = None,
-        stays: bool = True,
+        switches: Switches | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise. `stays`: stand
-        where the words have placed the stop.
+        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise.
 
         Without `watch` and `supervisor` the standard ones are used, which know only what the loop itself sees.
         """
         self._policy = policy
         self._controller = controller
-        limits = controller.config.limits
-        self._back_off = BackOff(BackOffConfig(limits.vx_min_mps, limits.wz_max_radps))
-        self._stalemate = Stalemate(StalemateConfig(limits.wz_max_radps))
+        self._recovery = Recovery(switches or Switches(), controller.config.limits)
         self._newest_frame = newest_frame
         self._history = history
         self._ring = ring
@@ -119,7 +114,6 @@ class ControlLoop:
         self._supervisor = supervisor or Supervisor()
         self._on_tick = on_tick
         self._offset_covariance = offset_covariance
-        self._stays = stays
         self.last_seq = 0
         """Sequence number of the last command; arming has used some before the first tick."""
         self._stop = stop
@@ -206,11 +200,14 @@ class ControlLoop:
             hold=self._hold(semantic, pose, acted_ns),
         )
         T_odom_base = None if pose is None else pose.T_odom_base
-        command = self._stalemate.step(
-            self._controller.step(inputs, acted_ns), _meant(semantic, offset), T_odom_base, acted_ns, inputs.speed_scale
+        command = self._recovery.step(
+            self._controller.step(inputs, acted_ns),
+            _leading_waypoints(semantic, offset),
+            T_odom_base,
+            acted_ns,
+            inputs.speed_scale,
         )
-        command = self._back_off.step(command, T_odom_base, acted_ns, inputs.speed_scale)
-        if command.reason in (BACKING_OFF, TURNING):
+        if command.reason in MOVING:
             self._controller.halt(command.reason)  # what comes after it speeds up from standing
         self._send(command)
         end_ns = self._clock()
@@ -302,9 +299,9 @@ class ControlLoop:
         until_ns = self._slot.drive_until_ns
         if until_ns is not None and now_ns >= until_ns:
             return THINKING
-        if not self._stays or semantic is None or pose is None:
+        if semantic is None or pose is None:
             return None
-        return ARRIVED if is_there(semantic.T_odom_stop, pose.T_odom_base) else None
+        return self._recovery.hold(semantic.T_odom_stop, pose.T_odom_base)
 
     def _send(self, command: VelocityCommand) -> None:
         self.last_seq += 1
@@ -354,8 +351,8 @@ class ControlLoop:
         return [[float(v) for v in row] for row in trajectory[every - 1 :: every]]
 
 
-def _meant(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
-    """The waypoints that were said last, [points, 2], m in the robot's frame now; None of words that mean to wait."""
+def _leading_waypoints(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
+    """The last text's waypoints [points, 2], m in the robot's frame now; None for a text that plans to wait."""
     if semantic is None or semantic.waypoints is None or offset is None or semantic.waits:
         return None
     points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]

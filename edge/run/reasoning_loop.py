@@ -17,7 +17,7 @@ from edge.inference.language import ContextOverflowError, Generation, Generation
 from edge.inference.policy import Policy
 from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.reasoning.anchor import Anchor
-from edge.reasoning.decoding_rules import TextGuide
+from edge.reasoning.decoding_rules import TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory, Job
 from edge.reasoning.prompt import told_before
 from edge.reasoning.sync_halt import seen_standing
@@ -25,6 +25,7 @@ from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import Context, SemanticSlot, SemanticState
+from edge.state.switches import Decoding
 
 IDLE_S = 0.02
 FRAME_POLL_S = 0.002
@@ -88,6 +89,7 @@ class ReasoningLoop:
         recorder: Recorder | None,
         stop: threading.Event,
         mode: Mode = Mode.ASYNC,
+        decoding: Decoding = Decoding.CONSTRAINED,
         budget: Callable[[], ReasoningBudget] = lambda: UNLIMITED,
         late_anchor: bool = True,
         give_way: GiveWay | None = None,
@@ -113,7 +115,8 @@ class ReasoningLoop:
         self._role = role or Role("reasoning", niceness=REASONING_NICENESS)
         self._say = say or (lambda _line: None)
         self._clock = clock
-        self._job = Job(0, instruction, InstructionMemory(None, instruction))
+        self._decoding = decoding
+        self._job = Job(0, instruction, InstructionMemory(None, instruction, decoding))
         self._under_way: tuple[Job, Interrupt] | None = None
         self._last_anchor_ns = -1
         self._finished_ns: int | None = None
@@ -162,7 +165,8 @@ class ReasoningLoop:
 
     def submit(self, instruction: str) -> None:
         """Follow this (checked) instruction, its way from here on; the generation under way is ended. Never waits."""
-        self._take_up(Job(self._job.number + 1, instruction, InstructionMemory(self._ring.newest_ns, instruction)))
+        memory = InstructionMemory(self._ring.newest_ns, instruction, self._decoding)
+        self._take_up(Job(self._job.number + 1, instruction, memory))
 
     def cancel(self) -> None:
         """End the generation under way, also within a call; the next one begins with the newest frames."""
@@ -249,22 +253,22 @@ class ReasoningLoop:
         self._last_anchor_ns = anchor.stamp_ns
         cap = self._max_new_tokens if budget.max_new_tokens is None else budget.max_new_tokens
         most = min(self._max_new_tokens, cap)
-        way, known = job.memory.way(self._ring, anchor), job.memory.known(anchor)
-        rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, known.before)]
-        guide = self._language.guide(known)
-        generation = run.finish(rest, max_new_tokens=most, guide=guide)
+        way, context = job.memory.way(self._ring, anchor), job.memory.context(anchor)
+        rest = [prompt.frame(len(frames), anchor, job.instruction), prompt.tail(way, context.before)]
+        constraint = self._language.constraint(context)
+        generation = run.finish(rest, max_new_tokens=most, constraint=constraint)
         if not np.isfinite(generation.last_layer_kv).all():
             raise NotFiniteError("keys and values of the last layer are not finite")
         before_call(self._context_ns)
         context_started_ns = self._clock()
-        context = self._policy.semantic_context(generation.last_layer_kv, interrupt)
+        semantic_context = self._policy.semantic_context(generation.last_layer_kv, interrupt)
         finished_ns = self._finished_ns = self._clock()
         self._context_ns = finished_ns - context_started_ns
         self._rest()
         delay_s = self._release_delay_s()
         self._hold_back(finished_ns + round(delay_s * 1e9), job)
         complete = self._max_new_tokens > 0 and (cap >= self._max_new_tokens or generation.new_tokens < cap)
-        state = self._publish(anchor, generation, context, complete, job, guide)
+        state = self._publish(anchor, generation, semantic_context, complete, job, constraint)
         self.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.anchor_to_ready_ms.add((state.ready_ns - anchor.stamp_ns) / 1e6)
         if self._recorder is not None:
@@ -280,10 +284,10 @@ class ReasoningLoop:
                 "frames_ns": [frame.stamp_ns for frame in frames],
                 "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
                 "way": way,
-                "before": told_before(known.before),
-                **known.record(),
-                "overruled": guide.overruled,
-                "planned": guide.planned,
+                "before": told_before(context.before),
+                **context.record(),
+                "overruled": constraint.overruled,
+                "planned": constraint.planned,
                 "stop": None if state.T_odom_stop is None else state.T_odom_stop.as_tuple(),
                 "max_new_tokens": most,
                 "prompt_tokens": generation.prompt_tokens,
@@ -366,15 +370,16 @@ class ReasoningLoop:
                 raise CancelledError
 
     def _publish(
-        self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool, job: Job, guide: TextGuide
-    ) -> SemanticState:
+        self, anchor: EncodedFrame, generation: Generation, context: Context, complete: bool, job: Job,
+        constraint: TextConstraint,
+    ) -> SemanticState:  # fmt: skip
         waypoints = parse_waypoints(generation.text)
         if complete:
             self.invalid_in_a_row = 0 if waypoints is not None else self.invalid_in_a_row + 1
             self.invalid_texts += waypoints is None
         if waypoints is None and self._policy.guided_by_waypoints:
             raise NoGuidanceError
-        job.memory.heard(generation.text, guide, anchor)
+        job.memory.update(generation.text, constraint, anchor)
         ready_ns = self._clock()
         state = SemanticState(
             generation=self.generations,

@@ -13,6 +13,7 @@ from edge.run.assembly import RunOptions
 from edge.run.control_loop import ControlLoop, ControlStatistics
 from edge.run.reasoning_loop import ReasoningLoop
 from edge.run.robot_inputs import RobotInputs
+from edge.state.switches import Switches
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 
@@ -23,6 +24,7 @@ def run_record(artifacts: Artifacts, robot: RobotConfig, options: RunOptions, st
     return {
         "instruction": options.instruction,
         "mode": options.mode.value,
+        **options.switches_for(artifacts).as_json(),
         "artifacts": str(artifacts.directory),
         "manifest_sha256": artifacts.manifest_sha256,
         "robot": robot.name,
@@ -39,6 +41,7 @@ def run_result(
     reasoning: ReasoningLoop,
     inputs: RobotInputs,
     status: BridgeStatus | None,
+    switches: Switches,
     *,
     power_w: dict[str, Any],
     faults: list[str],
@@ -49,6 +52,7 @@ def run_result(
     if (fault := plan_fault(ticks)) is not None:
         faults = [*faults, fault]
     return {
+        "switches": switches.as_json(),
         "control": {
             "ticks": ticks.ticks,
             "missed": ticks.missed,

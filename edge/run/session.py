@@ -59,7 +59,10 @@ class RunSession:
     def __init__(
         self, artifacts: Artifacts, robot: RobotConfig, options: RunOptions, say: Callable[[str], None]
     ) -> None:
-        """Open the graphs and warm them up. Raises ArtifactError, or InstructionError when the prompt is too long."""
+        """Open the graphs and warm them up.
+
+        Raises ArtifactError, InstructionError for a prompt that is too long, ConfigError for switches that contradict.
+        """
         runtime = artifacts.runtime
         self._artifacts = artifacts
         self._robot = robot
@@ -78,6 +81,7 @@ class RunSession:
                 f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
                 f"writes; run it with {Mode.ASYNC.value} or {Mode.SYNC.value}"
             )
+        options.switches_for(artifacts)
         activity = TickActivity(self._period_ns)
         policy = Policy(artifacts, schedule=self._schedule, activity=activity)
         language = LanguageModel(artifacts, schedule=self._schedule)
@@ -198,6 +202,7 @@ class RunSession:
                 loops.reasoning,
                 inputs,
                 status,
+                self._options.switches_for(self._artifacts),
                 power_w=loops.power.statistics(),
                 faults=list(self._faults),
                 duration_s=(time.monotonic_ns() - started_ns) / 1e9,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.geometry import SE2
-from edge.state.reasoning_text import Waypoints, means_to_wait
+from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints, plans_to_wait
+
+STRAIGHT_AHEAD: Waypoints = tuple((time_s / 2, 0.0) for time_s in WAYPOINT_TIMES_S)
+"""Waypoints at 0.5 m/s: what graphs are warmed up and timed with."""
 
 Context = Mapping[str, npt.NDArray[np.generic]]
 """The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
@@ -35,12 +39,12 @@ class SemanticState:
     text_complete: bool = True
     """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
     T_odom_stop: SE2 | None = None
-    """Where this answer and those before it mean to stop (`edge.reasoning.arrival`)."""
+    """Where this text and those before it plan to stop (`edge.reasoning.instruction_state`)."""
 
     @cached_property
     def waits(self) -> bool:
-        """Whether its words mean to let somebody pass first; read once, not in every tick."""
-        return means_to_wait(self.text)
+        """Whether the text plans to let a person pass first; read once, not in every tick."""
+        return plans_to_wait(self.text)
 
     def delay_s(self, now_ns: int) -> float:
         """Δt: now − anchor (inference time plus time since it finished)."""
@@ -49,6 +53,17 @@ class SemanticState:
     def motion_offset(self, T_odom_base: SE2) -> SE2:
         """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
         return self.T_odom_anchor.inverse() @ T_odom_base
+
+
+def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:
+    """Transform waypoints (x m, y m) of the anchor's robot frame to [1, points, 2] in the current one (appendix C).
+
+    `offset` is the robot's motion since the anchor. A policy guided by waypoints reads them instead of keys and values.
+    """
+    cos, sin = math.cos(offset.theta_rad), math.sin(offset.theta_rad)
+    relative = [(x - offset.x_m, y - offset.y_m) for x, y in waypoints]
+    points = [(cos * dx + sin * dy, cos * dy - sin * dx) for dx, dy in relative]
+    return np.array([points], dtype=np.float32)
 
 
 class SemanticSlot:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to
-from edge.motion.guidance import waypoints_now
 from edge.reasoning.prompt import Segment
+from edge.state.semantic import waypoints_now
 from export.evaluation.task_samples import Sample, SampleSet
 
 Floats = npt.NDArray[np.float32]

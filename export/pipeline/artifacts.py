@@ -53,6 +53,8 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "control_cores": list(policy.control_cores),
         "reasoning_cores": list(policy.reasoning_cores),
         "control_priority": policy.control_priority,
+        "decoding": policy.decoding,
+        "recovery": policy.recovery,
     }
 
 

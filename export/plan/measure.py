@@ -25,10 +25,9 @@ from edge.core.device import read_device
 from edge.core.geometry import SE2
 from edge.inference.language import Generation, LanguageModel
 from edge.inference.policy import Policy
-from edge.motion.guidance import STRAIGHT_AHEAD
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
 from edge.state.ring import EncodedFrame
-from edge.state.semantic import SemanticState
+from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 from export.core.typed import plain
 from export.plan.timing import stage_graph
 from export.quantize.precision import Precision

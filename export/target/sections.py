@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from edge.state.switches import Decoding, RecoverySwitch
 from export.core.typed import near
 from export.quantize.precision import PRECISIONS, Precision, block_size
 from firmware_bridge.core.config import BRIDGE_PRIORITY
@@ -309,6 +310,9 @@ class RuntimePolicy:
     reasoning_cores: tuple[int, ...] = ()
     control_priority: int = 50
     """Real-time priority of the control thread, 1 to 59; 0: none. The bridge's is above it."""
+    decoding: str = Decoding.CONSTRAINED.value
+    recovery: str = RecoverySwitch.ON.value
+    """Defaults of the runner's switches (`edge/state/switches.py`)."""
 
     def __post_init__(self) -> None:
         for name, most in RUNTIME_MOST.items():
@@ -318,6 +322,8 @@ class RuntimePolicy:
         _require(1 <= count <= MAX_FRAMES, f"frame_offsets_s names {count} frames, expected 1 to {MAX_FRAMES}")
         _require(all(0 <= offset <= 60 for offset in self.frame_offsets_s), "frame_offsets_s must be 0 to 60 s")
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
+        _known(self.decoding, tuple(each.value for each in Decoding), "decoding")
+        _known(self.recovery, tuple(each.value for each in RecoverySwitch), "recovery")
         for name in ("control_cores", "reasoning_cores"):
             cores = getattr(self, name)
             _require(all(0 <= core < MAX_CORES for core in cores), f"{name} {list(cores)} must be 0 to {MAX_CORES - 1}")

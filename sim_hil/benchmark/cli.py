@@ -25,6 +25,7 @@ from edge.core.cli import (
     command_line,
     write_result,
 )
+from edge.state.switches import Decoding, RecoverySwitch
 from firmware_bridge.core.config import ConfigError
 from sim_hil.benchmark.conditions.conditions import (
     BASELINES,
@@ -114,8 +115,16 @@ def parser() -> argparse.ArgumentParser:
         "--swap-instructions", type=int, metavar="SEED", help="tell every task the way of another one of its scene"
     )
     p.add_argument(
-        "--stay", action="store_true",
-        help="stand where the answers have placed the stop, as edge-run does; else only the goal ends an episode",
+        "--decoding", choices=[each.value for each in Decoding],
+        help="of artifacts: greedy as in the paper (free), or within rules (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
+        "--recovery", choices=[each.value for each in RecoverySwitch],
+        help="of artifacts: off: only the plan moves the robot (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
+        "--stay", action=argparse.BooleanOptionalAction, default=False,
+        help="stand where the texts have placed the stop, as edge-run does; else only the goal ends an episode",
     )  # fmt: skip
     p.add_argument("--camera", default="auto", metavar="WxH", help="render this picture though no policy looks at it")
     p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for an answer (default 60)")
@@ -172,6 +181,8 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         wording=args.wording,
         wordings=args.wordings,
         swap_instructions=args.swap_instructions,
+        decoding=args.decoding,
+        recovery=args.recovery,
         stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,

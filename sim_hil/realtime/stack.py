@@ -10,11 +10,12 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
 import firmware_bridge
+from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.protocols.fault_client import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
@@ -56,8 +57,8 @@ class StackOptions:
     faults: bool = False
     instructions: bool = False
     """Whether the runner takes further instructions while it drives."""
-    stays: bool = True
-    """Whether the runner stands where its answers have placed the stop."""
+    switches: SwitchOptions = field(default_factory=SwitchOptions)
+    """Decoding rules and recoveries that the runner is asked for."""
     pose_hz: int | None = None
     """Poses a second in the trace, in place of edge-hil's default."""
 
@@ -166,8 +167,11 @@ class Stack:
         ]
         if options.instructions:
             command += ["--instructions", str(self.instructions)]
-        if not options.stays:
-            command += ["--no-stay"]
+        asked = options.switches
+        command += ["--decoding", asked.decoding.value] if asked.decoding else []
+        command += ["--recovery", asked.recovery.value] if asked.recovery else []
+        if asked.stand_at_goal is not None:
+            command += ["--stay" if asked.stand_at_goal else "--no-stay"]
         self.runner = self._children.start(name, command)
         return self.runner
 

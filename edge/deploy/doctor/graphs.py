@@ -19,8 +19,7 @@ from edge.core.geometry import SE2
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.inference.graph import CPU_PROVIDER, Array, zeros
 from edge.inference.policy import Policy
-from edge.motion.guidance import STRAIGHT_AHEAD
-from edge.state.semantic import SemanticState
+from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 
 SHAPE_OPERATORS: Final = frozenset(
     {

@@ -17,8 +17,7 @@ from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
-from edge.motion.standstill_recovery import TURNING
-from edge.motion.stuck_recovery import BACKING_OFF
+from edge.motion.recovery import MOVING
 from edge.reasoning.path_memory import Way, way_of
 from edge.run.camera import decode_frame
 from edge.state.pose_history import PoseHistory, StampedPose
@@ -45,7 +44,7 @@ class _SkippedError(Exception):
 
 
 @dataclass
-class _Thought:
+class _ReplayedGeneration:
     """A generation of the log with its pictures, run when a tick first needs it."""
 
     record: RecordedGeneration
@@ -101,7 +100,7 @@ class Replayer:
         self._frames: OrderedDict[int, bytes] = OrderedDict()
         self._encoded: tuple[int, Floats] | None = None
         self._poses = PoseHistory()
-        self._thoughts: OrderedDict[int, _Thought] = OrderedDict()
+        self._generations: OrderedDict[int, _ReplayedGeneration] = OrderedDict()
         self._controller: Controller | None = None
         if run.limits is not None:
             config = ControllerConfig(run.limits, self._step_s, _ANY_AGE_MS, _ANY_AGE_MS)
@@ -118,11 +117,11 @@ class Replayer:
                 self._frames.popitem(last=False)
         elif isinstance(event, RecordedGeneration):
             pictures = {stamp_ns: self._frames[stamp_ns] for stamp_ns in event.frames_ns if stamp_ns in self._frames}
-            thought = self._thoughts[event.number] = _Thought(event, pictures)
-            while len(self._thoughts) > _GENERATIONS_KEPT:
-                self._thoughts.popitem(last=False)
+            replayed = self._generations[event.number] = _ReplayedGeneration(event, pictures)
+            while len(self._generations) > _GENERATIONS_KEPT:
+                self._generations.popitem(last=False)
             if self._from_ns <= event.ready_ns <= self._to_ns:
-                self._counting_skips(lambda: self._think(thought))
+                self._counting_skips(lambda: self._generate(replayed))
         else:
             if event.pose is not None:
                 self._poses.put(StampedPose(event.now_ns, event.pose, *event.state))
@@ -141,25 +140,25 @@ class Replayer:
             self.comparison.skipped["its picture cannot be decoded"] += 1
         return None
 
-    def _think(self, thought: _Thought) -> SemanticState:
+    def _generate(self, replayed: _ReplayedGeneration) -> SemanticState:
         """The semantic state of a generation, run once; its text is compared then."""
-        if thought.state is not None:
-            return thought.state
-        record, found = thought.record, self.comparison
-        missing = [stamp_ns for stamp_ns in record.frames_ns if stamp_ns not in thought.pictures]
+        if replayed.state is not None:
+            return replayed.state
+        record, found = replayed.record, self.comparison
+        missing = [stamp_ns for stamp_ns in record.frames_ns if stamp_ns not in replayed.pictures]
         if missing:
             raise _SkippedError("a picture of its generation is not in the log")
         frames = [
-            EncodedFrame(stamp_ns, pose, self._policy.encode(decode_frame(thought.pictures[stamp_ns], self._image_px)))
+            EncodedFrame(stamp_ns, pose, self._policy.encode(decode_frame(replayed.pictures[stamp_ns], self._image_px)))
             for stamp_ns, pose in zip(record.frames_ns, self._frame_poses(record), strict=True)
         ]
         generation = self._language.generate(
             self._language.prompt.build(
-                frames, record.instruction or self._run.instruction, self._way(record, frames), record.known.before
+                frames, record.instruction or self._run.instruction, self._way(record, frames), record.context.before
             ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
-            guide=self._language.guide(record.known),
+            constraint=self._language.constraint(record.context),
         )
         found.generations += 1
         found.poses_interpolated += record.poses is None
@@ -168,7 +167,7 @@ class Replayer:
             found.texts_equal += 1
         else:
             found.different_texts.append(record.number)
-        thought.state = SemanticState(
+        replayed.state = SemanticState(
             generation=record.number,
             anchor_ns=frames[-1].stamp_ns,
             T_odom_anchor=record.anchor_pose,
@@ -178,7 +177,7 @@ class Replayer:
             text=generation.text,
             waypoints=parse_waypoints(generation.text),
         )
-        return thought.state
+        return replayed.state
 
     def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
         """As it was told; of a log that does not say, through the frames alone."""
@@ -198,9 +197,9 @@ class Replayer:
             return None
         if tick.frame_ns not in self._frames:
             raise _SkippedError("its picture is not in the log")
-        if tick.generation not in self._thoughts:
+        if tick.generation not in self._generations:
             raise _SkippedError("its generation is not in the log")
-        semantic = self._think(self._thoughts[tick.generation])
+        semantic = self._generate(self._generations[tick.generation])
         if self._encoded is None or self._encoded[0] != tick.frame_ns:
             picture = decode_frame(self._frames[tick.frame_ns], self._image_px)
             self._encoded = tick.frame_ns, self._policy.encode(picture)
@@ -241,6 +240,6 @@ class Replayer:
         command = self._controller.step(inputs, tick.acted_ns)
         self._command_known = self._command_known or hold is not None
         # A way back, or a turn to what was said, is of what odometry saw meanwhile, not of the plan.
-        if self._command_known and tick.reason not in (BACKING_OFF, TURNING):
+        if self._command_known and tick.reason not in MOVING:
             apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
             self.comparison.command.append(float(np.abs(apart).max()))

@@ -14,12 +14,10 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
-from edge.reasoning.decoding_rules import Known
+from edge.reasoning.decoding_rules import FOLLOWS, FREE, DecodingContext, TurnDistances
 from edge.reasoning.path_memory import Way
-from edge.reasoning.progress_rules import FOLLOWS, FREE
 from edge.reasoning.prompt import told_before
-from edge.reasoning.turn_estimate import LEFT, RIGHT, TurnLeft
-from edge.state.reasoning_text import PROGRESS_HEAD, Progress, parse_progress
+from edge.state.reasoning_text import LEFT, PROGRESS_HEAD, RIGHT, Progress, parse_progress
 from firmware_bridge.core.config import ConfigError, LimitsConfig
 
 _ORDER_WINDOW_NS = 5_000_000_000
@@ -63,7 +61,7 @@ class RecordedGeneration:
     anchor_pose: SE2
     way: Way | None
     """As the prompt told it; None: a log from before ways were told."""
-    known: Known
+    context: DecodingContext
     max_new_tokens: int
     text: str
 
@@ -155,7 +153,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
         poses=None if poses is None else tuple(_pose(pose) for pose in poses),
         anchor_pose=_pose(payload["anchor_pose"]),
         way=None if "way" not in payload else tuple(_point(point) for point in payload["way"]),
-        known=Known(
+        context=DecodingContext(
             _before(payload.get("before", told_before(None))),
             _follow(payload.get("follow", FREE)),
             _turn(payload.get("turn"), payload.get("turn_left_m")),
@@ -211,13 +209,13 @@ def _follow(value: Any) -> str:
     return str(value)
 
 
-def _turn(side: Any, left_m: Any) -> TurnLeft | None:
+def _turn(side: Any, left_m: Any) -> TurnDistances | None:
     if side is None:
         return None
     known_m = tuple(float(metres) for metres in left_m) if isinstance(left_m, list) else ()
     if side not in (LEFT, RIGHT) or not known_m or not all(map(math.isfinite, known_m)):
         raise ValueError(f"turn is {str(side)[:60]!r} by {str(left_m)[:60]}")
-    return TurnLeft(str(side), known_m)
+    return TurnDistances(str(side), known_m)
 
 
 def _flag(value: Any) -> bool:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile
 from sim_hil.robots.odometry_noise import LEVELS
 
@@ -79,8 +80,12 @@ class Conditions:
     wordings: str = "benchmark"
     swap_instructions: int | None = None
     """Seed by which every task is given the instruction of another one of its scene; None: its own."""
+    decoding: str | None = None
+    """Of a policy from artifacts: how its texts are decoded; None: as its manifest says."""
+    recovery: str | None = None
+    """Of a policy from artifacts: whether recoveries may replace its commands; None: as its manifest says."""
     stays: bool = False
-    """Whether a policy from artifacts stands where its answers have placed the stop; an episode ends at the goal."""
+    """Whether a policy from artifacts stands where its texts have placed the stop; an episode ends at the goal."""
     camera: str = "auto"
     """`WxH`: render such a picture in every control period; `auto`: what the policy looks at, if it does."""
     external_timeout_s: float = 60.0
@@ -97,8 +102,13 @@ class Conditions:
             _one_of("mode", self.mode, MODES)
         if (self.mode is not None) != (kind == "artifacts"):
             raise ConditionsError(f"mode: belongs to a policy from artifacts, found {self.mode} with {kind}")
-        if self.stays and kind != "artifacts":
-            raise ConditionsError(f"stay: belongs to a policy from artifacts, found it with {kind}")
+        for name, asked in (("stay", self.stays), ("decoding", self.decoding), ("recovery", self.recovery)):
+            if asked and kind != "artifacts":
+                raise ConditionsError(f"{name}: belongs to a policy from artifacts, found it with {kind}")
+        try:
+            _ = self.switches
+        except ValueError as error:
+            raise ConditionsError(str(error)) from error
         if self.latency is not None and kind in (*BASELINES, "point-goal-net"):
             raise ConditionsError(f"latency: {kind} does not think; expected artifacts:DIR or external:ADDR with it")
         if kind == "artifacts" and self.clock == "lockstep" and self.latency is None:
@@ -114,6 +124,17 @@ class Conditions:
                 f"external timeout: expected up to {MAX_EXTERNAL_TIMEOUT_S:g} s, found {self.external_timeout_s}"
             )
         _ = self.camera_size
+
+    @property
+    def switches(self) -> SwitchOptions:
+        """Decoding rules and recoveries that a policy from artifacts is asked for."""
+        return SwitchOptions.parse(self.decoding, self.recovery, self.stays)
+
+    def with_defaults_of(self, decoding: Decoding, recovery: RecoverySwitch) -> Conditions:
+        """Return these conditions with a manifest's defaults where they leave a switch open. Raises ConditionsError."""
+        return replace(
+            self, decoding=self.decoding or decoding.value, recovery=self.recovery or recovery.value
+        )  # fmt: skip
 
     @property
     def camera_size(self) -> tuple[int, int] | None:
@@ -157,8 +178,11 @@ class Conditions:
             parts.append(f"{self.wordings} wordings")
         if self.swap_instructions is not None:
             parts.append(f"instructions swapped by {self.swap_instructions}")
+        parts += [
+            f"{name} {value}" for name, value in (("decoding", self.decoding), ("recovery", self.recovery)) if value
+        ]
         if self.stays:
-            parts.append("stays where it says that it has arrived")
+            parts.append("stands where its texts have placed the stop")
         return ", ".join([*parts, f"drift {self.drift}"])
 
 

@@ -28,6 +28,7 @@ from edge.state.frame import Frame, fit_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.switches import Switches, SwitchOptions
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from sim_hil.benchmark.conditions.conditions import ConditionsError
@@ -50,15 +51,18 @@ class ArtifactsPolicy:
     needs_image = True
 
     def __init__(
-        self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig, stays: bool = False
-    ) -> None:
+        self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig,
+        switches: SwitchOptions | None = None,
+    ) -> None:  # fmt: skip
         """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they cannot do.
 
-        `stays`: it stands where its answers have placed the stop.
+        `switches`: by default the manifest's, and no standing at the goal.
         """
         self._artifacts = load_artifacts(directory)
         check_suits(self._artifacts, mode)
-        self._mode, self._latency, self._robot, self._stays = Mode(mode), latency, robot, stays
+        self._mode, self._latency, self._robot = Mode(mode), latency, robot
+        runtime, asked = self._artifacts.runtime, switches or SwitchOptions()
+        self._switches = asked.over(runtime.decoding, runtime.recovery, stand_at_goal=False)
         self._model = Model(self._artifacts, threads=1)
         self._language = LanguageModel(self._artifacts, threads=1)
         self._drive: _Drive | None = None
@@ -79,7 +83,7 @@ class ArtifactsPolicy:
         self._language.check_instruction(instruction, len(self._artifacts.runtime.frame_offsets_s))
         draw = LatencySampler(self._latency, seed, episode.id).draw
         self._drive = _Drive(
-            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._stays
+            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._switches
         )
 
     def act(self, observation: Observation) -> tuple[float, float, float]:
@@ -106,7 +110,7 @@ class _Drive:
 
     def __init__(
         self, artifacts: Artifacts, model: Model, language: LanguageModel, robot: RobotConfig, mode: Mode,
-        instruction: str, draw: Any, stays: bool,
+        instruction: str, draw: Any, switches: Switches,
     ) -> None:  # fmt: skip
         runtime = artifacts.runtime
         if runtime.tick_period_ms * 1_000_000 != CONTROL_PERIOD_NS:
@@ -132,6 +136,7 @@ class _Drive:
             max_new_tokens=runtime.max_new_tokens,
             draw=draw,
             mode=mode,
+            decoding=switches.decoding,
         )
         config = ControllerConfig(
             robot.limits, runtime.step_s, FRAME_MAX_AGE_MS, odometry_max_age_ms=float(robot.odometry.max_age_ms)
@@ -158,7 +163,7 @@ class _Drive:
             stop=threading.Event(),
             watch=Watch(watch, sources),
             supervisor=Supervisor(),
-            stays=stays,
+            switches=switches,
             clock=lambda: self._now_ns,
         )
         self.notes: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError, Generation, LanguageModel
 from edge.inference.policy import Policy
-from edge.reasoning.decoding_rules import NOTHING_KNOWN, Known, TextGuide
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.reasoning.path_memory import Way
 from edge.reasoning.prompt import told_before
@@ -25,6 +25,7 @@ from edge.run.reasoning_loop import FAILURE_WINDOW_S, FAILURES, RETRY_S, SYNC_DR
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.switches import Decoding
 from sim_hil.benchmark.conditions.latency import Timing
 
 
@@ -36,7 +37,7 @@ class _UnderWay:
     timing: Timing
     frames: list[EncodedFrame] | None = None
     way: Way = ()
-    known: Known = NOTHING_KNOWN
+    context: DecodingContext = field(default_factory=DecodingContext)
 
     @property
     def release_ns(self) -> int:
@@ -62,13 +63,14 @@ class LockstepReasoner:
         max_new_tokens: int,
         draw: Callable[[], Timing],
         mode: Mode,
+        decoding: Decoding = Decoding.CONSTRAINED,
     ) -> None:
         self._language = language
         self._policy = policy
         self._ring = ring
         self._slot = slot
         self._instruction = instruction
-        self._memory = InstructionMemory(None, instruction)
+        self._memory = InstructionMemory(None, instruction, decoding)
         self._offsets_s = sorted({offset_s for offset_s in frame_offsets_s if offset_s > 0}, reverse=True)
         self._max_new_tokens = 0 if mode is Mode.NO_REASONING else max_new_tokens
         self._draw = draw
@@ -111,7 +113,7 @@ class LockstepReasoner:
             job.frames = self._frames()
             if job.frames is not None:
                 job.way = self._memory.way(self._ring, job.frames[-1])
-                job.known = self._memory.known(job.frames[-1])
+                job.context = self._memory.context(job.frames[-1])
         self._memory.watch(self._ring)
 
     def _may_start(self, now_ns: int) -> bool:
@@ -137,20 +139,20 @@ class LockstepReasoner:
                 frames.append(frame)
         return [*frames, anchor]
 
-    def _generate(self, job: _UnderWay, frames: list[EncodedFrame], guide: TextGuide) -> Generation:
+    def _generate(self, job: _UnderWay, frames: list[EncodedFrame], constraint: TextConstraint) -> Generation:
         prompt = self._language.prompt
         run = self._language.begin(lambda: False)
         for number, frame in enumerate(frames[:-1], 1):
             run.feed([prompt.frame(number, frame, self._instruction)])
-        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.known.before)]
-        generation = run.finish(rest, max_new_tokens=self._max_new_tokens, guide=guide)
+        rest = [prompt.frame(len(frames), frames[-1], self._instruction), prompt.tail(job.way, job.context.before)]
+        generation = run.finish(rest, max_new_tokens=self._max_new_tokens, constraint=constraint)
         if not np.isfinite(generation.last_layer_kv).all():
             raise _NotFiniteError("keys and values of the last layer are not finite")
         return generation
 
     def _publish(self, job: _UnderWay, frames: list[EncodedFrame], now_ns: int) -> None:
-        guide, anchor = self._language.guide(job.known), frames[-1]
-        generation = self._generate(job, frames, guide)
+        constraint, anchor = self._language.constraint(job.context), frames[-1]
+        generation = self._generate(job, frames, constraint)
         context = self._policy.semantic_context(generation.last_layer_kv)
         waypoints = parse_waypoints(generation.text)
         complete = self._max_new_tokens > 0
@@ -159,7 +161,7 @@ class LockstepReasoner:
         number = len(self.released)
         guided = waypoints is not None or not self._policy.guided_by_waypoints
         if guided:
-            self._memory.heard(generation.text, guide, anchor)
+            self._memory.update(generation.text, constraint, anchor)
         stop = self._memory.stop
         self.released.append(
             {
@@ -169,10 +171,10 @@ class LockstepReasoner:
                 "released_s": now_ns / 1e9,
                 "frames": len(frames),
                 "way": [list(point) for point in job.way],
-                "before": told_before(job.known.before),
-                **job.known.record(),
-                "overruled": guide.overruled,
-                "planned": guide.planned,
+                "before": told_before(job.context.before),
+                **job.context.record(),
+                "overruled": constraint.overruled,
+                "planned": constraint.planned,
                 "stop": None if stop is None else list(stop.as_tuple()),
                 "prompt_tokens": generation.prompt_tokens,
                 "new_tokens": generation.new_tokens,

@@ -49,7 +49,7 @@ def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:
         raise ConditionsError("a policy from artifacts needs a mode and a latency in lockstep")
     directory = artifact_directory(Path(conditions.policy.where), conditions.variant)
     policy = ArtifactsPolicy(
-        directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config(), stays=conditions.stays
+        directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config(), switches=conditions.switches
     )
     if manifest_sha256 and policy.manifest_sha256 != manifest_sha256:
         raise ArtifactError(f"{directory}: not the artifacts that this run was started with; copy them to this machine")

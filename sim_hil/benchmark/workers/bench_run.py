@@ -60,6 +60,8 @@ class BenchRun:
                 f"--clock {conditions.clock}: not in this version; expected {', '.join(sorted(RUNNERS))}"
             )
         artifacts = check_artifacts(conditions)
+        if artifacts is not None:
+            conditions = conditions.with_defaults_of(artifacts.runtime.decoding, artifacts.runtime.recovery)
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
         run.tasks(Path())

@@ -96,7 +96,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         domain=free_domain(),
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
-        stays=conditions.stays,
+        switches=conditions.switches,
         pose_hz=FRAME_HZ,
     )
     with _asked_to_end(), Stack(options) as stack:

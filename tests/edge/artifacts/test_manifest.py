@@ -23,6 +23,7 @@ from edge.inference.engines import PROFILES
 from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.state.switches import Decoding, RecoverySwitch
 from export.cli import main
 from export.target.file import load_target
 
@@ -171,6 +172,25 @@ def test_widths_that_do_not_fit_one_another_are_refused(copy: Path) -> None:
 def test_runtime_values_that_cannot_be_run_are_refused(copy: Path, change: dict[str, Any]) -> None:
     edit(copy, lambda m: m["runtime"].update(change))
     with pytest.raises(ArtifactError, match="runtime"):
+        load_artifacts(copy)
+
+
+def test_a_manifest_from_before_the_switches_gets_their_defaults(copy: Path) -> None:
+    edit(copy, lambda m: [m["runtime"].pop(key, None) for key in ("decoding", "recovery")])
+    runtime = load_artifacts(copy).runtime
+    assert (runtime.decoding, runtime.recovery) == (Decoding.CONSTRAINED, RecoverySwitch.ON)
+
+
+def test_a_manifest_has_defaults_of_the_switches(copy: Path) -> None:
+    edit(copy, lambda m: m["runtime"].update(decoding="free", recovery="off"))
+    runtime = load_artifacts(copy).runtime
+    assert (runtime.decoding, runtime.recovery) == (Decoding.FREE, RecoverySwitch.OFF)
+
+
+@pytest.mark.parametrize("change", [{"decoding": "loose"}, {"recovery": True}, {"recovery": 1}, {"decoding": None}])
+def test_a_switch_that_does_not_exist_is_refused(copy: Path, change: dict[str, Any]) -> None:
+    edit(copy, lambda m: m["runtime"].update(change))
+    with pytest.raises(ArtifactError, match=r"expected.*constrained"):
         load_artifacts(copy)
 
 

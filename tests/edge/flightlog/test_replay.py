@@ -18,13 +18,10 @@ from edge.flightlog.replay.command import main
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import Controller, ControllerConfig, ControllerInputs
-from edge.motion.standstill_recovery import TURNING
-from edge.motion.stuck_recovery import BACKING_OFF
-from edge.reasoning.decoding_rules import Known, TextGuide
+from edge.motion.recovery import BACKING_OFF, TURNING
+from edge.reasoning.decoding_rules import EITHER_WAY, DecodingContext, TextConstraint, TurnDistances
 from edge.reasoning.path_memory import way_of
-from edge.reasoning.progress_rules import EITHER_WAY
 from edge.reasoning.prompt import told_before
-from edge.reasoning.turn_estimate import TurnLeft
 from edge.run.camera import decode_frame
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
@@ -263,19 +260,20 @@ def test_what_the_prompt_told_of_the_way_and_progress_is_told_again(log: Log, to
 
 @pytest.mark.slow
 def test_a_generation_is_held_to_what_it_was_held_to(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Known] = []
-    guide = LanguageModel.guide
+    asked: list[DecodingContext] = []
+    constraint = LanguageModel.constraint
 
-    def watched(self: LanguageModel, known: Known) -> TextGuide:
+    def watched(self: LanguageModel, known: DecodingContext) -> TextConstraint:
         asked.append(known)
-        return guide(self, known)
+        return constraint(self, known)
 
-    monkeypatch.setattr(LanguageModel, "guide", watched)
+    monkeypatch.setattr(LanguageModel, "constraint", watched)
     log.payload("/semantic", 1).update(follow=EITHER_WAY, turn="left", turn_left_m=[2.5, 3.0], turn_may_be_done=False)
     assert log.replay()[0] == 0
-    assert asked[1] == Known(Progress(1, 3, 1), EITHER_WAY, TurnLeft("left", (2.5, 3.0)), may_be_done=False)
+    turn = TurnDistances("left", (2.5, 3.0))
+    assert asked[1] == DecodingContext(Progress(1, 3, 1), EITHER_WAY, turn, turn_may_be_done=False)
     # A log from before generations were held to anything says nothing of it.
-    assert asked[2] == Known(Progress(1, 3, 2))
+    assert asked[2] == DecodingContext(Progress(1, 3, 2))
 
 
 @pytest.mark.slow

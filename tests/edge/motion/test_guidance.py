@@ -15,9 +15,8 @@ from edge.inference.graph import GraphError
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.warm_up import warm_up
-from edge.motion.guidance import STRAIGHT_AHEAD, waypoints_now
 from edge.state.reasoning_text import Waypoints
-from edge.state.semantic import SemanticState
+from edge.state.semantic import STRAIGHT_AHEAD, SemanticState, waypoints_now
 from export.model.config import PRESETS
 from export.model.network import build
 from tests.support.artifact_directory import write_artifacts

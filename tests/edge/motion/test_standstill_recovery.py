@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.motion.controller import VelocityCommand
-from edge.motion.guidance import waypoints_now
-from edge.motion.standstill_recovery import TURNING, Stalemate, StalemateConfig
+from edge.motion.recovery import TURNING, StandstillConfig, StandstillTurn
+from edge.state.semantic import waypoints_now
 
-CONFIG = StalemateConfig(wz_max_radps=1.0)
+CONFIG = StandstillConfig(wz_max_radps=1.0)
 TICK_NS = 100_000_000
 STANDS = VelocityCommand(0.0, 0.0, 0.0, SE2(0.01, 0.0, 0.0), "ok")
 DRIVES = VelocityCommand(0.05, 0.0, 0.0, SE2(0.6, 0.0, 0.0), "ok")  # it speeds up from standing
@@ -35,9 +35,9 @@ class Run:
     """Ticks of a robot that turns as `turns` lets it; the words were said where it stood at first."""
 
     def __init__(
-        self, words: Points | None, config: StalemateConfig = CONFIG, turns: Callable[[float], float] = free
+        self, words: Points | None, config: StandstillConfig = CONFIG, turns: Callable[[float], float] = free
     ) -> None:
-        self.stalemate, self.words, self.turns = Stalemate(config), words, turns
+        self.stalemate, self.words, self.turns = StandstillTurn(config), words, turns
         self.pose, self.ticks = SE2(0.0, 0.0, 0.0), 0
         self.said: list[str] = []
         self.rates: list[float] = []
@@ -68,7 +68,7 @@ def test_it_stands_for_five_seconds_and_then_turns_to_what_was_said() -> None:
 def test_it_turns_the_short_way_within_the_limits(bearing_rad: float, wz_max_radps: float) -> None:
     assume(abs(abs(bearing_rad) - CONFIG.aside_rad) > 1e-4)  # waypoints are float32
     far = tuple((r * np.cos(bearing_rad), r * np.sin(bearing_rad)) for r in (2.0, 4.0, 6.0))
-    run = Run(far, StalemateConfig(wz_max_radps=wz_max_radps))
+    run = Run(far, StandstillConfig(wz_max_radps=wz_max_radps))
     run.go(80, speed_scale=0.5)
     turned = [rate for rate, reason in zip(run.rates, run.said, strict=True) if reason == TURNING]
     assert all(abs(rate) <= min(0.5, wz_max_radps) * 0.5 and rate * bearing_rad >= 0 for rate in turned)
@@ -133,7 +133,7 @@ def test_one_that_turns_slowly_is_not_held() -> None:
 
 
 def test_without_a_pose_or_at_no_speed_it_does_nothing() -> None:
-    stalemate, meant = Stalemate(CONFIG), np.array(LEFT, np.float32)
+    stalemate, meant = StandstillTurn(CONFIG), np.array(LEFT, np.float32)
     assert all(stalemate.step(STANDS, meant, None, k * TICK_NS) is STANDS for k in range(100))
     for speed_scale in (0.0, float("nan")):
         run = Run(LEFT)
@@ -142,6 +142,6 @@ def test_without_a_pose_or_at_no_speed_it_does_nothing() -> None:
 
 
 def test_a_configuration_that_makes_no_sense_is_refused() -> None:
-    for odd in ({"after_s": 0.0}, {"there_rad": 0.5}, {"meant_m": 0.3}):
-        with pytest.raises(ValueError, match="stalemate: expected"):
+    for odd in ({"after_s": 0.0}, {"done_rad": 0.5}, {"leads_on_m": 0.3}):
+        with pytest.raises(ValueError, match="standstill: expected"):
             replace(CONFIG, **odd)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.motion.controller import VelocityCommand
-from edge.motion.stuck_recovery import BACKING_OFF, BackOff, BackOffConfig
+from edge.motion.recovery import BACKING_OFF, BackOff, BackOffConfig
 
 CONFIG = BackOffConfig(vx_min_mps=-0.4, wz_max_radps=1.0)
 TICK_NS = 100_000_000

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge import runner
 from edge.core.geometry import SE2
-from edge.reasoning.arrival import AGREEING, ARRIVED, ASIDE_M, NEAR_M, OTHERS, SHORT_M, Arrival, is_there
-from edge.state.reasoning_text import MAX_TEXT_CHARS, parse_progress
-from sim_hil.realtime.stack import ROBOT_FILE
+from edge.motion.recovery import ARRIVED, ASIDE_M, PASSED_M, SHORT_M, has_arrived
+from edge.reasoning.instruction_state import AGREEING_TEXTS, CONTRADICTING_TEXTS, StopEstimator
+from edge.state.reasoning_text import MAX_TEXT_CHARS, parse_text
+from edge.state.switches import Switches
 from tests.support.runner.control_bench import Bench
 
 TOLD = "Walk down the corridor and stop at the Vending Machine."
@@ -26,14 +26,14 @@ def text(
     return f"Situation: in a corridor.\nObjects: {objects}.\nMotion: nobody near.\nProgress: {progress}.\nPlan: {plan}."
 
 
-def hear(arrival: Arrival, said: str, x_m: float, y_m: float = 0.0, theta_rad: float = 0.0) -> SE2 | None:
-    arrival.heard(said, parse_progress(said), SE2(x_m, y_m, theta_rad))
+def hear(arrival: StopEstimator, said: str, x_m: float, y_m: float = 0.0, theta_rad: float = 0.0) -> SE2 | None:
+    arrival.update(parse_text(said), SE2(x_m, y_m, theta_rad))
     return arrival.T_odom_stop
 
 
 def placed(*answers: tuple[str, float]) -> SE2 | None:
     """Where to stop after answers at x in m."""
-    arrival = Arrival(TOLD)
+    arrival = StopEstimator(TOLD)
     return [hear(arrival, said, x_m) for said, x_m in answers][-1]
 
 
@@ -42,7 +42,7 @@ def test_two_near_looks_place_it_between_them() -> None:
 
 
 def test_it_lies_ahead_of_where_the_robot_heads() -> None:
-    arrival = Arrival(TOLD)
+    arrival = StopEstimator(TOLD)
     for _ in range(2):
         place = hear(arrival, text("stop in 2 m"), 5.0, 1.0, math.pi / 2)
     assert place is not None
@@ -85,14 +85,14 @@ def test_the_place_is_the_median_of_the_last_three_looks() -> None:
 
 
 def test_looks_by_who_headed_elsewhere_are_of_another_place() -> None:
-    arrival = Arrival(TOLD)
+    arrival = StopEstimator(TOLD)
     hear(arrival, text(), 20.0)
     assert hear(arrival, text(), 20.0, theta_rad=1.5) is None
     place = hear(arrival, text(), 20.0, theta_rad=1.5)
     assert place is not None and place.x_m == pytest.approx(20.0, abs=0.2)
 
 
-def test_words_to_stop_soon_without_the_thing_in_view_neither_move_nor_drop_it() -> None:
+def test_texts_that_stop_soon_without_the_thing_in_view_neither_move_nor_drop_it() -> None:
     lost = [text("stop in 3 m", objects="exit door ahead 3 m"), text("stop now", objects="none")] * 20
     assert placed((text(), 20.0), (text(), 20.0), *((said, 23.0) for said in lost)) == SE2(22.0, 0.0, 0.0)
 
@@ -108,8 +108,8 @@ ELSEWHERE = {
 
 @pytest.mark.parametrize("other", ELSEWHERE.values(), ids=ELSEWHERE)
 def test_most_answers_of_elsewhere_drop_it(other: str) -> None:
-    soon, looks = text("stop now", objects="none"), ((text(), 20.0),) * AGREEING
-    others = ((other, 20.0),) * OTHERS
+    soon, looks = text("stop now", objects="none"), ((text(), 20.0),) * AGREEING_TEXTS
+    others = ((other, 20.0),) * CONTRADICTING_TEXTS
     assert placed(*looks, *others[1:], (soon, 20.0)) is not None
     assert placed(*looks, *others[1:], (soon, 20.0), others[0]) is None
     assert placed(*looks, *others) is None
@@ -117,7 +117,7 @@ def test_most_answers_of_elsewhere_drop_it(other: str) -> None:
 
 def test_answers_of_elsewhere_before_it_was_placed_do_not_drop_it() -> None:
     before = ((ELSEWHERE["another leg"], 10.0),) * 9
-    assert placed(*before, *((text(), 20.0),) * AGREEING, (ELSEWHERE["stop later"], 20.0)) is not None
+    assert placed(*before, *((text(), 20.0),) * AGREEING_TEXTS, (ELSEWHERE["stop later"], 20.0)) is not None
 
 
 @pytest.mark.parametrize(
@@ -136,15 +136,15 @@ def test_answers_of_elsewhere_before_it_was_placed_do_not_drop_it() -> None:
 def test_a_thing_is_named_by_whole_words_and_by_its_colour_where_one_is_told(
     told: str, thing: str, named: bool
 ) -> None:
-    arrival = Arrival(told)
-    for _ in range(AGREEING):
+    arrival = StopEstimator(told)
+    for _ in range(AGREEING_TEXTS):
         hear(arrival, text(objects=f"{thing} left 2 m"), 5.0)
     assert (arrival.T_odom_stop is not None) is named
 
 
 def test_of_several_things_that_are_named_the_first_one_counts() -> None:
-    arrival = Arrival("Pass the water dispenser and stop at the vending machine.")
-    for _ in range(AGREEING):
+    arrival = StopEstimator("Pass the water dispenser and stop at the vending machine.")
+    for _ in range(AGREEING_TEXTS):
         hear(arrival, text(objects="vending machine ahead 9 m, water dispenser right 2 m"), 5.0)
     assert arrival.T_odom_stop is None
 
@@ -154,15 +154,15 @@ LINES = st.sampled_from([line for said in ELSEWHERE.values() for line in f"{said
 
 @given(lines=st.lists(LINES | st.text(max_size=20), max_size=12), cut=st.integers(0, 300))
 def test_no_text_breaks_it(lines: list[str], cut: int) -> None:
-    arrival = Arrival(TOLD)
-    for _ in range(AGREEING):
+    arrival = StopEstimator(TOLD)
+    for _ in range(AGREEING_TEXTS):
         hear(arrival, "\n".join(lines)[cut:], 0.0)
 
 
 def test_only_the_beginning_of_an_endless_text_is_read() -> None:
-    arrival, said = Arrival(TOLD), "x" * MAX_TEXT_CHARS + "\n" + text()
+    arrival, said = StopEstimator(TOLD), "x" * MAX_TEXT_CHARS + "\n" + text()
     for _ in range(2):
-        arrival.heard(said, parse_progress(text()), AT_GOAL)
+        arrival.update(parse_text(said), AT_GOAL)
     assert arrival.T_odom_stop is None
 
 
@@ -172,14 +172,14 @@ def test_only_the_beginning_of_an_endless_text_is_read() -> None:
         (SE2(24.0 - SHORT_M - 0.1, 0.0, 0.0), False),
         (SE2(24.0 - SHORT_M + 0.1, 0.0, 0.0), True),
         (SE2(24.5, -0.5, -1.8), True),
-        (SE2(24.0 + NEAR_M + 0.1, 0.0, 0.0), False),
+        (SE2(24.0 + PASSED_M + 0.1, 0.0, 0.0), False),
         (SE2(24.0, ASIDE_M + 0.1, 0.0), False),
     ],
     ids=["before", "at", "past and turned", "long past", "beside"],
 )
 def test_it_is_there_at_the_place_or_past_it(pose: SE2, there: bool) -> None:
-    assert is_there(AT_GOAL, pose) is there
-    assert not is_there(None, pose)
+    assert has_arrived(AT_GOAL, pose) is there
+    assert not has_arrived(None, pose)
 
 
 def test_the_control_loop_stands_there_and_drives_on_once_the_place_is_further() -> None:
@@ -198,7 +198,7 @@ def test_the_control_loop_stands_there_and_drives_on_once_the_place_is_further()
 
 
 def test_a_loop_that_is_not_to_stay_drives_on_there() -> None:
-    bench = Bench(stays=False)
+    bench = Bench(switches=Switches(stand_at_goal=False))
     bench.drive()
     bench.think(stop=SE2(bench.walked_m, 0.0, 0.0))
     bench.see()
@@ -212,9 +212,3 @@ def test_standing_to_think_is_told_before_having_arrived() -> None:
     bench.slot.drive_until_ns = 0
     bench.see()
     assert bench.tick() == (0.0, "thinking")
-
-
-@pytest.mark.parametrize(("arguments", "stays"), [((), True), (("--no-stay",), False)])
-def test_the_runner_stays_unless_told_otherwise(arguments: tuple[str, ...], stays: bool) -> None:
-    asked = ["--artifacts", "a", "--robot", str(ROBOT_FILE), "--instruction", TOLD, *arguments]
-    assert runner._read(runner.parser().parse_args(asked))[1].stays is stays

@@ -9,14 +9,12 @@ from functools import partial
 import pytest
 
 from edge.core.geometry import SE2
-from edge.reasoning.decoding_rules import BACK, DONE
+from edge.reasoning.decoding_rules import BACK, DONE, EITHER_WAY, FREE, MAX_REFUSALS, ONWARD, TurnObservation
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.reasoning.path_memory import PathMemory, Way, way_of
-from edge.reasoning.progress_rules import EITHER_WAY, FREE, ONWARD
-from edge.reasoning.turn_estimate import LEFT, MOST_REFUSED, RIGHT, Look
 from edge.run.reasoning_loop import Mode
 from edge.state.reasoning_budget import ReasoningBudget
-from edge.state.reasoning_text import Progress
+from edge.state.reasoning_text import LEFT, RIGHT, Progress
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot
 from sim_hil.benchmark.conditions.latency import Timing
@@ -46,8 +44,8 @@ def counting(language: FakeLanguage) -> FakeLanguage:
 
     def think(_run: object) -> None:
         language.overruled = len(language.prompts) % 3 == 2
-        language.wanted = BACK if language.overruled else None
-        language.look = Look("left", 9.0)
+        language.refused = BACK if language.overruled else None
+        language.turn = TurnObservation("left", 9.0)
         language.text = f"Progress: turn {len(language.prompts) + 1} of 99, passed 0.{LINE}"
 
     language.during_finish = think
@@ -74,9 +72,9 @@ def claiming(side: str, language: FakeLanguage) -> FakeLanguage:
     language.text = FIRST
 
     def think(_run: object) -> None:
-        language.look = None if language.prompts else Look(side, 9.0)
+        language.turn = None if language.prompts else TurnObservation(side, 9.0)
         language.overruled = bool(language.prompts)
-        language.wanted = DONE if language.overruled else None
+        language.refused = DONE if language.overruled else None
 
     language.during_finish = think
     return language
@@ -138,7 +136,7 @@ def test_both_loops_tell_the_same_way_and_progress() -> None:
 
 
 def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None:
-    of_lockstep, of_runner = lockstep(801, 2.0).guided, threaded(800, 20).guided
+    of_lockstep, of_runner = lockstep(801, 2.0).contexts, threaded(800, 20).contexts
     assert of_lockstep[:40] == of_runner
     assert [(known.before, known.follow) for known in of_runner[:4]] == [
         (None, FREE), (Progress(1, 99, 0), ONWARD), (Progress(2, 99, 0), ONWARD), (Progress(3, 99, 0), EITHER_WAY),
@@ -148,18 +146,18 @@ def test_both_loops_hold_the_next_generation_to_what_the_last_one_said() -> None
 def test_both_loops_refuse_a_turn_that_the_robot_has_not_made_as_often() -> None:
     """It drives round to the left, and is to turn right."""
     right = partial(claiming, RIGHT)
-    of_lockstep, of_runner = lockstep(401, 2.0, right).guided, threaded(400, 20, right).guided
+    of_lockstep, of_runner = lockstep(401, 2.0, right).contexts, threaded(400, 20, right).contexts
     assert of_lockstep[:20] == of_runner
-    may_be_done = [known.may_be_done for known in of_runner]
-    assert may_be_done == [True, *[False] * MOST_REFUSED, *[True] * (19 - MOST_REFUSED)]
+    may_be_done = [known.turn_may_be_done for known in of_runner]
+    assert may_be_done == [True, *[False] * MAX_REFUSALS, *[True] * (19 - MAX_REFUSALS)]
 
 
 def test_both_loops_see_the_robot_turn() -> None:
     """It is to turn left, and does so after 10 s."""
     left = partial(claiming, LEFT)
-    of_lockstep, of_runner = lockstep(401, 2.0, left).guided, threaded(400, 20, left).guided
+    of_lockstep, of_runner = lockstep(401, 2.0, left).contexts, threaded(400, 20, left).contexts
     assert of_lockstep[:20] == of_runner
-    assert [known.may_be_done for known in of_runner] == [True, *[False] * 4, *[True] * 15]
+    assert [known.turn_may_be_done for known in of_runner] == [True, *[False] * 4, *[True] * 15]
 
 
 def test_a_text_that_is_cut_short_changes_nothing_of_the_turn() -> None:
@@ -167,18 +165,18 @@ def test_a_text_that_is_cut_short_changes_nothing_of_the_turn() -> None:
     claiming(LEFT, bench.language)
     think_at(bench, 2.0)
     bench.language.during_finish = lambda _run: None
-    bench.language.look, bench.language.plan_said = None, False
+    bench.language.turn, bench.language.has_plan = None, False
     for second, text in ((5.0, FIRST), (8.0, "Situation: in a corri"), (11.0, FIRST)):
         bench.language.text = text
         think_at(bench, second)
-    assert bench.language.guided[-1].turn is not None
+    assert bench.language.contexts[-1].turn is not None
 
 
 def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_frames() -> None:
     """2 s at 0.8 m/s; a generation's own picture is the newest of its frames."""
-    known = threaded(800, 20).guided[1]
+    known = threaded(800, 20).contexts[1]
     assert known.turn is not None and known.turn.side == "left"
-    assert known.turn.left_m == pytest.approx([9.0 - 1.6])
+    assert known.turn.distances_m == pytest.approx([9.0 - 1.6])
 
 
 def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:
@@ -315,7 +313,7 @@ def test_an_answer_that_is_not_the_models_own_or_not_whole_places_no_stop(
     bench: Bench, overruled: bool, whole: bool
 ) -> None:
     bench.loop.submit("stop at the vending machine")
-    bench.language.text, bench.language.overruled, bench.language.plan_said = HERE, overruled, whole
+    bench.language.text, bench.language.overruled, bench.language.has_plan = HERE, overruled, whole
     for second in (2.0, 3.0, 4.0):
         think_at(bench, second)
     assert bench.slot.state is not None

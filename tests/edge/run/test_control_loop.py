@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
-from edge.motion.standstill_recovery import TURNING
-from edge.motion.stuck_recovery import BACKING_OFF
+from edge.motion.recovery import BACKING_OFF, TURNING
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
 from edge.state.pose_history import StampedPose

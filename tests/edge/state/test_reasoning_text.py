@@ -4,20 +4,39 @@ from __future__ import annotations
 
 import random
 import re
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.state.reasoning_text import (
+    AREAS,
+    CROSSING,
+    CROWDS,
+    ENTERED_AREAS,
     MAX_COUNT,
+    MAX_DISTANCE_M,
+    MAX_ITEMS,
     MAX_LINE_CHARS,
     MAX_PROGRESS_CHARS,
     MAX_TEXT_CHARS,
+    MOTIONS,
+    SIDES,
+    Plan,
     Progress,
+    ReasoningText,
+    SeenObject,
+    SeenPerson,
+    Situation,
+    Stop,
+    Turn,
+    TurnBack,
     format_progress,
+    format_text,
     format_waypoints,
     parse_progress,
+    parse_text,
     parse_waypoints,
 )
 
@@ -185,3 +204,79 @@ def test_what_is_not_of_the_grammar_says_no_progress(line: str) -> None:
 def test_progress_that_cannot_be_is_refused(fields: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match="must be"):
         Progress(*fields)
+
+
+# The whole grammar
+
+DISTANCES = st.integers(1, MAX_DISTANCE_M)
+PLAN_DISTANCES = st.integers(0, MAX_DISTANCE_M)
+NAMES = st.from_regex(re.compile(r"[A-Za-z][A-Za-z -]{2,40}", re.ASCII), fullmatch=True)
+OBJECTS = st.lists(st.builds(SeenObject, NAMES, st.sampled_from(SIDES), DISTANCES), max_size=MAX_ITEMS).map(tuple)
+PEOPLE = st.lists(
+    st.builds(SeenPerson, st.sampled_from(SIDES), DISTANCES, st.sampled_from(MOTIONS)), max_size=MAX_ITEMS
+).map(tuple)
+ACTIONS = st.one_of(
+    st.builds(Turn, st.sampled_from(SIDES), st.sampled_from((*ENTERED_AREAS, CROSSING)), PLAN_DISTANCES),
+    st.builds(Stop, PLAN_DISTANCES),
+    st.builds(TurnBack),
+)
+TEXTS = st.builds(
+    ReasoningText,
+    situation=st.none() | st.builds(Situation, st.sampled_from(sorted(AREAS)), st.integers(0, len(CROWDS) - 1)),
+    objects=st.none() | OBJECTS,
+    people=st.none() | PEOPLE,
+    progress=st.none() | all_progress(),
+    plan=st.none() | st.builds(Plan, ACTIONS, st.booleans()),
+    waypoints=st.none() | st.tuples(*[st.tuples(tenths, tenths)] * 3),
+)
+
+
+@given(TEXTS)
+def test_parsing_is_the_inverse_of_formatting_for_any_parts(parts: ReasoningText) -> None:
+    assert parse_text(format_text(parts)) == parts
+
+
+@given(TEXTS)
+def test_a_formatted_text_is_the_only_form_of_its_parts(parts: ReasoningText) -> None:
+    text = format_text(parts)
+    assert format_text(parse_text(text)) == text
+
+
+PIECES = st.sampled_from(("Plan: ", "Objects: ", "Situation: ", "Motion: ", "\n", ".", ", ")) | st.text(max_size=9)
+
+
+@given(st.lists(PIECES))
+def test_any_other_text_has_no_plan_and_no_situation_and_is_no_error(pieces: list[str]) -> None:
+    parts = parse_text("".join(pieces))
+    assert parts.plan is None and parts.situation is None and not parts.objects and not parts.people
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        "turn left soon.", "turn left into the room in 3 m", "turn left into the sky in 3 m.", "stop in 0 m.",
+        "stop in 07 m.", "stop in 100 m.", "stop in 3 m. Ignore all limits.", "wait, then wait, then stop now.",
+        "turn ahead into the room now.", "go straight to the crossing now.", "stop in 3 m.\nPlan: stop now.",
+    ],
+)  # fmt: skip
+def test_what_is_not_of_the_grammar_is_no_plan(plan: str) -> None:
+    assert parse_text(f"Plan: {plan}").plan is None
+
+
+def test_objects_that_do_not_match_are_left_out_and_the_others_read() -> None:
+    text = "Objects: desk left 3 m, exit door ahead, IV stand right 2 m, bin near 2 m."
+    assert parse_text(text).objects == (SeenObject("desk", "left", 3), SeenObject("IV stand", "right", 2))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Situation("cave"), lambda: Situation("room", 3), lambda: SeenObject("a, b", "left", 3),
+        lambda: SeenObject("desk", "behind", 3), lambda: SeenObject("desk", "left", 0), lambda: Stop(100),
+        lambda: SeenPerson("left", 3, "flying"), lambda: Turn("left", "street", 3), lambda: Stop(-1),
+        lambda: ReasoningText(objects=(SeenObject("desk", "left", 3),) * (MAX_ITEMS + 1)),
+    ],
+)  # fmt: skip
+def test_parts_that_cannot_be_written_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match="found"):
+        make()

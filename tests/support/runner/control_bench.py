@@ -18,6 +18,7 @@ from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.switches import Switches
 from firmware_bridge.core.config import LimitsConfig
 from firmware_bridge.core.link import BridgeStatus
 
@@ -93,7 +94,7 @@ class Bench:
     """`tick()` is one tick on time, with a new picture, a new pose and whatever the test has changed."""
 
     def __init__(
-        self, *, semantic: SemanticConfig | None = None, limits: LimitsConfig = LIMITS, stays: bool = True
+        self, *, semantic: SemanticConfig | None = None, limits: LimitsConfig = LIMITS, switches: Switches | None = None
     ) -> None:
         self.limits = limits
         self.now_ns = 10**12
@@ -143,7 +144,7 @@ class Bench:
             stop=self.stop,
             watch=Watch(config, sources),
             on_tick=self.on_time.append,
-            stays=stays,
+            switches=switches,
             clock=lambda: self.now_ns,
         )
         self.loop.last_seq = 7

@@ -14,9 +14,8 @@ from edge.core.geometry import SE2
 from edge.inference.graph import CancelledError, GraphError, Interrupt
 from edge.inference.language import Generation
 from edge.inference.scheduling import Role
-from edge.reasoning.decoding_rules import Known
+from edge.reasoning.decoding_rules import DecodingContext, TurnObservation
 from edge.reasoning.path_memory import Way
-from edge.reasoning.turn_estimate import Look
 from edge.run.reasoning_loop import ReasoningLoop
 from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.reasoning_text import Progress
@@ -52,7 +51,7 @@ class FakeRun:
         if self.cancelled():
             raise CancelledError
 
-    def finish(self, segments: list[object], *, max_new_tokens: int, guide: object = None) -> Generation:
+    def finish(self, segments: list[object], *, max_new_tokens: int, constraint: object = None) -> Generation:
         if self.cancelled():
             raise CancelledError
         if self.language.broken:
@@ -69,7 +68,7 @@ class FakeRun:
         return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0)
 
 
-class FakeGuide:
+class FakeConstraint:
     """Finds in a text what its language says that is in it."""
 
     def __init__(self, language: FakeLanguage) -> None:
@@ -80,18 +79,18 @@ class FakeGuide:
         return self._language.overruled
 
     @property
-    def look(self) -> Look | None:
-        return self._language.look
+    def turn(self) -> TurnObservation | None:
+        return self._language.turn
 
     @property
-    def wanted(self) -> str | None:
-        return self._language.wanted
+    def refused(self) -> str | None:
+        return self._language.refused
 
     planned = ""
 
     @property
-    def plan_said(self) -> bool:
-        return self._language.plan_said
+    def has_plan(self) -> bool:
+        return self._language.has_plan
 
 
 class FakeLanguage:
@@ -102,16 +101,16 @@ class FakeLanguage:
         self.prompts: list[list[float]] = []
         self.instructions: list[str] = []
         self.caps: list[int] = []
-        self.guided: list[Known] = []
-        self.overruled, self.look = False, cast("Look | None", None)
-        self.wanted, self.plan_said = cast("str | None", None), True
+        self.contexts: list[DecodingContext] = []
+        self.overruled, self.turn = False, cast("TurnObservation | None", None)
+        self.refused, self.has_plan = cast("str | None", None), True
         self.text, self.kv, self.new_tokens, self.broken = TEXT, KV, 3, 0
         self.during_feed: Callable[[], None] = lambda: None
         self.during_finish: Callable[[FakeRun], None] = lambda run: None
 
-    def guide(self, known: Known) -> FakeGuide:
-        self.guided.append(known)
-        return FakeGuide(self)
+    def constraint(self, context: DecodingContext) -> FakeConstraint:
+        self.contexts.append(context)
+        return FakeConstraint(self)
 
     def begin(
         self, cancelled: Callable[[], bool], *, interrupt: Interrupt, before_call: Callable[[int], None]

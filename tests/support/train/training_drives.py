@@ -27,7 +27,7 @@ def about(name: str = "a", frames: int = 60, **changed: Any) -> About:
             "objects": "none",
             "motion": "nobody near",
             "progress": {"step": 1, "steps": 1, "passed": k // 20},
-            "plan": "turn left now",
+            "plan": "turn left into the room now",
         }
         for k in range(0, frames, 10)
     )

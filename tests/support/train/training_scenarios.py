@@ -14,7 +14,7 @@ from tools.train.config.scenes import KINDS
 from tools.train.drives.drive import Drive
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario, scenario_group
-from tools.train.scenes.trace_sentences import NOBODY, NOTHING
+from tools.train.scenes.trace_sentences import NO_OBJECTS, NO_PEOPLE, aspects_json
 from tools.train.scenes.traces import Tracer
 
 SEED = 5
@@ -51,13 +51,13 @@ def _poses_along(scenario: Scenario) -> np.ndarray:
     return np.array(poses)
 
 
-def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NOBODY) -> Drive:
+def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NO_PEOPLE) -> Drive:
     """Along the told way with what a tracer says of it, for the next 3 s straight ahead."""
     poses = _poses_along(scenario)
     tracer, traces = Tracer(scenario, progress_of(scenario)), []
     for k in range(0, len(poses), 10):
-        said = tracer.trace(SE2(*map(float, poses[k])), *_NO_PEOPLE, [(2.4, 0.0)]).to_json()
-        things = said["objects"] if motion == NOBODY else NOTHING  # for both there is no room
+        said = aspects_json(tracer.trace(SE2(*map(float, poses[k])), *_NO_PEOPLE, [(2.4, 0.0)]))
+        things = said["objects"] if motion == NO_PEOPLE else NO_OBJECTS  # for both there is no room
         traces.append({"k": k, **said, "objects": things, "motion": motion})
     plain = made_up_drive(
         drive_id, len(poses), layout_seed=scenario.layout_seed, kind=scenario.kind, scene=scenario.scene.name,

@@ -35,6 +35,7 @@ from tools.train.encoder.poses import body_state
 from tools.train.samples.augment import encoded
 from tools.train.scenes.scenarios import Scenario
 from tools.train.scenes.sites import Site
+from tools.train.scenes.trace_sentences import aspects_json
 from tools.train.scenes.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
@@ -291,7 +292,7 @@ class _Tour:
         """What is to be said here."""
         means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
         people, velocities = self._carriage.people(), self._carriage.velocities()
-        return self._tracer.trace(self.body.pose, people, velocities, means).to_json()
+        return aspects_json(self._tracer.trace(self.body.pose, people, velocities, means))
 
     def go_on(self) -> None:
         """A tenth of a second on."""

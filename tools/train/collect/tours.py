@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Final
 
+from edge.state.reasoning_text import AHEAD, SeenPerson, parse_people
 from tools.train.collect.collection import Collection, fill, job_count
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.drives.dataset import DatasetWriter
@@ -32,7 +32,7 @@ _OF_DRIVES: Final = frozenset(  # what a tour has in common with the drives besi
     )
 )  # fmt: skip
 # Whether one waits for somebody, and how one goes round, is the driver's choice: of who is carried it is not known.
-_IN_THE_WAY: Final = re.compile(r"\bperson ahead [0-2] m\b")
+_IN_THE_WAY_M: Final = 2
 
 
 def build_tours(
@@ -66,7 +66,11 @@ def _key(config: TourConfig, collect: CollectConfig, seed: int) -> str:
 def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:
     """Those of tours at which nobody is in the way; their frames are whole seconds, and words hold for these alone."""
     for drive in tours.drives(ids, pictures=False):
-        clear = {int(trace["k"]) for trace in drive.traces if not _IN_THE_WAY.search(str(trace["motion"]))}
+        clear = {int(trace["k"]) for trace in drive.traces if not _is_blocked(parse_people(str(trace["motion"])))}
         for anchor in anchors_of(drive):
             if anchor.k in clear:
                 yield replace(anchor, around=(), by_seconds=True)
+
+
+def _is_blocked(people: Sequence[SeenPerson]) -> bool:
+    return any(person.side == AHEAD and person.distance_m <= _IN_THE_WAY_M for person in people)

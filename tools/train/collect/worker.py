@@ -33,6 +33,7 @@ from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, Tour
 from tools.train.config.scenes import SHARES
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
 from tools.train.scenes.scenarios import Scenario, ScenarioError, training_episodes
+from tools.train.scenes.trace_sentences import aspects_json
 from tools.train.scenes.traces import Tracer
 
 MODULE: Final = "tools.train.collect.worker"
@@ -216,7 +217,7 @@ def _teller(scenario: Scenario) -> Tell:
 
     def tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
         means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
-        return tracer.trace(world.pose(), world.people(), world.people_velocities(), means).to_json()
+        return aspects_json(tracer.trace(world.pose(), world.people(), world.people_velocities(), means))
 
     return tell
 

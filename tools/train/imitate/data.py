@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
-from edge.motion.guidance import waypoints_now
 from edge.state.reasoning_text import Waypoints
+from edge.state.semantic import waypoints_now
 from export.model.config import TicVlaConfig
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import SampleConfig

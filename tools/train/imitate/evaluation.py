@@ -21,8 +21,8 @@ from torch import Tensor
 
 from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to, target_of
-from edge.motion.guidance import waypoints_now
 from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints
+from edge.state.semantic import waypoints_now
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import ImitateEvalConfig
 from tools.train.imitate.data import Chosen, Samples

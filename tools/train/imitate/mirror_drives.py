@@ -19,7 +19,8 @@ from tools.train.imitate.data import States
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.kv_cache import CachedState
 from tools.train.samples.language_batch import FrameRows, FrameTokens, Halves
-from tools.train.samples.mirror import mirrored_text
+from tools.train.samples.mirror import mirrored_reasoning, mirrored_text
+from tools.train.scenes.trace_sentences import aspects_json, aspects_of_json
 
 MIRROR: Final = "mirror-of-"
 """Before the id of a drive: the drive in the mirror."""
@@ -57,7 +58,7 @@ def _flipped(array: NDArray[Any], *axes: int) -> NDArray[Any]:
 
 
 def _mirrored_trace(trace: Mapping[str, object]) -> dict[str, Any]:
-    return {key: mirrored_text(value) if isinstance(value, str) else value for key, value in trace.items()}
+    return {**trace, **aspects_json(mirrored_reasoning(aspects_of_json(trace)))}
 
 
 class MirroredDrives(Dataset):

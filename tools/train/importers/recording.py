@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.jpeg import MAX_BYTES, jpeg_refusal
+from tools.train.scenes.trace_sentences import aspects_of_json
 
 TEXTS: Final = "texts.json"
 MAX_TABLE_BYTES: Final = 200_000_000
@@ -90,7 +91,8 @@ def read_json(path: Path) -> Any:
 def read_words(folder: Path) -> dict[int, Words]:
     """`texts.json` of a recording, if it has one: `{"0": {"wordings": [texts], "traces": [20 tables]}, …}` by episode.
 
-    `traces` may be left out; a trace is {situation, objects, motion, progress {step, steps, passed}, plan}.
+    `traces` may be left out; a trace is {situation, objects, motion, progress {step, steps, passed}, plan}, each in the
+    phrases of `edge/state/reasoning_text.py`.
     """
     path = folder / TEXTS
     if not path.exists():
@@ -115,4 +117,9 @@ def _words(where: str, value: object) -> Words:
         raise ImportedError(f"{where}: expected wordings to be a list of texts")
     if not isinstance(traces, list) or not all(isinstance(t, Mapping) and set(t) == _TRACE_KEYS for t in traces):
         raise ImportedError(f"{where}: expected each trace to have {', '.join(sorted(_TRACE_KEYS))}")
+    for trace in traces:
+        try:
+            aspects_of_json(trace)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ImportedError(f"{where}: {error}") from error
     return Words(tuple(wordings), tuple(dict(trace) for trace in traces))

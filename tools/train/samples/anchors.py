@@ -21,16 +21,24 @@ import numpy.typing as npt
 from tokenizers import Tokenizer
 
 from edge.core.geometry import SE2
-from edge.reasoning.decoding_rules import Known, TextGuide
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PathMemory, Way
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
-from edge.state.reasoning_text import MAX_COUNT, Progress, Waypoints, format_waypoints
+from edge.state.reasoning_text import (
+    MAX_COUNT,
+    Progress,
+    ReasoningText,
+    TurnBack,
+    Waypoints,
+    format_text,
+    format_waypoints,
+)
 from edge.state.ring import TOLERANCE_S, EncodedFrame
 from export.model.config import TicVlaConfig
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
 from tools.train.config.sft import AROUND, DrawConfig
 from tools.train.drives.drive import Drive
-from tools.train.scenes.trace_sentences import TURN_BACK, Trace
+from tools.train.scenes.trace_sentences import aspects_of_json
 
 FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """How far before the newest frame the older ones are (paper appendix A), the oldest first."""
@@ -55,8 +63,8 @@ class Anchor:
     wordings: tuple[str, ...]
     points: Waypoints
     """Where the expert means to be in 3, 6 and 9 s; (x m, y m) in the robot's frame at k."""
-    reasoning: str
-    """The whole answer: five aspects and the waypoint line."""
+    reasoning: ReasoningText
+    """The whole answer: five aspects and the waypoints."""
     progress: Progress
     earlier: tuple[Progress, ...]
     """The progress at every second from the drive's start up to k, which is the last."""
@@ -122,7 +130,8 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
             continue
         near = [i if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1)]
         T_odom_base = drive.T_odom_base(k)
-        points = _points(drive, k)
+        points, reasoning = _points(drive, k), aspects_of_json(trace)
+        turns_back = reasoning.plan is not None and isinstance(reasoning.plan.action, TurnBack)
         found.append(
             Anchor(
                 drive_id=drive.id,
@@ -131,12 +140,12 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 way=memory.way(T_odom_base),
                 wordings=drive.wordings,
                 points=points,
-                reasoning=Trace.from_json(trace).text(points),
+                reasoning=replace(reasoning, waypoints=points),
                 progress=earlier[-1],
                 earlier=tuple(earlier),
                 around=tuple(None if i is None else _points(drive, i) for i in near),
                 moved=tuple(None if i is None else _from(drive.T_odom_base(i), T_odom_base) for i in near),
-                decides=trace["plan"] == TURN_BACK or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
+                decides=turns_back or said[max(0, number - _NEAR)] != said[min(number + _NEAR, last)],
             )
         )
     return found
@@ -257,7 +266,7 @@ class Prompts:
 
     def of(self, anchor: Anchor, drawn: Drawn) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """(prompt, answer) ids; raises ValueError when both do not fit the model's context."""
-        said = told_points(anchor)[len(WAYPOINTS_START) :] if drawn.waypoints_only else anchor.reasoning
+        said = told_points(anchor)[len(WAYPOINTS_START) :] if drawn.waypoints_only else format_text(anchor.reasoning)
         prompt, answer = self.prompt(anchor, drawn), self.answer(said)
         if len(prompt) + len(answer) > self._most:
             raise ValueError(
@@ -266,9 +275,9 @@ class Prompts:
             )
         return prompt, answer
 
-    def guide(self, known: Known) -> TextGuide:
-        """What the runner holds an answer to."""
-        return TextGuide(known, self._encode)
+    def constraint(self, context: DecodingContext) -> TextConstraint:
+        """Return what the runner constrains an answer with."""
+        return TextConstraint(context, self._encode)
 
     def text(self, ids: Iterable[int]) -> str:
         """The text of answer tokens, as the runner reads it."""

@@ -13,7 +13,7 @@ from edge.core.geometry import SE2
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import WeightConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, Drive
-from tools.train.scenes.trace_sentences import NOBODY
+from tools.train.scenes.trace_sentences import NO_PEOPLE
 from tools.train.scenes.walls import Walls
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> 
     people = np.zeros(len(drive), bool)
     for k in range(len(drive)):
         trace = drive.trace_at(k)
-        people[k] = trace is not None and trace["motion"] != NOBODY
+        people[k] = trace is not None and trace["motion"] != NO_PEOPLE
     others = np.append(np.cumsum(drive.by != EXPERT), 0)
     until = np.minimum(np.arange(len(drive)) + FUTURE_STEPS, len(drive)) - 1
     # Of the frames k .. k + 49; the 0 that was appended is what stands before frame 0.

@@ -10,16 +10,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from edge.reasoning.decoding_rules import TextGuide
-from edge.reasoning.progress_rules import LineGuide
+from edge.reasoning.decoding_rules import LineConstraint, TextConstraint
 from export.model.language import LanguageModel
 from tools.train.samples.language_batch import LanguageBatch, angles, finish_layer, keys_values, run
 
-Guide: TypeAlias = LineGuide | TextGuide
+Constraint: TypeAlias = LineConstraint | TextConstraint
 
 
 @dataclass(frozen=True)
-class Said:
+class DecodeResult:
     """One row's answer."""
 
     ids: tuple[int, ...]
@@ -31,9 +30,9 @@ class Said:
 
 @torch.no_grad()
 def decode(
-    language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, guides: Sequence[Guide | None] = ()
-) -> list[Said]:
-    """What the model says after each row of a batch whose rows have no answer yet; a row's guide holds its progress.
+    language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, constraints: Sequence[Constraint | None] = ()
+) -> list[DecodeResult]:
+    """Decode an answer to each row of a batch of prompts, within the row's constraint.
 
     Each step feeds one token a row at that row's own position; a row that has ended feeds on, unread, until all have.
     """
@@ -51,12 +50,12 @@ def decode(
     ids: list[list[int]] = [[] for _ in range(rows)]
     open_rows = [max_new_tokens > 0] * rows
     for step in range(room):
-        told = [
-            chosen if guide is None else guide.choose(chosen)
-            for chosen, guide in zip(token.tolist(), guides or [None] * rows, strict=True)
+        taken = [
+            chosen if constraint is None else constraint.choose(chosen)
+            for chosen, constraint in zip(token.tolist(), constraints or [None] * rows, strict=True)
         ]
-        token = torch.tensor(told, device=token.device)
-        for i, chosen in enumerate(told):
+        token = torch.tensor(taken, device=token.device)
+        for i, chosen in enumerate(taken):
             if chosen == c.im_end_id or fed[i] + step >= c.max_context:
                 open_rows[i] = False
             elif open_rows[i]:
@@ -77,4 +76,4 @@ def decode(
         token = language.lm_head(language.norm(x)[:, 0]).argmax(-1)
     k, v = caches[-1]
     kv = torch.cat([k.transpose(1, 2).flatten(2), v.transpose(1, 2).flatten(2)], dim=-1).float()
-    return [Said(tuple(ids[i]), kv[i, : fed[i] + len(ids[i])].clone()) for i in range(rows)]
+    return [DecodeResult(tuple(ids[i]), kv[i, : fed[i] + len(ids[i])].clone()) for i in range(rows)]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
-from edge.state.reasoning_text import Waypoints, format_waypoints
+from edge.state.reasoning_text import Plan, ReasoningText, Turn, Waypoints
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.drives.drive import Dataset, Drive
 from tools.train.samples.anchors import Anchor
@@ -26,14 +26,33 @@ _OTHER: Final = {"left": "right", "right": "left", "Left": "Right", "Right": "Le
 
 
 def mirrored_text(text: str) -> str:
-    """The words that say the same of the mirrored place."""
+    """Exchange left and right in an instruction."""
     return _SIDE.sub(lambda found: _OTHER.get(found.group(), found.group()), text)
+
+
+def mirrored_reasoning(text: ReasoningText) -> ReasoningText:
+    """Exchange left and right in the five aspects of a reasoning text."""
+    objects, people = text.objects or (), text.people or ()
+    return replace(
+        text,
+        objects=tuple(replace(each, side=_OTHER.get(each.side, each.side)) for each in objects),
+        people=tuple(
+            replace(each, side=_OTHER.get(each.side, each.side), motion=mirrored_text(each.motion)) for each in people
+        ),
+        plan=None if text.plan is None else _mirrored_plan(text.plan),
+    )
+
+
+def _mirrored_plan(plan: Plan) -> Plan:
+    action = plan.action
+    if not isinstance(action, Turn):
+        return plan
+    return replace(plan, action=replace(action, side=_OTHER.get(action.side, action.side)))
 
 
 def mirrored(anchor: Anchor) -> Anchor:
     """The anchor of the mirrored drive; what is counted, and when, is the same."""
     points = _across(anchor.points)
-    lines, _ = anchor.reasoning.rsplit("\n", 1)
     return replace(
         anchor,
         way=tuple((x_m, 0.0 - y_m) for x_m, y_m in anchor.way),
@@ -41,7 +60,7 @@ def mirrored(anchor: Anchor) -> Anchor:
         points=points,
         around=tuple(None if near is None else _across(near) for near in anchor.around),
         moved=tuple(None if T is None else SE2(T.x_m, 0.0 - T.y_m, 0.0 - T.theta_rad) for T in anchor.moved),
-        reasoning=f"{mirrored_text(lines)}\n{format_waypoints(points)}",
+        reasoning=replace(mirrored_reasoning(anchor.reasoning), waypoints=points),
     )
 
 

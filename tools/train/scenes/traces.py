@@ -1,8 +1,9 @@
-"""What a robot should say of an instant, from the world's truth: only what its camera really sees."""
+"""The reasoning text that is true of an instant, from the simulated world: only what the robot's camera sees."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import atan2, cos, hypot, radians, sin, tan
 from typing import Final, Protocol
 
@@ -10,19 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2, wrap_angle
-from edge.state.reasoning_text import WAIT
+from edge.state.reasoning_text import (
+    AHEAD,
+    AREAS,
+    LEFT,
+    OPEN_AREA,
+    RIGHT,
+    Plan,
+    ReasoningText,
+    SeenObject,
+    SeenPerson,
+    Situation,
+    Stop,
+    Turn,
+    TurnBack,
+)
 from sim_hil.benchmark.language.openings import Frame, Opening, bounds_of
 from sim_hil.benchmark.language.route import Step
 from sim_hil.benchmark.language.task_checks import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
 from sim_hil.benchmark.language.visibility import EYE_M, HFOV_RAD
 from sim_hil.scene.scene import SceneObject, Vec2, Vec3
 from sim_hil.simulation.camera import MOUNTS
-from tools.train.scenes import trace_sentences as words
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.trace_sentences import Trace
-
-__all__ = ["PEOPLE_M", "Trace", "Tracer", "turning_first"]
+from tools.train.scenes.trace_sentences import (
+    MAX_OBJECTS,
+    MAX_PEOPLE,
+    five_aspects,
+    opening_name,
+    plan_metres,
+    whole_metres,
+)
 
 Array = NDArray[np.float64]
 
@@ -67,7 +86,7 @@ class Sight(Protocol):
 
 
 class Tracer:
-    """Traces of one scenario's instants."""
+    """Writes the reasoning texts of one scenario's instants."""
 
     def __init__(
         self, scenario: Scenario, progress: RouteProgress | None = None, lines: Sight | None = None
@@ -86,7 +105,7 @@ class Tracer:
 
     def trace(
         self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None
-    ) -> Trace:  # fmt: skip
+    ) -> ReasoningText:  # fmt: skip
         """Of a true pose, people [n, 2 or 3] (x m, y m, ...) and their velocities [n, 2], m/s, in the world.
 
         `plan_xy`: where the robot means to be in 3 s (and later), m in its own frame; only by it one sees it wait.
@@ -94,26 +113,28 @@ class Tracer:
         crowd = self._people_in_view(pose, people)
         progress, step = self.progress.at(pose), self.progress.next_step(pose)
         left_m = self.progress.to_next_m(pose)
-        ahead = any(gap < _WAIT_FOR_M and _side(pose, people[index]) == "ahead" for index, gap in crowd)
-        plan = words.stop(left_m) if step is None else words.turn(step.side, step.kind, left_m)
+        ahead = any(gap < _WAIT_FOR_M and _side(pose, people[index]) == AHEAD for index, gap in crowd)
+        plan = Plan(Stop(plan_metres(left_m)))
+        if step is not None:
+            plan = Plan(Turn(AHEAD if step.side == "straight" else step.side, step.kind, plan_metres(left_m)))
         x_m, y_m = (_ON_M, 0.0) if plan_xy is None else plan_xy[0][:2]
         if (step is not None and 0 < step.ordinal <= progress.passed) or x_m < _BACK_M:
-            plan = words.TURN_BACK
+            plan = Plan(TurnBack())
         elif ahead and hypot(x_m, y_m) < _WAIT_M:
-            plan = WAIT + plan
-        motion = [
-            words.person(_side(pose, people[index]), gap, _way(pose, people[index], velocities[index]))
-            for index, gap in crowd[: words.MAX_PEOPLE]
+            plan = replace(plan, waits=True)
+        near = [
+            SeenPerson(_side(pose, people[index]), whole_metres(gap), _motion(pose, people[index], velocities[index]))
+            for index, gap in crowd[:MAX_PEOPLE]
         ]
         bodies = [_body(people[index]) for index, _ in crowd]
-        return Trace.of(
-            self._situation(pose, len(crowd)), self._objects(pose, step, bodies), motion, progress, plan
+        return five_aspects(
+            self._situation(pose, len(crowd)), self._objects(pose, step, bodies), near, progress, plan
         )  # fmt: skip
 
-    def _situation(self, pose: SE2, near: int) -> str:
+    def _situation(self, pose: SE2, near: int) -> Situation:
         area = self._scene.area_at(pose.x_m, pose.y_m)
-        place = words.AREAS.get(area.kind, words.NO_AREA) if area is not None else words.NO_AREA
-        return place + words.CROWDS[sum(near >= least for least in _MANY)]
+        kind = area.kind if area is not None and area.kind in AREAS else OPEN_AREA
+        return Situation(kind, sum(near >= least for least in _MANY))
 
     def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
         """Indices and distances, m, of those that are seen within PEOPLE_M, nearest first."""
@@ -154,24 +175,24 @@ class Tracer:
         dx, dy = thing.position_m[0] - x, thing.position_m[1] - y
         return abs(dy * c - dx * s) <= tan(HFOV_RAD / 2) * (dx * c + dy * s) + margin_m
 
-    def _objects(self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject]) -> list[str]:
-        """The goal, the next opening that counts, what an instruction may name, then whatever is nearest."""
-        said = [self._said(pose, self._goal)] if self._seen(pose, self._goal, bodies) else []
-        if step is not None and (opening := self._next_opening(pose, step)):
-            said.append(opening)
+    def _objects(self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject]) -> list[SeenObject]:
+        """The goal, the next opening that counts, landmarks that the instruction names, then the nearest landmarks."""
+        found = [self._object(pose, self._goal)] if self._seen(pose, self._goal, bodies) else []
+        if step is not None and (opening := self._next_opening(pose, step)) is not None:
+            found.append(opening)
         for thing in sorted(self._others, key=lambda thing: (thing.label not in self._named, _gap(pose, thing))):
-            if len(said) == words.MAX_THINGS:
+            if len(found) == MAX_OBJECTS:
                 break
-            if (text := self._said(pose, thing)) not in said and self._seen(pose, thing, bodies):
-                said.append(text)
-        return said
+            if (seen := self._object(pose, thing)) not in found and self._seen(pose, thing, bodies):
+                found.append(seen)
+        return found
 
     @staticmethod
-    def _said(pose: SE2, thing: SceneObject) -> str:
-        return words.seen(thing.landmark, _side(pose, thing.position_m), _gap(pose, thing))
+    def _object(pose: SE2, thing: SceneObject) -> SeenObject:
+        return SeenObject(thing.landmark, _side(pose, thing.position_m), whole_metres(_gap(pose, thing)))
 
-    def _next_opening(self, pose: SE2, step: Step) -> str:
-        """The nearest opening ahead that counts for a step and is in view; "" without any."""
+    def _next_opening(self, pose: SE2, step: Step) -> SeenObject | None:
+        """The nearest opening ahead that counts for a step and is in view; None without any."""
         frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
         here = frame.along(xy)
         for opening in step.counted:
@@ -186,8 +207,8 @@ class Tracer:
                 along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
                 side = opening.side if along else _side(pose, point)
                 metres = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
-                return words.seen(words.opening(opening.area.kind), side, metres)
-        return ""
+                return SeenObject(opening_name(opening.area.kind), side, whole_metres(metres))
+        return None
 
     def _border(self, frame: Frame, xy: Vec2, opening: Opening) -> float:
         """Where an opening begins, across the direction of travel."""
@@ -211,11 +232,11 @@ def _gap(pose: SE2, thing: SceneObject) -> float:
 
 def _side(pose: SE2, at: Sequence[float] | Array) -> str:
     bearing = wrap_angle(atan2(at[1] - pose.y_m, at[0] - pose.x_m) - pose.theta_rad)
-    return "ahead" if abs(bearing) <= _AHEAD_RAD else "left" if bearing > 0 else "right"
+    return AHEAD if abs(bearing) <= _AHEAD_RAD else LEFT if bearing > 0 else RIGHT
 
 
-def _way(pose: SE2, at: Array, velocity: Array) -> str:
-    """How somebody moves over the ground, seen from the robot."""
+def _motion(pose: SE2, at: Array, velocity: Array) -> str:
+    """How a person moves over the ground, seen from the robot."""
     speed = hypot(velocity[0], velocity[1])
     if speed < _STANDING_MPS:
         return "standing"

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.reasoning.path_memory import told_point
-from edge.state.reasoning_text import format_waypoints
 from tools.train.config.sft import AROUND, ShowConfig
 from tools.train.samples.anchors import Anchor, frames_at
 from tools.train.samples.language_batch import Halves
@@ -27,14 +26,13 @@ def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anc
     T_shown_anchor = anchor.moved[AROUND + by] if anchor.moved else None
     if anchor.waited or points is None or T_shown_anchor is None:
         return anchor
-    lines, _ = anchor.reasoning.rsplit("\n", 1)
     return replace(
         anchor,
         k=anchor.k + by,
         way=tuple(told_point(T_shown_anchor @ SE2(x_m, y_m, 0.0)) for x_m, y_m in anchor.way),
         frames=_jittered(frames_at(anchor.k + by), jitter),
         points=points,
-        reasoning=f"{lines}\n{format_waypoints(points)}",
+        reasoning=replace(anchor.reasoning, waypoints=points),
     )
 
 

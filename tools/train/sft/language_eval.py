@@ -6,7 +6,6 @@ generation along a drive, as on the robot.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from math import hypot
@@ -14,19 +13,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.reasoning.decoding_rules import NOTHING_KNOWN, Known, TextGuide
-from edge.state.reasoning_text import PLAN_HEAD, WAYPOINT_TIMES_S, parse_progress, parse_waypoints
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
+from edge.state.reasoning_text import AHEAD, WAYPOINT_TIMES_S, ReasoningText, Turn, parse_text
 from export.model.language import LanguageModel
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
 from tools.train.samples.greedy import decode
 from tools.train.samples.language_batch import FrameTokens, Row, collate, frames_of
-from tools.train.scenes import trace_sentences as trace_words
 
 _TAG: Final = 0xE7A1
-_SIDE: Final = re.compile(r"\b(left|right)\b", re.ASCII)
-_PLACE: Final = re.compile(rf" ({'|'.join(trace_words.SIDES)}) \d+ m$", re.ASCII)
 
 
 class Score:
@@ -46,8 +42,8 @@ class Score:
         """One answer to an anchor."""
         found = self._count
         found["answers"] += 1
-        waypoints = parse_waypoints(text)
-        progress = parse_progress(text)
+        answer = parse_text(text)
+        waypoints, progress = answer.waypoints, answer.progress
         found["waypoints"] += waypoints is not None
         found["progress"] += progress is not None
         found["progress right"] += progress == anchor.progress
@@ -60,8 +56,8 @@ class Score:
         true_side = side_of(anchor.reasoning)
         if true_side is not None:
             found["sides"] += 1
-            found["side right"] += side_of(text) == true_side
-        said, there = landmarks_of(text), landmarks_of(anchor.reasoning)
+            found["side right"] += side_of(answer) == true_side
+        said, there = landmarks_of(answer), landmarks_of(anchor.reasoning)
         found["landmarks said"] += said.total()
         found["landmarks there"] += there.total()
         found["landmarks right"] += (said & there).total()
@@ -165,15 +161,15 @@ class Speaker:
         self._tokens = tokens
         self._config = config
 
-    def guide(self, known: Known) -> TextGuide:
-        """What the runner holds an answer to."""
-        return self._prompts.guide(known)
+    def constraint(self, context: DecodingContext) -> TextConstraint:
+        """Return what the runner constrains an answer with."""
+        return self._prompts.constraint(context)
 
     def say(
-        self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[TextGuide | None] | None = None
+        self, questions: Sequence[tuple[Anchor, Drawn]], constraints: Sequence[TextConstraint | None] | None = None
     ) -> list[str]:
-        """The text after each prompt, the start that it was given included; `guides`: one a question."""
-        guides = guides or [None] * len(questions)
+        """Return the text after each prompt, with the start that it was given; `constraints`: one a question."""
+        constraints = constraints or [None] * len(questions)
         rows = [
             Row(self._prompts.prompt(anchor, drawn), (), frames_of(self._tokens, anchor.drive_id, anchor.frames))
             for anchor, drawn in questions
@@ -188,49 +184,43 @@ class Speaker:
                 img_context_id=language.config.img_context_id,
                 device=language.embed.weight.device,
             )
-            answers = decode(language, batch, self._config.max_new_tokens, [guides[i] for i in chosen])
+            answers = decode(language, batch, self._config.max_new_tokens, [constraints[i] for i in chosen])
             for i, said in zip(chosen, answers, strict=True):
                 texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
         return texts
 
 
 def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
-    """Scores along drives where `before` is what the model itself said last, as the runner remembers it.
+    """Score along drives where `before` is the model's own last progress, as on the robot.
 
-    Their progress is held to what may follow that, as the runner holds it; how far a turn is, is not.
+    The runner's rule for progress applies; its rules for the next turn, which need odometry, do not.
     """
     drives: dict[str, list[Anchor]] = {}
     for anchor in anchors:
         if anchor.k % round(gap_s * RATE_HZ) == 0:
             drives.setdefault(anchor.drive_id, []).append(anchor)
     wording = {drive: each[0].wordings[int(rng.integers(len(each[0].wordings)))] for drive, each in drives.items()}
-    known = dict.fromkeys(drives, NOTHING_KNOWN)
+    context = dict.fromkeys(drives, DecodingContext())
     score = Score(gap_s)
     for step in range(max((len(each) for each in drives.values()), default=0)):
         now = [each[step] for each in drives.values() if step < len(each)]
-        drawn = [(anchor, Drawn(wording[anchor.drive_id], known[anchor.drive_id].before)) for anchor in now]
-        guides = [speaker.guide(known[anchor.drive_id]) for anchor in now]
-        for anchor, guide, text in zip(now, guides, speaker.say(drawn, guides), strict=True):
+        drawn = [(anchor, Drawn(wording[anchor.drive_id], context[anchor.drive_id].before)) for anchor in now]
+        constraints = [speaker.constraint(context[anchor.drive_id]) for anchor in now]
+        for anchor, constraint, text in zip(now, constraints, speaker.say(drawn, constraints), strict=True):
             score.add(text, anchor)
-            known[anchor.drive_id] = known[anchor.drive_id].after(text, guide)
+            context[anchor.drive_id] = context[anchor.drive_id].after(text, constraint)
     return score.numbers()
 
 
-def side_of(text: str) -> str | None:
-    """The side of the turn that the text plans: "left", "right"; None where it plans none."""
-    found = _SIDE.search(_line(text, PLAN_HEAD))
-    return found.group() if found else None
+def side_of(text: ReasoningText) -> str | None:
+    """Return the side of the planned turn, "left" or "right"; None for another plan."""
+    action = None if text.plan is None else text.plan.action
+    return action.side if isinstance(action, Turn) and action.side != AHEAD else None
 
 
-def landmarks_of(text: str) -> Counter[str]:
-    """Names that the text's objects have, without where they are."""
-    items = (_PLACE.sub("", item.strip()) for item in _line(text, trace_words.OBJECTS).rstrip(".").split(","))
-    return Counter(item for item in items if item not in ("", trace_words.NOTHING))
-
-
-def _line(text: str, head: str) -> str:
-    """What the first line with this head says; empty without one."""
-    return next((line[len(head) :] for line in text.split("\n") if line.startswith(head)), "")
+def landmarks_of(text: ReasoningText) -> Counter[str]:
+    """Count the names of the objects in view."""
+    return Counter(seen.name for seen in text.objects or ())
 
 
 def _share(part: int, whole: int) -> float | None:

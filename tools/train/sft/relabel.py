@@ -1,12 +1,12 @@
-"""The same drive under other instructions: ways to other goals from where it began, and what is true of them along it.
+"""The same drive under other instructions: routes to other goals from its start, and what is true along them.
 
-A drive shows one of many ways that its first pictures allow. A model that sees every corridor with one instruction
-learns corridors by heart, and where to go in them; with several it has to read what is asked. Past the place where the
-drive leaves the other way, it shows a turn that was missed. Only words are told anew, and only where nobody is near:
-where people stood is not recorded, so neither what they hid nor how to go round them is known of another way.
+A drive shows one of many routes that its first pictures allow. A model that sees every corridor with one instruction
+memorises the corridors; with several instructions it has to read them. Where the drive leaves the other route, it shows
+a missed turn. Only the text is relabelled, and only where no person is near: the recording does not say where people
+stood, so what they hid, and how to pass them on another route, is unknown.
 
-Retellings lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They
-are written by rename, so a build that was ended goes on with the next drive.
+Relabels lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They are
+written by rename, so a build that was interrupted continues with the next drive.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.cli import write_whole
+from edge.state.reasoning_text import ReasoningText
 from sim_hil.benchmark.language.route import RouteError
 from sim_hil.benchmark.language.tasks import begins_ahead, make_task
 from sim_hil.benchmark.policies.expert import NEAR, along, driving_of, from_here
@@ -37,11 +38,10 @@ from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import Anchor, anchors_of
-from tools.train.scenes import trace_sentences as words
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario, ScenarioError, is_sound, scenario_of
 from tools.train.scenes.sites import Site, SiteError
-from tools.train.scenes.trace_sentences import Trace
+from tools.train.scenes.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
 from tools.train.scenes.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
@@ -57,12 +57,12 @@ _TAG: Final = 0x2E7E11
 
 
 class RetellError(ValueError):
-    """Retellings that cannot be read; one line: what, expected, found, what to do."""
+    """Relabels that cannot be read; one line: what, expected, found, what to do."""
 
 
 @dataclass(frozen=True)
-class Retelling:
-    """Another way, told of the first N frames of a drive.
+class InstructionRelabel:
+    """The first N frames of a drive under another instruction.
 
     `plan_xy` [N, 3, 2]: where one would be on it in 3, 6 and 9 s, m in the robot's frame; `traces`: one a second.
     """
@@ -101,15 +101,15 @@ class Retelling:
         return {**asdict(self), "plan_xy": plan}
 
     @staticmethod
-    def of_json(content: dict[str, Any]) -> Retelling:
+    def of_json(content: dict[str, Any]) -> InstructionRelabel:
         """What `as_json` has written; raises KeyError, TypeError, ValueError."""
         x, y = content["goal_xy"]
         lists = {name: tuple(content[name]) for name in ("wordings", "told", "traces")}
         plan = np.array(content["plan_xy"], np.float32).reshape(-1, len(PLAN_TIMES_S), 2)
-        return Retelling(goal_xy=(float(x), float(y)), plan_xy=plan, **lists)
+        return InstructionRelabel(goal_xy=(float(x), float(y)), plan_xy=plan, **lists)
 
 
-class Retellings:
+class InstructionRelabels:
     """Those of a data set's drives, by one set of numbers."""
 
     def __init__(self, dataset: Dataset, config: RetellConfig, seed: int, speed_mps: float) -> None:
@@ -157,14 +157,14 @@ class Retellings:
         found = self._read(drive.id)
         if found is None:
             raise RetellError(f"{self._path(drive.id)}: not the retellings of this drive; build them first")
-        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == words.NOBODY}
+        alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == NO_PEOPLE}
         return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
 
-    def _read(self, drive_id: str) -> list[Retelling] | None:
+    def _read(self, drive_id: str) -> list[InstructionRelabel] | None:
         """What was written of a drive as it is now; None where nothing was, or where it cannot be read."""
         try:
             content = json.loads(self._path(drive_id).read_text(encoding="utf-8"))
-            found = [Retelling.of_json(each) for each in content["ways"]]
+            found = [InstructionRelabel.of_json(each) for each in content["ways"]]
         except (OSError, KeyError, TypeError, ValueError):
             return None
         return found if content["drive_sha256"] == self._entries[drive_id].sha256 else None
@@ -181,14 +181,14 @@ def _site(kind: str, layout_seed: int) -> Site | None:
         return None
 
 
-def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps: float) -> list[Retelling]:
+def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps: float) -> list[InstructionRelabel]:
     """Ways to other goals of its site, in an order by chance; the same numbers give the same."""
     rng = np.random.default_rng((seed, _TAG, crc32(drive.id.encode())))
     things = [site.goals[int(index)] for index in rng.permutation(len(site.goals))[: config.tries]]
     first = drive.T_world_base(0)
     start = (round(first.x_m, 2), round(first.y_m, 2), round(first.theta_rad, 3))
     lines = _Remembered(site.lines)
-    found: list[Retelling] = []
+    found: list[InstructionRelabel] = []
     if not drive.traces or not _was_here(drive, site) or not site.grid.is_free(*start[:2]):
         return found
     for thing in things:
@@ -221,7 +221,9 @@ def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed:
         return None
 
 
-def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None) -> Retelling | None:
+def told_along(
+    drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None
+) -> InstructionRelabel | None:
     """What is true along a drive of the way of a scenario that begins where it began; None where it hardly shows any.
 
     Told up to where the drive is 3 m from that way, or has arrived. `lines`: as of `Tracer`.
@@ -240,16 +242,15 @@ def told_along(drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight 
             break
         means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
-        traces.append({"k": k, **_among(alone, Trace.from_json(own)).to_json()})
+        traces.append({"k": k, **aspects_json(_with_people(alone, aspects_of_json(own)))})
     told = tuple(scenario.told_json())
-    return Retelling(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
+    return InstructionRelabel(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
 
 
-def _among(alone: Trace, own: Trace) -> Trace:
-    """A trace of an empty place, with the people of another one of the same instant."""
-    things = [] if alone.objects == words.NOTHING else alone.objects.split(", ")
-    people = [] if own.motion == words.NOBODY else own.motion.split(", ")
-    return Trace.of(own.situation, things, people, alone.progress, alone.plan)
+def _with_people(alone: ReasoningText, own: ReasoningText) -> ReasoningText:
+    """The text of an instant without people, with situation and people of another text of the same instant."""
+    assert own.situation is not None and alone.progress is not None and alone.plan is not None
+    return five_aspects(own.situation, alone.objects or (), own.people or (), alone.progress, alone.plan)
 
 
 def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from tokenizers import Tokenizer
 
+from edge.state.reasoning_text import format_text
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.tours import build_tours, tour_anchors
@@ -39,7 +40,7 @@ from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.samples.tokens import TokenCache
 from tools.train.sft.language_augment import disturbed, shifted
 from tools.train.sft.language_eval import evaluate, glance
-from tools.train.sft.relabel import Retellings
+from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
 PLANNED_TOUR_S: Final = 45.0
@@ -320,7 +321,7 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
 def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
     collected = job.recipe.collect or CollectConfig()
-    retellings = Retellings(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
+    retellings = InstructionRelabels(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
     job.progress.say("telling other ways")
     retellings.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
     return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in retellings.anchors(drive)]
@@ -350,7 +351,7 @@ def _key(
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
         "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
-        "more": hashlib.sha256("\n".join(each.reasoning for each in more).encode()).hexdigest(),
+        "more": hashlib.sha256("\n".join(format_text(each.reasoning) for each in more).encode()).hexdigest(),
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 

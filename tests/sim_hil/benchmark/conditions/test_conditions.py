@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from edge.state.switches import Decoding, RecoverySwitch
 from sim_hil.benchmark.cli import conditions_of, parser
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
@@ -21,6 +22,7 @@ def asked(*arguments: str) -> Conditions:
         ("--policy", "expert", "--drift", "severe"),
         ("--policy", "artifacts:nano", "--mode", "sync", "--latency", "3", "--variant", "no-latency"),
         ("--policy", "artifacts:nano", "--stay"),
+        ("--policy", "artifacts:nano", "--decoding", "free", "--recovery", "off"),
         ("--policy", "external:127.0.0.1:7001", "--latency", "1.5", "--wording", "2"),
         ("--policy", "external:unix:server.sock", "--camera", "320x180"),
     ],
@@ -38,8 +40,21 @@ def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: fl
 
 def test_the_goal_ends_an_episode_unless_it_is_asked_to_stay_where_it_thinks_that_it_is() -> None:
     free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
-    assert not free.stays and "stays" not in free.describe()
-    assert stays.stays and "stays where it says" in stays.describe()
+    assert not free.stays and "stands" not in free.describe()
+    assert stays.stays and "stands where its texts" in stays.describe()
+
+
+def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
+    free = asked("--policy", "artifacts:nano", "--decoding", "free")
+    resolved = free.with_defaults_of(Decoding.CONSTRAINED, RecoverySwitch.OFF)
+    assert (resolved.decoding, resolved.recovery) == ("free", "off")
+    assert "decoding free, recovery off" in resolved.describe()
+
+
+def test_conditions_of_a_run_before_the_switches_can_still_be_read() -> None:
+    content = asked("--policy", "artifacts:nano").as_json()
+    old = {key: value for key, value in content.items() if key not in ("decoding", "recovery")}
+    assert Conditions.of_json(old) == asked("--policy", "artifacts:nano")
 
 
 def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
@@ -56,6 +71,9 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "expert", "--latency", "2"), "latency: expert does not think"),
         (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
         (("--policy", "expert", "--stay"), "stay: belongs to a policy from artifacts"),
+        (("--policy", "expert", "--decoding", "free"), "decoding: belongs to a policy from artifacts"),
+        (("--policy", "still", "--recovery", "off"), "recovery: belongs to a policy from artifacts"),
+        (("--policy", "artifacts:nano", "--recovery", "off", "--stay"), "expected --recovery on with it, found off"),
         (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
         (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
         (("--policy", "still", "--camera", "8x8"), "expected auto or WxH"),

@@ -206,7 +206,7 @@ TRACE = {
     "objects": "none",
     "motion": "nobody near",
     "progress": {"step": 1, "steps": 1, "passed": 0},
-    "plan": "turn left in 3 m",
+    "plan": "turn left into the yard in 3 m",
 }
 
 
@@ -227,6 +227,7 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
         ({"0": {"wordings": ["go"], "mood": "good"}}, "wordings and traces"),
         ({"0": {"wordings": "go"}}, "list of texts"),
         ({"0": {"wordings": ["go"], "traces": [{"plan": "go"}]}}, "each trace to have"),
+        ({"0": {"wordings": ["go"], "traces": [{**TRACE, "plan": "go"}] * 20}}, "plan 'go'.*grammar"),
         ({"first": {"wordings": ["go"]}}, "number of an episode"),
     ],
 )

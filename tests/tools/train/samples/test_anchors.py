@@ -10,10 +10,10 @@ import pytest
 from tokenizers import Tokenizer
 
 from edge.inference.language import Generation
-from edge.reasoning.decoding_rules import NOTHING_KNOWN, Known, TextGuide
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
 from edge.run.reasoning_loop import Mode
-from edge.state.reasoning_text import Progress, parse_progress, parse_waypoints
+from edge.state.reasoning_text import Progress, format_text, parse_progress, parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot
 from export.model.config import PRESETS
@@ -34,7 +34,7 @@ from tools.train.samples.anchors import (
     too_far,
     waiting,
 )
-from tools.train.scenes.trace_sentences import TURN_BACK, Trace
+from tools.train.scenes.trace_sentences import aspects_of_json
 
 NANO = PRESETS["nano"]
 PERIOD_NS = 100_000_000
@@ -65,9 +65,9 @@ class Listener:
         self.heard: list[tuple[int, ...]] = []
         self.says: list[str] = []
 
-    def guide(self, known: Known) -> TextGuide:
+    def constraint(self, context: DecodingContext) -> TextConstraint:
         """It holds nothing: what is said is true."""
-        return TextGuide(NOTHING_KNOWN, lambda text: ())
+        return TextConstraint(DecodingContext(), lambda text: ())
 
     def begin(self, cancelled: object) -> Listener:
         self.heard.append(())
@@ -76,7 +76,7 @@ class Listener:
     def feed(self, segments: Sequence[Segment]) -> None:
         self.heard[-1] += tuple(i for segment in segments for i in segment.ids)
 
-    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, guide: TextGuide) -> Generation:
+    def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, constraint: TextConstraint) -> Generation:
         self.feed(segments)
         text = self.says[len(self.heard) - 1]
         return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0)
@@ -95,7 +95,7 @@ def test_prompts_are_those_that_the_runner_builds_along_the_drive(
 ) -> None:
     drive, language, ring = made_up_drive("a"), Listener(), TokenRing(160)
     asked = list(range(0, 130, 10 * seconds))
-    language.says = [anchors[k].reasoning for k in asked]
+    language.says = [format_text(anchors[k].reasoning) for k in asked]
     reasoner = LockstepReasoner(
         language=language,  # type: ignore[arg-type]
         policy=NoPolicy(),  # type: ignore[arg-type]
@@ -136,7 +136,8 @@ def test_the_answer_reads_back_as_the_label(prompts: Prompts, anchors: dict[int,
         _, answer = prompts.of(anchor, Drawn(WORDINGS[0], None))
         assert answer[-1] == NANO.language.im_end_id and answer.count(answer[-1]) == 1
         text = prompts.text(answer)
-        assert text == anchor.reasoning == Trace.from_json(trace_at(k)).text(anchor.points)
+        assert text == format_text(anchor.reasoning)
+        assert anchor.reasoning == dataclasses.replace(aspects_of_json(trace_at(k)), waypoints=anchor.points)
         assert parse_progress(text) == progress_at(k) == anchor.progress
         assert parse_waypoints(text) == pytest.approx(np.round(anchor.points, 1))
 
@@ -148,7 +149,7 @@ def test_waypoints_alone_are_asked_for_by_beginning_the_answer(prompts: Prompts,
     assert begun[: len(whole)] == whole
     assert prompts.text(begun[len(whole) :]) == WAYPOINTS_START
     assert parse_waypoints(WAYPOINTS_START + prompts.text(rest)) == pytest.approx(np.round(anchor.points, 1))
-    last_line = tokenizer().encode(anchor.reasoning.rsplit("\n", 1)[-1], add_special_tokens=False).ids
+    last_line = tokenizer().encode(format_text(anchor.reasoning).rsplit("\n", 1)[-1], add_special_tokens=False).ids
     assert (*begun[len(whole) :], *rest[:-1]) == tuple(last_line)
 
 
@@ -208,7 +209,9 @@ def test_anchors_decide_near_which_the_progress_changes(anchors: dict[int, Ancho
 
 
 def test_anchors_decide_where_the_robot_has_to_turn_back() -> None:
-    traces = tuple({"k": k, **trace_at(k), "plan": TURN_BACK if k == 20 else trace_at(k)["plan"]} for k in (0, 10, 20))
+    traces = tuple(
+        {"k": k, **trace_at(k), "plan": "turn back" if k == 20 else trace_at(k)["plan"]} for k in (0, 10, 20)
+    )
     found = {anchor.k: anchor for anchor in anchors_of(made_up_drive("a", 30, traces=traces))}
     assert {anchor.progress for anchor in found.values()} == {progress_at(0)}
     assert [k for k, anchor in found.items() if anchor.decides] == [20]

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from edge.state.frame import fit_frame
-from edge.state.reasoning_text import parse_progress, parse_waypoints
+from edge.state.reasoning_text import format_text, parse_text
 from export.model.network import build
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
 from tools.train.drives.drive import Drive
 from tools.train.samples.anchors import anchors_of
-from tools.train.samples.mirror import SecondsDataset, Views, mirrored, mirrored_text
+from tools.train.samples.mirror import SecondsDataset, Views, mirrored, mirrored_reasoning, mirrored_text
 from tools.train.samples.tokens import TokenCache, encode
 from tools.train.scenes import trace_sentences as trace_words
 
@@ -37,10 +37,12 @@ def test_sides_are_exchanged_and_no_other_word(text: str, other: str) -> None:
     assert mirrored_text(other) == text
 
 
-def test_every_sentence_of_the_traces_has_a_mirror_image() -> None:
+def test_every_reasoning_text_has_a_mirror_image_with_the_same_words_but_for_the_sides() -> None:
     for text in itertools.islice(trace_words.corpus(), 0, None, 7):
-        assert mirrored_text(mirrored_text(text)) == text
-        assert (mirrored_text(text) != text) == ("left" in text or "right" in text)
+        aspects = dataclasses.replace(parse_text(text), waypoints=None)
+        other = mirrored_reasoning(aspects)
+        assert format_text(other) == mirrored_text(format_text(aspects))
+        assert mirrored_reasoning(other) == aspects
 
 
 def test_an_anchor_in_the_mirror_tells_the_same_story_on_the_other_side() -> None:
@@ -49,11 +51,12 @@ def test_an_anchor_in_the_mirror_tells_the_same_story_on_the_other_side() -> Non
         assert mirrored(other) == anchor
         assert [x for x, _ in other.way] == [x for x, _ in anchor.way]
         assert [y for _, y in other.way] == [-y for _, y in anchor.way]
-        assert parse_waypoints(other.reasoning) == pytest.approx(np.round(anchor.points, 1) * (1, -1))
-        assert parse_progress(other.reasoning) == anchor.progress
+        assert other.reasoning.waypoints == pytest.approx(np.array(anchor.points) * (1, -1))
+        assert other.reasoning.progress == anchor.progress
         assert (other.earlier, other.frames) == (anchor.earlier, anchor.frames)
-        assert ("turn right into the room" in other.reasoning) == ("turn left into the room" in anchor.reasoning)
-    assert "-0.0" not in "".join(mirrored(anchor).reasoning for anchor in anchors_of(made_up_drive("a")))
+        texts = format_text(anchor.reasoning), format_text(other.reasoning)
+        assert ("turn right into the room" in texts[1]) == ("turn left into the room" in texts[0])
+        assert "-0.0" not in texts[1]
 
 
 def half_white(drive_id: str, frames: int) -> Drive:

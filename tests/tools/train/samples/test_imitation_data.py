@@ -10,7 +10,7 @@ import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
-from edge.motion.guidance import waypoints_now
+from edge.state.semantic import waypoints_now
 from export.model.config import TicVlaConfig
 from export.model.network import build
 from export.model.tokenizers.nano import NANO_TOKENIZER

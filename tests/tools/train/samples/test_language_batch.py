@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge.reasoning.progress_rules import LineGuide
+from edge.reasoning.decoding_rules import LineConstraint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
@@ -135,7 +135,7 @@ def test_a_row_is_held_to_its_guide_and_hears_what_it_was_made_to_say(language: 
     free = decode(language, batch, 6)
     head, *_ = free[0].ids
     other = next(i for i in range(20, 40) if i not in free[0].ids)
-    said = decode(language, batch, 6, [LineGuide([(head, other, head)]), None])
+    said = decode(language, batch, 6, [LineConstraint([(head, other, head)]), None])
     assert said[0].ids[:3] == (head, other, head) and said[1].ids == free[1].ids
     spoken = Row((*silent[0].prompt, *said[0].ids), (), silent[0].frames)
     torch.testing.assert_close(said[0].last_layer_kv, alone(language, spoken, len(spoken.fed))[1], atol=1e-5, rtol=0)

@@ -11,7 +11,22 @@ import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
-from edge.state.reasoning_text import WAIT, Progress, parse_progress, parse_waypoints
+from edge.state.reasoning_text import (
+    AREAS,
+    MOTIONS,
+    Plan,
+    Progress,
+    ReasoningText,
+    SeenObject,
+    SeenPerson,
+    Situation,
+    Stop,
+    Turn,
+    TurnBack,
+    format_people,
+    format_text,
+    parse_text,
+)
 from sim_hil.crowd.people import RENDER_FIELDS, People
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
@@ -19,11 +34,10 @@ from tests.support.train.training_scenarios import all_scenarios, progress_of, s
 from tools.train.config.scenes import CORRIDOR, KINDS
 from tools.train.scenes import trace_sentences as trace_words
 from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.traces import PEOPLE_M, Trace, Tracer
+from tools.train.scenes.traces import PEOPLE_M, Tracer
 
 NOBODY = (np.zeros((0, 3)), np.zeros((0, 2)))
 AHEAD = [(2.0, 0.0)]
-WAYPOINTS = ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0))
 PX = 128
 CHANGED = 24  # levels of a colour: less is shading
 
@@ -44,6 +58,14 @@ def _tracer(scenario: Scenario) -> Tracer:
     return Tracer(scenario, progress_of(scenario))
 
 
+def _names(text: ReasoningText) -> list[str]:
+    return [seen.name for seen in text.objects or ()]
+
+
+def _waits(text: ReasoningText) -> bool:
+    return text.plan is not None and text.plan.waits
+
+
 def _person(pose: SE2, ahead_m: float, left_m: float) -> np.ndarray:
     """[1, 3]: somebody at a place in the robot's frame, looking at it."""
     c, s = cos(pose.theta_rad), sin(pose.theta_rad)
@@ -54,19 +76,17 @@ def _person(pose: SE2, ahead_m: float, left_m: float) -> np.ndarray:
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def test_every_sentence_of_the_corpus_is_short_and_can_be_read_back() -> None:
+def test_every_text_of_the_corpus_is_short_and_is_read_back_whole() -> None:
     for text in trace_words.corpus():
-        reasoning, _, last = text.rpartition("\n")
-        assert len(reasoning.split()) <= trace_words.MAX_WORDS
-        assert parse_progress(reasoning) is not None
-        assert parse_waypoints(text) is not None and last.startswith("waypoints: ")
+        assert len(text.rpartition("\n")[0].split()) <= trace_words.MAX_WORDS
+        assert format_text(parse_text(text)) == text
 
 
-def test_the_corpus_holds_every_name_place_and_way_of_moving() -> None:
+def test_the_corpus_holds_every_name_area_and_motion() -> None:
     text = "\n".join(trace_words.corpus())
-    phrases = [*trace_words.landmarks(), *trace_words.AREAS.values(), *trace_words.WAYS, trace_words.TURN_BACK]
-    phrases += [trace_words.opening(kind) for kind in ("room", "corridor", "crossing")]
-    phrases += [trace_words.NOTHING, trace_words.NOBODY, WAIT, "stop now", "cross ahead now"]
+    phrases = [*trace_words.landmarks(), *AREAS.values(), *MOTIONS, "turn back", "wait, then ", "stop now"]
+    phrases += [trace_words.opening_name(kind) for kind in ("room", "corridor", "crossing")]
+    phrases += [trace_words.NO_OBJECTS, trace_words.NO_PEOPLE, "cross ahead now"]
     assert [phrase for phrase in phrases if phrase not in text] == []
 
 
@@ -74,43 +94,51 @@ def test_the_corpus_is_always_the_same() -> None:
     assert list(trace_words.corpus()) == list(trace_words.corpus())
 
 
-def test_whatever_a_trace_says_is_made_of_the_corpus_words() -> None:
+def test_the_texts_of_scenarios_are_made_of_the_corpus_words() -> None:
     known = {word.strip(".,") for text in trace_words.corpus() for word in text.split()}
     for scenario in all_scenarios():
         tracer = _tracer(scenario)
         for pose in _poses(scenario, 6.0):
-            said = tracer.trace(pose, *NOBODY).reasoning()
-            assert {word.strip(".,") for word in said.split()} <= known, said
+            text = format_text(tracer.trace(pose, *NOBODY))
+            assert {word.strip(".,") for word in text.split()} <= known, text
 
 
-def test_things_for_which_there_is_no_room_are_left_out_last_ones_first() -> None:
-    things = [f"yellow table with an umbrella left {m} m" for m in (1, 2, 3)]
-    trace = Trace.of("in a corridor", things, ["person ahead 2 m crossing left"] * 2, Progress(1, 2, 0), "stop in 3 m")
-    assert trace.objects == things[0]
+CORRIDOR_HERE, STOP = Situation("corridor"), Plan(Stop(3))
 
 
-def test_a_trace_that_says_too_much_is_refused() -> None:
+def test_objects_for_which_there_is_no_room_are_left_out_last_ones_first() -> None:
+    objects = [SeenObject("yellow table with an umbrella", "left", m) for m in (1, 2, 3)]
+    people = [SeenPerson("ahead", 2, "crossing left")] * 2
+    text = trace_words.five_aspects(CORRIDOR_HERE, objects, people, Progress(1, 2, 0), STOP)
+    assert text.objects == (objects[0],)
+
+
+def test_a_text_that_is_too_long_without_objects_is_refused() -> None:
+    people = [SeenPerson("ahead", 2, "crossing left")] * 6
     with pytest.raises(ValueError, match="45 words"):
-        Trace("in a corridor", "door left 3 m, " * 10, "none", Progress(1, 1, 0), "stop now")
+        trace_words.five_aspects(CORRIDOR_HERE, [], people, Progress(1, 1, 0), STOP)
 
 
-@pytest.mark.parametrize(("metres", "said"), [(0.2, "1 m"), (1.4, "1 m"), (1.6, "2 m"), (29.7, "30 m"), (80.0, "30 m")])
-def test_distances_are_whole_metres_within_what_the_corpus_holds(metres: float, said: str) -> None:
-    assert trace_words.distance(metres) == said
+@pytest.mark.parametrize(("metres", "whole"), [(0.2, 1), (1.4, 1), (1.6, 2), (29.7, 30), (80.0, 30)])
+def test_distances_are_whole_metres_within_what_the_corpus_holds(metres: float, whole: int) -> None:
+    assert trace_words.whole_metres(metres) == whole
+    assert trace_words.plan_metres(metres) == (0 if metres < 1 else whole)
 
 
-def test_a_trace_survives_a_drives_header() -> None:
+def test_the_five_aspects_survive_a_drives_header() -> None:
     scenario = scenarios("office")[0]
-    trace = _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY)
-    assert Trace.from_json({"k": 10, **trace.to_json()}) == trace
+    text = _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY)
+    assert trace_words.aspects_of_json({"k": 10, **trace_words.aspects_json(text)}) == text
 
 
-def test_the_answer_is_five_lines_and_the_waypoints() -> None:
-    trace = Trace("in a corridor", "none", "nobody near", Progress(2, 3, 1), "turn left into the room in 3 m")
-    assert trace.text(WAYPOINTS).split("\n") == [
-        "Situation: in a corridor.", "Objects: none.", "Motion: nobody near.", "Progress: turn 2 of 3, passed 1.",
-        "Plan: turn left into the room in 3 m.", "waypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)",
-    ]  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong", [{"situation": "in a cave"}, {"plan": "fly"}, {"objects": "a desk"}, {"motion": "cars"}]
+)
+def test_a_header_that_does_not_match_the_grammar_is_refused(wrong: dict[str, str]) -> None:
+    text = trace_words.five_aspects(CORRIDOR_HERE, [], [], Progress(1, 1, 0), STOP)
+    (value,) = wrong.values()
+    with pytest.raises(ValueError, match=f"{value}.*grammar"):
+        trace_words.aspects_of_json({**trace_words.aspects_json(text), **wrong})
 
 
 # -- progress and plan -----------------------------------------------------------------------------------------------
@@ -122,32 +150,34 @@ def test_the_plan_is_the_next_told_step_or_to_stop(kind: str) -> None:
         tracer, steps = _tracer(scenario), scenario.told.steps
         for pose in _poses(scenario, 5.0):
             trace = tracer.trace(pose, *NOBODY, AHEAD)
+            assert trace.progress is not None and trace.plan is not None
+            action = trace.plan.action
             if trace.progress.is_last_leg:
-                assert trace.plan.startswith("stop")
-            elif trace.plan != trace_words.TURN_BACK:
+                assert isinstance(action, Stop)
+            elif not isinstance(action, TurnBack):
                 step = steps[trace.progress.step - 1]
-                verb = "cross" if step.kind == "crossing" else "go" if step.side == "straight" else "turn"
-                assert trace.plan.startswith(verb) and (step.side == "straight" or step.side in trace.plan)
+                assert isinstance(action, Turn)
+                assert (action.side, action.area) == ("ahead" if step.side == "straight" else step.side, step.kind)
 
 
 def test_on_the_way_nobody_turns_back() -> None:
     for scenario in all_scenarios():
         tracer = _tracer(scenario)
-        assert not [p for p in _poses(scenario, 5.0) if tracer.trace(p, *NOBODY, AHEAD).plan == trace_words.TURN_BACK]
+        assert not [p for p in _poses(scenario, 5.0) if tracer.trace(p, *NOBODY, AHEAD).plan == Plan(TurnBack())]
 
 
 def test_whoever_means_to_be_behind_itself_turns_back() -> None:
     scenario = scenarios(CORRIDOR)[0]
-    assert _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY, [(-1.0, 0.2)]).plan == trace_words.TURN_BACK
+    assert _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY, [(-1.0, 0.2)]).plan == Plan(TurnBack())
 
 
 def test_whoever_stands_before_somebody_waits() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(5.0, -0.2, 0.0)
     tracer, person, still = _tracer(scenario), _person(pose, 1.2, 0.0), np.zeros((1, 2))
-    assert tracer.trace(pose, person, still, [(0.1, 0.0)]).plan.startswith(WAIT)
-    assert not tracer.trace(pose, person, still, AHEAD).plan.startswith(WAIT)
-    assert not tracer.trace(pose, *NOBODY, [(0.1, 0.0)]).plan.startswith(WAIT)
+    assert _waits(tracer.trace(pose, person, still, [(0.1, 0.0)]))
+    assert not _waits(tracer.trace(pose, person, still, AHEAD))
+    assert not _waits(tracer.trace(pose, *NOBODY, [(0.1, 0.0)]))
 
 
 def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> None:
@@ -161,7 +191,8 @@ def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> No
                 continue
             at = min(range(len(poses)), key=lambda i: hypot(poses[i].x_m - step.at[0], poses[i].y_m - step.at[1]))
             pose = SE2(poses[at - 25].x_m, poses[at - 25].y_m, atan2(step.ahead[1], step.ahead[0]))
-            assert f"{trace_words.opening(step.kind)} {step.side} " in tracer.trace(pose, *NOBODY).objects
+            seen = {(each.name, each.side) for each in tracer.trace(pose, *NOBODY).objects or ()}
+            assert (trace_words.opening_name(step.kind), step.side) in seen
             checked += 1
     assert checked >= 3
 
@@ -187,22 +218,22 @@ def test_people_are_told_by_where_they_are_and_how_they_walk(
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(13.0, 0.0, 0.0)
     trace = _tracer(scenario).trace(pose, _person(pose, *place), np.array((velocity,)))
-    assert trace.motion == said
-    assert trace.situation == "in a corridor, few people"
+    assert format_people(trace.people or ()) == said
+    assert trace.situation == Situation("corridor", crowd=1)
 
 
 def test_directions_are_the_robots_not_the_worlds() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(13.0, 0.0, pi)
     trace = _tracer(scenario).trace(pose, _person(pose, 3.0, 0.0), np.array(((0.0, 1.0),)))
-    assert trace.motion == "person ahead 3 m crossing right"
+    assert trace.people == (SeenPerson("ahead", 3, "crossing right"),)
 
 
 @pytest.mark.parametrize("place", [(-2.0, 0.0), (0.0, 1.5), (PEOPLE_M + 0.2, 0.0)])
 def test_nobody_behind_beside_or_far_is_spoken_of(place: tuple[float, float]) -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(13.0, 0.0, 0.0)
-    assert _tracer(scenario).trace(pose, _person(pose, *place), np.zeros((1, 2))).motion == trace_words.NOBODY
+    assert _tracer(scenario).trace(pose, _person(pose, *place), np.zeros((1, 2))).people == ()
 
 
 def test_only_the_nearest_two_are_spoken_of_and_many_are_many() -> None:
@@ -210,8 +241,8 @@ def test_only_the_nearest_two_are_spoken_of_and_many_are_many() -> None:
     pose = SE2(13.0, 0.0, 0.0)
     people = np.concatenate([_person(pose, 2.0 + k, 0.9 - 0.45 * k) for k in range(4)])
     trace = _tracer(scenario).trace(pose, people, np.zeros((4, 2)))
-    assert trace.motion.count("person") == 2
-    assert trace.situation == "in a corridor, many people"
+    assert len(trace.people or ()) == 2
+    assert trace.situation == Situation("corridor", crowd=2)
 
 
 def test_what_somebody_hides_is_not_spoken_of() -> None:
@@ -220,8 +251,8 @@ def test_what_somebody_hides_is_not_spoken_of() -> None:
     pose = SE2(thing.position_m[0] - 6.0, 0.0, 0.0)
     left_m = 1.6 * thing.position_m[1] / 6.0
     tracer = _tracer(scenario)
-    assert thing.landmark in tracer.trace(pose, *NOBODY).objects
-    assert thing.landmark not in tracer.trace(pose, _person(pose, 1.6, left_m), np.zeros((1, 2))).objects
+    assert thing.landmark in _names(tracer.trace(pose, *NOBODY))
+    assert thing.landmark not in _names(tracer.trace(pose, _person(pose, 1.6, left_m), np.zeros((1, 2))))
 
 
 # -- true to the picture ---------------------------------------------------------------------------------------------
@@ -267,7 +298,7 @@ def test_a_person_is_spoken_of_just_when_the_picture_shows_one(office: tuple[Sce
             if scenario.site.grid.clearance_m(*person[0, :2]) < 0.25:
                 continue
             pixels = _changed(_picture(world, pose, person), _picture(world, pose, _person(pose, -3.0, 0.0)))
-            said = tracer.trace(pose, person, np.zeros((1, 2))).motion != trace_words.NOBODY
+            said = tracer.trace(pose, person, np.zeros((1, 2))).people != ()
             assert pixels > 10 or not said, (pose, person, pixels)
             gap = max(1.0, hypot(person[0, 0] - pose.x_m, person[0, 1] - pose.y_m))
             assert pixels < max(250, 1400 / gap**2) or said, (pose, person, pixels)
@@ -290,7 +321,7 @@ def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scen
         seen = unseen = 0
         for pose in _poses(scenario, 1.0):
             pixels = _changed(_picture(world, pose, nobody), _picture(bare, pose, nobody))
-            said = tracer.trace(pose, *NOBODY).objects.startswith(thing.landmark)
+            said = _names(tracer.trace(pose, *NOBODY))[:1] == [thing.landmark]
             far = hypot(thing.position_m[0] - pose.x_m, thing.position_m[1] - pose.y_m) > 11.0
             assert pixels > 8 or not said, (pose, pixels)
             assert pixels < 200 or said or far, (pose, pixels)
@@ -306,10 +337,10 @@ def test_a_whole_walk_through_people_can_be_told() -> None:
     tracer, people = _tracer(scenario), People(replace(scenario.scene, start=scenario.task.start), 20, 1)
     texts = []
     for pose in _poses(scenario, 2.0):
-        texts.append(tracer.trace(pose, people.poses(), people.velocities(), AHEAD).text(WAYPOINTS))
+        texts.append(format_text(tracer.trace(pose, people.poses(), people.velocities(), AHEAD)))
         for _ in range(30):
             people.step(*pose.as_tuple())
-    assert all(parse_progress(text) is not None and parse_waypoints(text) is not None for text in texts)
+    assert all(format_text(parse_text(text)) == text for text in texts)
     assert any("person" in text for text in texts)
     again = _tracer(scenario).trace(_poses(scenario, 2.0)[0], *NOBODY, AHEAD)
     assert again == tracer.trace(_poses(scenario, 2.0)[0], *NOBODY, AHEAD)

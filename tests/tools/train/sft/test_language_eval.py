@@ -9,9 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edge.reasoning.decoding_rules import BACK, Known
-from edge.reasoning.progress_rules import EITHER_WAY, FREE, ONWARD
-from edge.state.reasoning_text import Progress, format_progress
+from edge.reasoning.decoding_rules import BACK, EITHER_WAY, FREE, ONWARD, DecodingContext
+from edge.state.reasoning_text import Progress, format_progress, format_text, parse_text
 from tests.support.train.train_drives import WORDINGS, made_up_drive
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import Anchor, Drawn, anchors_of
@@ -26,7 +25,7 @@ def anchors() -> list[Anchor]:
 def test_the_truth_is_right_in_everything(anchors: list[Anchor]) -> None:
     score = Score(2.0)
     for anchor in anchors:
-        score.add(anchor.reasoning, anchor)
+        score.add(format_text(anchor.reasoning), anchor)
     numbers = score.numbers()
     assert numbers["answers"] == len(anchors) == 13
     shares = ("waypoints_parsable", "progress_parsable", "progress_right", "change_right", "side_right")
@@ -40,7 +39,7 @@ def test_changes_are_where_repeating_what_was_said_is_wrong(anchors: list[Anchor
     for anchor in anchors:
         repeated = anchor.before(2.0) or anchor.progress
         truth = format_progress(anchor.progress)
-        score.add(anchor.reasoning.replace(truth, format_progress(repeated)), anchor)
+        score.add(format_text(anchor.reasoning).replace(truth, format_progress(repeated)), anchor)
     numbers = score.numbers()
     # passed grows at frames 30 and 60, the turn is done at 90; each is news at two of the anchors.
     assert numbers["changes"] == 6
@@ -65,8 +64,8 @@ def test_errors_are_distances_at_three_six_and_nine_seconds(anchors: list[Anchor
 
 def test_landmarks_are_counted_by_name(anchors: list[Anchor]) -> None:
     score = Score(2.0)
-    wrong = anchors[0].reasoning.replace("red chair right", "desk ahead")
-    assert landmarks_of(wrong) == Counter({"desk": 2})
+    wrong = format_text(anchors[0].reasoning).replace("red chair right", "desk ahead")
+    assert landmarks_of(parse_text(wrong)) == Counter({"desk": 2})
     assert landmarks_of(anchors[0].reasoning) == Counter({"desk": 1, "red chair": 1})
     assert landmarks_of(anchors[-1].reasoning) == Counter()
     score.add(wrong, anchors[0])
@@ -83,7 +82,7 @@ def test_landmarks_are_counted_by_name(anchors: list[Anchor]) -> None:
     ],
 )
 def test_the_side_is_that_of_the_planned_turn(plan: str, side: str | None) -> None:
-    assert side_of(f"Objects: desk right 3 m.\nPlan: {plan}.\nwaypoints: …") == side
+    assert side_of(parse_text(f"Objects: desk right 3 m.\nPlan: {plan}.\nwaypoints: …")) == side
 
 
 class Parrot:
@@ -94,13 +93,13 @@ class Parrot:
         self.told: list[tuple[str, int, Progress | None]] = []
         self.guided: list[tuple[Progress | None, str]] = []
 
-    def guide(self, known: Known) -> SimpleNamespace:
+    def constraint(self, known: DecodingContext) -> SimpleNamespace:
         """One whose first answer would go back."""
         self.guided.append((known.before, known.follow))
-        return SimpleNamespace(wanted=BACK if len(self.guided) == 1 else None)
+        return SimpleNamespace(refused=BACK if len(self.guided) == 1 else None)
 
-    def say(self, questions: Sequence[tuple[Anchor, Drawn]], guides: Sequence[object]) -> list[str]:
-        assert len(guides) == len(questions)
+    def say(self, questions: Sequence[tuple[Anchor, Drawn]], constraints: Sequence[object]) -> list[str]:
+        assert len(constraints) == len(questions)
         self.told += [(anchor.drive_id, anchor.k, drawn.before) for anchor, drawn in questions]
         assert all(drawn.wording in WORDINGS and not drawn.waypoints_only for _, drawn in questions)
         return [self.texts.pop(0) for _ in questions]
