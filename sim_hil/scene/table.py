@@ -1,4 +1,4 @@
-"""Tables of a scene file, read strictly: every key known, of the right shape, finite."""
+"""Strict reader of a scene file's tables: known keys, right shapes, finite numbers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 
 class SceneError(ValueError):
-    """A scene that cannot be used; one line: what, expected, found."""
+    """An invalid scene; one line: what, expected, found."""
 
 
 class Table:
-    """A TOML table that insists on every key being known and of the right shape; `done` refuses what is left over."""
+    """Strict reader of a TOML table; all methods raise SceneError, and `done` rejects unknown keys."""
 
     def __init__(self, what: str, table: object) -> None:
         if not isinstance(table, Mapping):
@@ -23,42 +23,42 @@ class Table:
         return key in self._rest
 
     def take(self, key: str, default: object = None) -> Any:
-        """The raw value; raises SceneError when the key is missing and there is no default."""
+        """Return the raw value; a missing key without a default is an error."""
         if key not in self._rest and default is None:
             raise SceneError(f"{self.what}: key {key!r} is missing")
         return self._rest.pop(key, default)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A piece of text."""
+        """Return a text."""
         value = self.take(key, default)
         if not isinstance(value, str):
             raise SceneError(f"{self.what}: {key} must be text, found {value!r}")
         return value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number."""
+        """Return a finite number."""
         return number(f"{self.what}: {key}", self.take(key, default))
 
     def whole(self, key: str, default: int | None = None) -> int:
-        """A whole number."""
+        """Return a whole number."""
         value = self.take(key, default)
         if isinstance(value, bool) or not isinstance(value, int):
             raise SceneError(f"{self.what}: {key} must be a whole number, found {value!r}")
         return value
 
     def vector(self, key: str, length: int, default: tuple[float, ...] | None = None) -> tuple[Any, ...]:
-        """So many finite numbers."""
+        """Return `length` finite numbers."""
         return vector(f"{self.what}: {key}", self.take(key, default), length)
 
     def points(self, key: str) -> tuple[Any, ...]:
-        """An array of (x, y) points."""
+        """Return an array of (x, y) points."""
         value = self.take(key)
         if not isinstance(value, list):
             raise SceneError(f"{self.what}: {key} must be an array of points")
         return tuple(vector(f"{self.what}: {key}: point", point, 2) for point in value)
 
     def heading(self, default_deg: float | None = None) -> float:
-        """`heading_deg`, or `heading_rad` where degrees cannot say it to the last bit; rad."""
+        """Return the heading, rad, from `heading_deg` or `heading_rad` (for exact values)."""
         if "heading_rad" in self:
             if "heading_deg" in self:
                 raise SceneError(f"{self.what}: expected heading_deg or heading_rad, found both")
@@ -66,27 +66,27 @@ class Table:
         return radians(self.number("heading_deg", default_deg))
 
     def tables(self, key: str) -> list[Table]:
-        """An array of tables, each named by its place in it."""
+        """Return an array of tables, each named by its index."""
         value = self.take(key, [])
         if not isinstance(value, list):
             raise SceneError(f"{self.what}: {key} must be an array of tables")
         return [Table(f"{key}[{index}]", item) for index, item in enumerate(value)]
 
     def done(self) -> None:
-        """Raises SceneError when a key was not taken."""
+        """Reject the table if it contains keys that were not read."""
         if self._rest:
             raise SceneError(f"{self.what}: unknown key {sorted(self._rest)[0]!r}")
 
 
 def number(what: str, value: object) -> float:
-    """A finite number of sensible size, as a float; raises SceneError."""
+    """Return a finite number of at most 1e6 in magnitude as a float. Raises SceneError."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value or abs(value) > 1e6:
         raise SceneError(f"{what} must be a finite number, found {value!r}")
     return float(value)
 
 
 def vector(what: str, value: object, length: int) -> tuple[float, ...]:
-    """So many finite numbers; raises SceneError."""
+    """Return `length` finite numbers. Raises SceneError."""
     if not isinstance(value, list | tuple) or len(value) != length:
         raise SceneError(f"{what} must be {length} numbers, found {value!r}")
     return tuple(number(what, item) for item in value)

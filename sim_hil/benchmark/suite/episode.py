@@ -1,6 +1,6 @@
-"""A benchmark suite as data: tasks (where to go, in words) and their episodes (robot, crowd, seed, timeout).
+"""Benchmark suite as data: tasks (start, goal, instructions) and their episodes (robot, crowd, seed, timeout).
 
-A suite is a TOML file. Episodes of one task share start, goal and instructions and differ in crowd density, robot and
+A suite is a TOML file. Episodes of one task share start, goal and instructions. They differ in crowd density, robot and
 timeout (paper appendix C: "share the same semantic objective but differ in crowd density, robot platform and timeout").
 """
 
@@ -20,7 +20,7 @@ else:
 
 SUITES = Path(__file__).with_name("suites")
 ROBOTS = ("go2", "carter")
-FORMAT = 1  # of the file; a suite's own version says which data it holds
+FORMAT = 1  # of the file; `version` in the file identifies the suite's data
 MIN_WORDINGS = 4
 MAX_PEOPLE = 200
 
@@ -29,14 +29,14 @@ Vec3 = tuple[float, float, float]
 
 
 class SuiteError(ValueError):
-    """A suite that cannot be used; one line: what, expected, found."""
+    """An invalid suite; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One run of the benchmark: go from `start` (x m, y m, theta rad) to `goal_xy` (m) as the instruction says.
+    """One run of the benchmark from `start` (x m, y m, theta rad) to `goal_xy` (m) by instruction.
 
-    `landmarks` are labels of the scene's objects that the instructions name; `goal_landmark` is the one by the goal.
+    `landmarks`: labels of the scene's objects that the instructions name; `goal_landmark`: the one at the goal.
     `shortest_m` is the length of the shortest feasible path for this robot (paper equation 9).
     """
 
@@ -76,13 +76,13 @@ class Episode:
         if not self.instructions or any(not text.strip() for text in self.instructions):
             raise SuiteError(f"{what}: expected instructions, none of them empty")
         if len(set(self.instructions)) != len(self.instructions):
-            raise SuiteError(f"{what}: an instruction is there twice")
+            raise SuiteError(f"{what}: expected different instructions, found one twice")
         if self.goal_landmark not in self.landmarks:
             raise SuiteError(f"{what}: goal_landmark {self.goal_landmark!r} is not among its landmarks")
 
 
 class _Table:
-    """A TOML table that insists on every key being known and of the right type."""
+    """Strict reader of a TOML table: every key must be known and have the right type."""
 
     def __init__(self, what: str, table: object) -> None:
         if not isinstance(table, Mapping):
@@ -175,7 +175,7 @@ def _task(raw: object, index: int) -> list[Episode]:
 
 
 def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
-    """Episodes of a suite's TOML text, in the file's order; `source` names it in errors. Raises SuiteError."""
+    """Parse a suite's TOML text into episodes, in the file's order; `source` names it in errors. Raises SuiteError."""
     try:
         table = _Table("suite", tomllib.loads(text))
         if (found := table.whole("format")) != FORMAT:
@@ -192,12 +192,12 @@ def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
 
 
 def suite_names() -> list[str]:
-    """Names that load_suite knows."""
+    """Return the names of the shipped suites."""
     return sorted(path.stem for path in SUITES.glob("*.toml"))
 
 
 def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
-    """Episodes of a shipped suite, or of a TOML file; ids are unique. Raises SuiteError."""
+    """Load the episodes of a shipped suite or a TOML file; ids are unique. Raises SuiteError."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         if str(name_or_path) not in suite_names():
@@ -211,7 +211,7 @@ def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
     episodes = parse_suite(text, path.name)
     ids = [episode.id for episode in episodes]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):
-        raise SuiteError(f"{path.name}: episode id {twice[0]!r} is there twice")
+        raise SuiteError(f"{path.name}: expected unique episode ids, found {twice[0]!r} twice")
     return episodes
 
 
@@ -225,7 +225,7 @@ def _array(values: Sequence[str]) -> str:
 
 
 def suite_to_toml(name: str, version: int, episodes: Sequence[Episode]) -> str:
-    """The suite as TOML that parse_suite reads back; episodes of one task must follow each other."""
+    """Format a suite as TOML for `parse_suite`; the episodes of one task must be adjacent."""
     lines = [
         "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.",
         f"format = {FORMAT}",

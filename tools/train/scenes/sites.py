@@ -10,7 +10,7 @@ import numpy as np
 
 from sim_hil.benchmark.language.tasks import goals
 from sim_hil.benchmark.language.visibility import Sightlines
-from sim_hil.benchmark.suite.robots import robot_grid, telling_grid
+from sim_hil.benchmark.suite.robots import robot_grid, route_grid
 from sim_hil.layouts import generate, is_reserved
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, load_scene
@@ -55,7 +55,7 @@ class Site:
     @cached_property
     def grid(self) -> NavGrid:
         """The floor by which ways are told."""
-        return telling_grid(self.scene)
+        return route_grid(self.scene)
 
     @cached_property
     def goals(self) -> tuple[SceneObject, ...]:

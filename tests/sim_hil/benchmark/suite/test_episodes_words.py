@@ -216,7 +216,7 @@ def test_wordings_are_the_same_for_the_same_seed_and_different_from_each_other(w
 
 def test_a_turn_that_nothing_tells_from_others_is_refused(way: Told) -> None:
     vague = replace(way.steps[0], ordinal=0, near=(), at_end=False)
-    with pytest.raises(WordingError, match="cannot be told"):
+    with pytest.raises(WordingError, match="cannot be described"):
         wordings(replace(way, steps=(vague,)), 4, 1, held_out=True)
 
 
