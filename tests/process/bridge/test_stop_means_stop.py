@@ -209,6 +209,7 @@ class TestPermission:
 
         repeat("permission", repetitions, once)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("repetitions", [1, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
     def test_it_expires_after_ten_seconds(self, rig: Rig, bridge: Running, repetitions: int) -> None:
         rig.reset()
