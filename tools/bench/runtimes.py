@@ -32,7 +32,7 @@ from rich.table import Table
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
-from tools.bench.peers.contenders import EVERYTHING, OURS, Contender, chosen
+from tools.bench.peers.contenders import EVERYTHING, OURS, OWN_STACK, Contender, chosen
 from tools.bench.peers.process import ROOT, MemoryWatch, Peak, Worker, WorkerError, worker_command
 from tools.bench.peers.rounds import Round, run_rounds
 from tools.bench.peers.summary import Verdict, judge_all, markdown, verdict_text
@@ -280,6 +280,8 @@ def main(argv: list[str] | None = None) -> int:
     show(verdicts)
     print(f"{args.out / 'summary.md'} and samples.json written")
     reached = [v.reached for v in verdicts]
+    if all(c.stack == OWN_STACK for c in bench.contenders):
+        return EXIT_DONE  # measured alone, as asked: there is no peer to compare with
     return EXIT_DONE if True in reached and False not in reached else EXIT_CHECK_FAILED
 
 
