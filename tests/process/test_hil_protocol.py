@@ -324,7 +324,7 @@ def test_a_run_that_fails_is_one_line_a_result_an_end_line_and_exit_status_1(
     code = f"""
 import sys
 import pybullet
-from sim_hil import hil
+from sim_hil.hil import command as hil
 from sim_hil.simulation.physics import Simulation
 from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
 from sim_hil.protocols.unitree.services.service import ServiceServer
