@@ -82,10 +82,11 @@ test-slow: .venv/.test-installed
 	@echo "== slow tests of processes, one at a time"
 	$(PYTEST) --durations=15 -m "slow and process" $(PROCESS_FILES)
 
+# Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
 	@seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
 	echo "== property tests with the random seed $$seed; repeat them with: make test-random SEED=$$seed"; \
-	$(PARALLEL) -m "hypothesis and not process" --hypothesis-profile=random --hypothesis-seed=$$seed
+	$(PARALLEL) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
 	@echo "== all tests but those of processes, $(WORKERS) at a time"

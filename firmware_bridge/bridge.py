@@ -46,7 +46,7 @@ _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE,
 
 EPILOG: Final = """examples:
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
-  edge-bridge stop --robot go2.toml      emergency stop: every running bridge stops the robot and refuses to arm, also
+  edge-bridge stop --robot go2.toml      emergency stop: the bridges at these sockets stop and refuse to arm, also
                                          after a restart of the bridge; done when the robot itself reports that it
                                          stands still
   edge-bridge arm --robot go2.toml       permit the runner that waits now to arm once, within 10 s: after an emergency
@@ -83,6 +83,10 @@ class Bridge:
         operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
         self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
         self._estop_file = config.safety.estop_file
+        if not latch_path.parent.is_dir():
+            raise ConfigError(
+                f"--latch {latch_path}: expected a file in an existing folder; create {latch_path.parent}"
+            )
         latch = read_latch(latch_path)
         self._latch_file = LatchFile(latch_path, log.say)
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
@@ -159,6 +163,9 @@ class Bridge:
         for request in outputs.requests:
             self._robot.write(request)
         latch_is_kept = self._latch_file.keep(outputs.latch, outputs.status.stamp_ns)
+        if outputs.latch and self._latch_file.failed:
+            reason = f"{outputs.status.reason}; NOT ON DISK: this stop ends with the bridge"
+            outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
         self._link.tell(outputs.status)

@@ -45,6 +45,7 @@ class BridgeClient:
         self._status: BridgeStatus | None = None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
+            self._socket.settimeout(_HELLO_TIMEOUT_MS / 1e3)  # a bridge that hangs accepts nobody
             self._socket.connect(str(socket_path))
             listener_uid = peer_uid(self._socket)
         except PermissionError as error:

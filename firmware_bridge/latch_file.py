@@ -54,9 +54,12 @@ class LatchFile:
         """`say` takes one line for the operator when the file cannot be written."""
         self._path = path
         self._say = say
-        self._kept = self._written = read_latch(path)
+        self._kept = read_latch(path)
+        self._change = self._done = 0  # numbers of the newest change and of the newest one that was carried out
         self._changed_ns = 0
-        self._changes: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self.failed = False
+        """The last change could not be carried out."""
+        self._changes: queue.SimpleQueue[tuple[int, str] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_changes, name="latch-file", daemon=True)
         self._thread.start()
 
@@ -67,9 +70,9 @@ class LatchFile:
         operator hears of a stop only then.
         """
         if reason != self._kept:
-            self._kept, self._changed_ns = reason, now_ns
-            self._changes.put(reason)
-        return self._written == reason or now_ns - self._changed_ns > _PATIENCE_NS
+            self._kept, self._changed_ns, self._change = reason, now_ns, self._change + 1
+            self._changes.put((self._change, reason))
+        return self._done == self._change or now_ns - self._changed_ns > _PATIENCE_NS
 
     def close(self, timeout_s: float) -> None:
         """Give the disk up to `timeout_s` to take the last change."""
@@ -77,14 +80,15 @@ class LatchFile:
         self._thread.join(timeout_s)
 
     def _write_changes(self) -> None:
-        for reason in iter(self._changes.get, None):
+        for number, reason in iter(self._changes.get, None):
             try:
                 self._write(reason)
-                self._written = reason
-                with contextlib.suppress(OSError):  # not every file system can be synced
-                    self._sync(reason)
+                self.failed, self._done = False, number
+                if self._changes.empty():  # a newer change must not wait for the disk
+                    with contextlib.suppress(OSError):  # not every file system can be synced
+                        self._sync(reason)
             except OSError as error:
-                self._written = reason  # as well as it goes
+                self.failed, self._done = True, number  # as well as it goes
                 failed = ("cannot be written", "may not survive") if reason else ("cannot be removed", "will survive")
                 says = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
                 self._say(f"latch file {self._path}: {says}")

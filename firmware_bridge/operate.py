@@ -21,7 +21,7 @@ from firmware_bridge.core.link import BridgeStatus
 
 CONFIRM_S: Final = 1.0
 _STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again
-_MOVES_ON_S: Final = 0.5  # a robot that still moves this long after a stop: the operator must know now
+_MOVES_ON_S: Final = 0.7  # a robot that still moves this long after a stop: the operator must know now
 _POLL_S: Final = 0.005
 _USE_REMOTE: Final = "press L2 and B on its remote, or switch it off"
 
@@ -54,10 +54,13 @@ def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
     unconfirmed = [answer for answer in answers.values() if isinstance(answer, Unconfirmed)]
     statuses = [answer for answer in answers.values() if isinstance(answer, BridgeStatus)]
     if len(missing) == len(answers):
-        return _refuse("; ".join(map(str, hidden or missing)))
+        advice = f"; the robot was NOT stopped: {_USE_REMOTE}" if command == "stop" and hidden else ""
+        return _refuse("; ".join(map(str, hidden or missing)) + advice)
     for status in (*statuses, *(answer.status for answer in unconfirmed if answer.status is not None)):
         blocked = "" if status.blocked_by == "none" else f"; arming is refused: {status.blocked_by}"
         sys.stderr.write(f"edge-bridge: {status.state}: {status.reason}{blocked}\n")
+    if command == "arm" and any(status.permit == "not needed" for status in statuses):
+        sys.stderr.write("edge-bridge: no permission is needed: the runner arms by itself\n")
     for error in hidden:
         sys.stderr.write(f"edge-bridge: {error}\n")
     for answer in unconfirmed:

@@ -16,6 +16,7 @@ from edge.flightlog.replay.command import Tolerance, verdict
 from edge.flightlog.replay.policy import Comparison
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import run_result
+from edge.state.switches import Switches
 from sim_hil.benchmark import cli as bench_cli
 from sim_hil.benchmark.suite import validate
 from sim_hil.benchmark.workers.bench_run import BenchRun
@@ -98,11 +99,12 @@ def test_a_run_without_a_finite_plan_is_a_fault_with_exit_code_1(
         def request_stop(self) -> None: ...
         def run(self) -> dict[str, Any]:
             made: Any = run_result
-            return dict(made(control, reasoning, inputs, None, power_w={}, faults=[], duration_s=1.0))
+            return dict(made(control, reasoning, inputs, None, Switches(), power_w={}, faults=[], duration_s=1.0))
 
     monkeypatch.setattr(runner, "RunSession", Session)
-    monkeypatch.setattr(runner, "load_artifacts", lambda *_: SimpleNamespace(trained=True))
-    monkeypatch.setattr(runner.engines, "needed", lambda _: ())
+    monkeypatch.setattr(runner, "load_artifacts", lambda *_: SimpleNamespace(trained=True, directory=tmp_path))
+    monkeypatch.setattr(runner.engines, "check", lambda *_: SimpleNamespace(check_unchanged=lambda: None))
+    monkeypatch.setattr(runner.engines, "with_engines", lambda artifacts, _: artifacts)
     monkeypatch.setattr(runner.signal, "signal", lambda *_: None)
     out = tmp_path / "run.json"
     arguments = ["--artifacts", str(tmp_path), "--robot", str(GO2_SIM), "--instruction", "go on", "--json", str(out)]

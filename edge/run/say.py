@@ -17,6 +17,7 @@ from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
 
 ANSWER_S = 2.0
+STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
 STOP: Final = "stop"
 """What the runner is sent for every stop phrase."""
 ROBOT_FILE_SOCKET: Final = "bridge.sock"
@@ -75,9 +76,10 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
         code = operate(STOP, *bridges)[0] if bridges else EXIT_REFUSED
         answer = None if asking is None else _stop_answer(asking, path)
     runners = None if answer is None else Path(str(answer.get("bridge")))
-    if runners is not None and (code != EXIT_DONE or runners not in bridges) and bridge in (None, runners):
-        # The runner names its bridge: what is known of that one alone decides.
-        code = operate(STOP, runners)[0]
+    if runners is not None and (code != EXIT_DONE or runners not in bridges):
+        # The runner names its bridge: it decides, together with a bridge that the user named.
+        runners_code = operate(STOP, runners)[0]
+        code = runners_code if bridge is None else max(code, runners_code)
     if code == EXIT_DONE and (bridge is not None or runners is not None):
         sys.stdout.write("stopped: the bridge confirms it; before the robot moves again: `edge-bridge arm`, new run\n")
         return EXIT_DONE
@@ -116,7 +118,7 @@ def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
 def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
     """The runner's answer to a stop phrase; None without one that can be used."""
     try:
-        answer = _answer(asking, path, ANSWER_S)
+        answer = _answer(asking, path, STOP_ANSWER_S)
     except (SayError, OSError) as error:
         sys.stderr.write(f"edge-say: {error}\n")
         return None

@@ -46,6 +46,7 @@ END_S = 7.0
 JOIN_S = 3.0
 """Of it, the most for both loops' threads: a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
+STANDSTILL_S = 2.0  # for the robot to come to rest and report it
 """Of it, the most for the bridge's word that the robot has been told to stand."""
 STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
 """Fault that ends a run when the instruction channel brings a stop phrase."""
@@ -117,13 +118,13 @@ class RunSession:
         language.check_instruction(text, len(self._artifacts.runtime.frame_offsets_s))
 
     def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
-        """Stop the robot and end the run; whether the bridge confirms the stop within STOP_CONFIRM_S."""
+        """Stop the robot and end the run; whether the bridge reports within STANDSTILL_S that it stands still."""
         bridge.stop()
         if STOP_PHRASE not in self._faults:
             self._faults.append(STOP_PHRASE)
         self._stop_requested = True
         self._stop.set()
-        return disarm(bridge, limit_s=STOP_CONFIRM_S)
+        return disarm(bridge, limit_s=STANDSTILL_S)
 
     def _take_instructions(self, told: InstructionSocket | None, loops: Loops) -> None:
         """Hand a new instruction on to reasoning; a stop phrase has stopped the robot when this returns."""

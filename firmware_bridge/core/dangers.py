@@ -15,6 +15,8 @@ _NEVER_NS: Final = -(2**62)
 _STILL_MPS: Final = 0.05  # fault matrix row 38: stopped means slower than this for half a second
 _STILL_RADPS: Final = 0.2  # our choice: well above what a standing robot's gyroscope shows
 _STILL_NS: Final = 500_000_000
+_CONFIRM_NS: Final = 200_000_000
+"""A robot counts as still after this long without a report of motion: one report can be a change of direction."""
 _SEEN_NS: Final = 200_000_000  # a report older than this proves nothing about motion
 _TILT_RAD: Final = math.radians(30.0)  # fault matrix row 64
 REMOTE_NS: Final = _NS_PER_S  # our choice: a remote counts as in use for this long after its last stick or key
@@ -105,12 +107,14 @@ class DangerWatch:
     def motion(self, now_ns: int, since_ns: int = _NEVER_NS) -> tuple[str, float]:
         """One of link.MOTIONS and the robot's speed in m/s (-1: unknown).
 
-        "still" needs a report that is fresh, was received after `since_ns`, and comes from the only publisher.
+        "still" needs a report that is fresh, was received after `since_ns`, comes from the only publisher, and follows
+        200 ms without a report of motion.
         """
         robot = self.fresh(now_ns, _SEEN_NS)
         if robot is None or robot.received_ns <= since_ns:
             return "unknown", -1.0
-        motion = "moving" if is_moving(robot) else "still" if self._publishers is None else "unknown"
+        moves = is_moving(robot) or now_ns - self._moving_ns < _CONFIRM_NS
+        motion = "moving" if moves else "still" if self._publishers is None else "unknown"
         return motion, math.hypot(robot.vx_mps, robot.vy_mps)
 
 

@@ -40,7 +40,7 @@ operator: the robot file asks for an operator's `edge-bridge arm`, which has not
 PERMITS: Final = ("not needed", "needed", "given")
 """Whether the next arming needs an operator's `edge-bridge arm`, and whether it was given."""
 MOTIONS: Final = ("unknown", "still", "moving")
-"""The robot's own report: still means slower than 0.05 m/s, in a report received after the last stop."""
+"""The robot's own report: still means slower than 0.05 m/s for 200 ms, in a report received after the last stop."""
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512
 

@@ -25,7 +25,7 @@ class OperatorPermit:
         self.latch = latch
         self._required = required
         self._asked_ns = self._until_ns = _NEVER_NS
-        self._in_use = False
+        self._begun = False
 
     def hold(self, reason: str) -> None:
         """Latch an emergency stop; the first reason stays. Voids a permission."""
@@ -44,16 +44,20 @@ class OperatorPermit:
         return True
 
     def use(self) -> None:
-        """Begin the arming that the permission is for."""
-        self._in_use, self._until_ns, self._asked_ns = self.is_needed, _NEVER_NS, _NEVER_NS
+        """Spend the permission on the arming that begins now; it still expires before the first request is sent."""
+        self._asked_ns = _NEVER_NS
+
+    def begin(self) -> None:
+        """Note that the arming has sent its first request: from now on the permission does not expire."""
+        self._begun = self.is_needed
 
     def finish(self) -> None:
         """End that arming with the robot armed: the latch is gone, the permission used up."""
-        self.latch, self._in_use = "", False
+        self.latch, self._until_ns, self._begun = "", _NEVER_NS, False
 
     def void(self, *, disconnected: bool = False) -> None:
         """Take the permission back, also from an arming that has begun."""
-        self._until_ns, self._in_use = _NEVER_NS, False
+        self._until_ns, self._begun = _NEVER_NS, False
         self._asked_ns = _NEVER_NS if disconnected else self._asked_ns
 
     @property
@@ -63,7 +67,7 @@ class OperatorPermit:
 
     def allows(self, now_ns: int) -> bool:
         """Whether an arming may begin or go on."""
-        return not self.is_needed or self._in_use or now_ns <= self._until_ns
+        return not self.is_needed or self._begun or now_ns <= self._until_ns
 
     def state(self, now_ns: int) -> str:
         """One of link.PERMITS."""

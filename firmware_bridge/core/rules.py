@@ -2,7 +2,7 @@
 
 States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
 * disarmed: the bridge sends nothing, with two exceptions: a robot found moving when the bridge starts is stopped, and
-  so is a robot that moves when an operator asks for an emergency stop.
+  so is a robot that moves when an emergency stop is pressed (also after an arming that was broken off).
 * arming: the robot names its version and is stood up call by call, each confirmed by the mode it reports. A danger or
   a time-out refuses with a reason.
 * armed: the newest good command goes out at the bridge's own rate through limits and slew.
@@ -45,6 +45,12 @@ _STOP_AGAIN_NS: Final = 100 * _NS_PER_MS
 _FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second after its commander has died
 _STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: a robot that moves this long after a stop does not obey it
 _ASLEEP_NS: Final = 100 * _NS_PER_MS
+_BURST_NS: Final = 1_000 * _NS_PER_MS  # longer than an operator's command repeats its stop
+_PRESSES: Final = (
+    "emergency stop by an operator",
+    "emergency stop pressed at the local input",
+    "emergency stop pressed on the remote",
+)
 _STILL_MOVING: Final = "THE ROBOT STILL MOVES: stop it with its own remote"
 _NO_RUNNER: Final = "operator's arm refused: no runner asks to arm; start edge-run or read its last line, then repeat"
 _LATCHED: Final = "`edge-bridge arm` ends this while a runner waits"
@@ -71,6 +77,8 @@ class BridgeCore:
         self._watch = DangerWatch(safety, self._state_timeout_ns)
         self._permit = OperatorPermit(safety.operator_arm, latch)
         self._had_client = self._ever_armed = self._released = False
+        self._pressed = (False, False, False)
+        self._pressed_ns = _NEVER_NS
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
         self._called: dict[int, int] = {}  # api id -> when, during this arming
@@ -120,7 +128,7 @@ class BridgeCore:
         blocked, zero_after_stop = self._blocked(now_ns), self._state != "armed" and not self._released
         counters = (max(self._last_seq, 0), self._commands, self._rejected, self._last_command, zero_after_stop)
         causes = (self._cause, "none" if blocked is None else blocked[0])
-        motion, speed_mps = self._watch.motion(now_ns, self._stopped_ns)
+        motion, speed_mps = self._watch.motion(now_ns, max(self._stopped_ns, self._pressed_ns))
         disobeys = self._state == "stopped" and not self._released and now_ns - self._stopped_ns >= _STOPPING_NS
         reason = f"{self._reason}; {_STILL_MOVING}" if disobeys and motion == "moving" else self._reason
         permit = self._permit.state(now_ns)
@@ -140,27 +148,29 @@ class BridgeCore:
     def _hear_operator(self, inputs: Inputs, now_ns: int) -> None:
         """Emergency stops of every source, then an operator's arm or release; a stop beside them wins."""
         stop = any(isinstance(message, Stop) for message in inputs.operator)
-        for pressed, reason in (
-            (stop, "emergency stop by an operator"),
-            (inputs.estop, "emergency stop pressed at the local input"),
-            (inputs.robot.remote_estop, "emergency stop pressed on the remote"),
-        ):
-            if pressed:
+        pressed = (stop, inputs.estop, inputs.robot.remote_estop)
+        for is_pressed, reason in zip(pressed, _PRESSES, strict=True):
+            if is_pressed:
                 self._permit.hold(reason)
-        if stop:
-            self._released = False
+        if any(now and not before for now, before in zip(pressed, self._pressed, strict=True)):
             self._engage(now_ns)
-        elif any(isinstance(message, Arm) for message in inputs.operator):
+        self._pressed = pressed
+        if not stop and any(isinstance(message, Arm) for message in inputs.operator):
             self._take_permission(now_ns)
-        elif any(isinstance(message, Release) for message in inputs.operator):
+        elif not stop and any(isinstance(message, Release) for message in inputs.operator):
             self._release()
         known = (Arm, Stop, Release)  # only the runner's socket commands
         self._rejected += sum(not isinstance(message, known) for message in inputs.operator)
 
     def _engage(self, now_ns: int) -> None:
-        """An operator's stop of a robot that this bridge has not driven: stop it if it moves."""
+        """A new press: end a release, and stop a robot that moves although this bridge has not driven it."""
+        if self._released:
+            self._released, self._reason = False, self._permit.latch
+        if now_ns - self._pressed_ns > _BURST_NS:  # an operator's stop is repeated until it is confirmed
+            self._pressed_ns = now_ns
         robot = self._watch.fresh(now_ns, self._state_timeout_ns)
-        if self._state == "disarmed" and robot is not None and is_walking(robot):
+        idle = self._state in ("disarmed", "stopped") and not self._ever_armed
+        if idle and robot is not None and is_walking(robot):
             self._state, self._ever_armed = "armed", True
             self._stop("estop", self._permit.latch, now_ns)
 
@@ -254,6 +264,7 @@ class BridgeCore:
             self._next_ns = now_ns
         elif now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
             self._called[call] = now_ns
+            self._permit.begin()
             self._reason = f"{ids.SPORT_API_NAMES[call]} sent, robot in mode {mode}"
             self._requests.append(Call(call))
 

@@ -16,6 +16,7 @@ from firmware_bridge.unitree.dds import DDS_ERRORS, DECODE_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
 
 _FEW: Final = 16  # announcements a step
+_MOST: Final = 64  # publishers kept; more are a flood, which must not cost memory or time
 INPUT_TOPICS: Final = (
     *(ids.SPORT_STATE_TOPIC, ids.LF_LOW_STATE_TOPIC, ids.REMOTE_TOPIC),
     ids.response_topic(ids.SPORT_SERVICE),
@@ -33,6 +34,7 @@ class PublisherWatch:
             ids.LOW_COMMAND_TOPIC: own_motor_publishers,
         }
         self._topics: dict[str, str] = {}  # GUID of a publisher -> topic
+        self._flooded = False
         self._reader: Any = BuiltinDataReader(bus.participant, BuiltinTopicDcpsPublication)
 
     def surplus(self) -> str | None:
@@ -47,6 +49,8 @@ class PublisherWatch:
         counts = dict.fromkeys(self._allowed, 0)
         for topic in self._topics.values():
             counts[topic] += 1
+        if self._flooded:
+            return f"more than {_MOST} publishers of the robot's topics; restart the bridge once they have gone"
         for topic, allowed in self._allowed.items():
             if counts[topic] > allowed:
                 return f"{counts[topic]} publishers of {topic}, expected {allowed}"
@@ -56,4 +60,6 @@ class PublisherWatch:
         if not sample.sample_info.valid_data:  # this publisher has left
             self._topics.pop(str(sample.key), None)
         elif str(sample.participant_key) != self._own and sample.topic_name in self._allowed:
-            self._topics[str(sample.key)] = sample.topic_name
+            self._flooded = self._flooded or len(self._topics) >= _MOST
+            if not self._flooded:
+                self._topics[str(sample.key)] = sample.topic_name

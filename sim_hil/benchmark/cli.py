@@ -1,17 +1,15 @@
-"""`edge-bench`: runs the benchmark's episodes and measures success, collisions and latency together."""
+"""`edge-bench`: run the benchmark's episodes and measure success, collisions and latency."""
 
 from __future__ import annotations
 
 import argparse
 import shutil
-import signal
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from edge.artifacts.files import ArtifactError
@@ -23,6 +21,7 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from edge.state.switches import Decoding, RecoverySwitch
@@ -82,7 +81,7 @@ _BAD_INPUT = (
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line of a run."""
+    """Return the argument parser of a run."""
     p = argparse.ArgumentParser(
         "edge-bench", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -98,48 +97,55 @@ def parser() -> argparse.ArgumentParser:
         "--clock", choices=CLOCKS, default="lockstep",
         help="lockstep (default): virtual time, deterministic; realtime: edge-hil, edge-bridge and edge-run, go2 only",
     )  # fmt: skip
-    p.add_argument("--mode", choices=MODES, help="of a policy from artifacts (default async)")
+    p.add_argument("--mode", choices=MODES, help="reasoning mode of an artifact policy (default async)")
     p.add_argument(
         "--latency", metavar="S|profile:FILE",
-        help="time of a generation (of an external policy's answer): seconds, or a profile, an edge-run result or a "
-        "flight log (default: 2 s, 0.25 s without reasoning; external: none)",
+        help="duration of one generation (external policy: of one answer): seconds, or profile:FILE with a latency "
+        "profile, an edge-run result or a flight log (default: 2 s, 0.25 s without reasoning; external: none)",
     )  # fmt: skip
-    p.add_argument("--drift", choices=DRIFTS, default="none", help="of odometry (paper, table 14)")
-    p.add_argument("--variant", metavar="NAME", help="of the model: DIR/NAME, checked against its manifest")
-    p.add_argument("--wording", type=int, default=0, metavar="N", help="which of the instructions, from 0 (default 0)")
+    p.add_argument("--drift", choices=DRIFTS, default="none", help="odometry drift (paper, table 14; default none)")
+    p.add_argument("--variant", metavar="NAME", help="model variant: DIR/NAME, checked against its manifest")
+    p.add_argument("--wording", type=int, default=0, metavar="N", help="index of the instruction, from 0 (default 0)")
     p.add_argument(
         "--wordings", choices=WORDINGS, default="benchmark",
-        help="the same ways in the sentence patterns of training instead of the benchmark's own",
+        help="sentence patterns of the instructions: the benchmark's own (default), or those used in training",
     )  # fmt: skip
     p.add_argument(
-        "--swap-instructions", type=int, metavar="SEED", help="tell every task the way of another one of its scene"
+        "--swap-instructions",
+        type=int,
+        metavar="SEED",
+        help="control experiment: give every task the instruction of another task in the same scene",
     )
     p.add_argument(
         "--decoding", choices=[each.value for each in Decoding],
-        help="of artifacts: greedy as in the paper (free), or within rules (default: the manifest's)",
+        help="decoding of an artifact policy: greedy as in the paper (free), or within rules (default: the manifest's)",
     )  # fmt: skip
     p.add_argument(
         "--recovery", choices=[each.value for each in RecoverySwitch],
-        help="of artifacts: off: only the plan moves the robot (default: the manifest's)",
+        help="recoveries of an artifact policy; off: only the plan moves the robot (default: the manifest's)",
     )  # fmt: skip
     p.add_argument(
         "--stay", action=argparse.BooleanOptionalAction, default=False,
-        help="stand where the texts have placed the stop, as edge-run does; else only the goal ends an episode",
+        help="halt at the stop that the reasoning text gives, as edge-run does (default: only the goal ends the run)",
     )  # fmt: skip
-    p.add_argument("--camera", default="auto", metavar="WxH", help="render this picture though no policy looks at it")
-    p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for an answer (default 60)")
-    p.add_argument("--jobs", type=int, default=1, metavar="N", help="episodes at a time, a process each (default 1)")
-    p.add_argument("--cluster", metavar="ADDR", help="hand the episodes to the Ray cluster at HOST:PORT instead")
-    p.add_argument("--out", type=Path, metavar="DIR", help="results, logs, videos, report.html; can be resumed")
-    p.add_argument("--resume", action="store_true", help="continue the run in --out")
-    p.add_argument("--video", choices=VIDEO_CHOICES, default="none", help="of which episodes (default none)")
+    p.add_argument(
+        "--camera", default="auto", metavar="WxH", help="render images of this size even if the policy uses none"
+    )
+    p.add_argument("--external-timeout", type=float, default=60.0, metavar="S", help="for one answer, s (default 60)")
+    p.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="episodes run in parallel, one process each (default 1)"
+    )
+    p.add_argument("--cluster", metavar="ADDR", help="run the episodes on the Ray cluster at HOST:PORT")
+    p.add_argument("--out", type=Path, metavar="DIR", help="directory for results, logs, videos and report.html")
+    p.add_argument("--resume", action="store_true", help="continue the interrupted run in --out")
+    p.add_argument("--video", choices=VIDEO_CHOICES, default="none", help="episodes to record on video (default none)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
 @command_line("edge-bench")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; see EXAMPLES for the exit codes."""
+    """Run the command and return its exit code (see EXAMPLES)."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if argv and argv[0] in ("compare", "report"):
         from sim_hil.benchmark.results import compare
@@ -153,15 +159,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _run(args)
     except ArtifactError as error:
-        return _complain(error, EXIT_REFUSED)
+        return _report_problem(error, EXIT_REFUSED)
     except RefusedRunError as error:
-        return _complain(error, error.code)
+        return _report_problem(error, error.code)
     except _BAD_INPUT as error:
-        return _complain(error, EXIT_BAD_INPUT)
+        return _report_problem(error, EXIT_BAD_INPUT)
 
 
 def conditions_of(args: argparse.Namespace) -> Conditions:
-    """What the arguments ask for; raises ConditionsError, LatencyError, ExternalError."""
+    """Build the run's conditions from the arguments. Raises ConditionsError, LatencyError or ExternalError."""
     policy = PolicySpec.parse(args.policy)
     if policy.kind == "external":
         Address.parse(policy.where)
@@ -192,7 +198,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
 def _run(args: argparse.Namespace) -> int:
     check_result_target(args.json)
     if args.out is None and (args.resume or args.video != "none"):
-        raise ConditionsError("--resume and --video: expected --out DIR with them")
+        raise ConditionsError("--resume and --video need a directory: add --out DIR")
     conditions = conditions_of(args)
     episodes = choose(load_suite(args.suite), args.episodes)
     skipped: list[str] = []
@@ -200,13 +206,13 @@ def _run(args: argparse.Namespace) -> int:
         check_realtime(conditions, jobs=args.jobs, cluster=args.cluster is not None, video=args.video)
         episodes, skipped = drivable(episodes)
         if skipped:
-            _complain(f"{len(skipped)} episodes skipped: edge-bridge drives no other robot than the go2", EXIT_DONE)
+            _report_problem(f"{len(skipped)} episodes skipped: edge-bridge drives only the go2", EXIT_DONE)
         if not episodes:
             raise ConditionsError("--clock realtime: expected an episode of the go2 among --episodes, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
     started_ns = time.monotonic_ns()
-    with _directory(args.out) as folder, stop_flag() as stop:
+    with _output_directory(args.out) as folder, stop_signals() as stop:
         backend, store = _backend(args), None
         try:
             store = (ResultStore.resume if args.resume else ResultStore.create)(folder, run.config())
@@ -218,13 +224,13 @@ def _run(args: argparse.Namespace) -> int:
                 store.close()
         result = bench_result(run, store, finished=finished, started_ns=started_ns)
         result["skipped"] = skipped
-        _tell(args, store, result)
+        _write_outputs(args, store, result)
     if not finished:
-        again = f"; continue with --resume --out {args.out}" if args.out is not None else ""
+        advice = f"; continue with --resume --out {args.out}" if args.out is not None else ""
         counted = f"{result['summary']['episodes']} of {len(run.episodes)} episodes have a result"
-        return _complain(f"interrupted, {counted}{again}", EXIT_INTERRUPTED)
+        return _report_problem(f"interrupted, {counted}{advice}", EXIT_INTERRUPTED)
     if not store.results:
-        return _complain("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)
+        return _report_problem("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)
     return EXIT_CHECK_FAILED if store.failed else EXIT_DONE
 
 
@@ -235,7 +241,7 @@ def _backend(args: argparse.Namespace) -> Backend:
 
 
 @contextmanager
-def _directory(out: Path | None) -> Iterator[Path]:
+def _output_directory(out: Path | None) -> Iterator[Path]:
     if out is not None:
         yield out.absolute()
         return
@@ -246,36 +252,20 @@ def _directory(out: Path | None) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-@contextmanager
-def stop_flag() -> Iterator[list[int]]:
-    """A list that holds the number of the signal that asked for an end; empty until then."""
-    asked: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        asked.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _tell(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:
+def _write_outputs(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:
     write_result(args.json, result)
     if args.out is not None:
         write_result(str(store.directory / "result.json"), result)
         report = write_report(store, result["summary"], f"DynaNav: {Path(args.suite).stem}, {args.policy}")
         sys.stderr.write(f"edge-bench: {report}\n")
     if result["code_changed"]:
-        _complain("the code has changed while this ran: its episodes may be of two versions", EXIT_DONE)
+        _report_problem("the code changed during the run: its episodes may come from two versions", EXIT_DONE)
     if args.json != "-":
         sys.stdout.write(summary_lines(result))
 
 
 def summary_lines(result: dict[str, Any]) -> str:
-    """The numbers of a run for a terminal."""
+    """Format a run's summary as a table for the terminal."""
     summary = result["summary"]
     rows = [("all", summary)]
     rows += [(key, means) for group in ("by_scene", "by_crowd", "by_robot") for key, means in summary[group].items()]
@@ -295,8 +285,8 @@ def summary_lines(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _complain(what: object, code: int) -> int:
-    sys.stderr.write(f"edge-bench: {what}\n")
+def _report_problem(message: object, code: int) -> int:
+    sys.stderr.write(f"edge-bench: {message}\n")
     return code
 
 

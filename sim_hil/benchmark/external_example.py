@@ -1,6 +1,6 @@
-"""An example of a policy server: `edge-bench --policy external:ADDR` lets it drive.
+"""Example policy server for `edge-bench --policy external:ADDR`.
 
-It walks towards the brighter half of what lies ahead, which needs no learning and finds nothing: replace `Walker`.
+The example drives towards the brighter half of the image. Replace `Walker` with your own policy.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ EXAMPLES = """examples:
   python -m sim_hil.benchmark.external_example --listen 127.0.0.1:7001
   edge-bench --suite dynanav --policy external:127.0.0.1:7001 --latency 1 --out out/example
 
-Each connection is one episode at a time, so --jobs N makes N connections. docs/benchmark.md describes the protocol.
+Each connection runs one episode at a time: --jobs N opens N connections. docs/benchmark.md describes the protocol.
 exit codes: 0 ended by a signal, 2 bad arguments or input
 """
 WIDTH, HEIGHT, ENCODING = 160, 90, "jpeg"
 
 
 class Walker:
-    """Forward at a fixed speed, turning to the brighter side."""
+    """Example policy: drive forward at a fixed speed and turn to the brighter side."""
 
     def __init__(self, instruction: str, max_speed_mps: float) -> None:
         self._instruction = instruction
@@ -78,11 +78,11 @@ def _serve(channel: Channel) -> None:
             walker = Walker(text(header, "instruction", channel.peer), _max_speed(header))
             channel.send({"type": "ready"})
         elif walker is None:
-            raise ExternalError("observe came before reset")
+            raise ExternalError("observe arrived before reset")
         else:
             picture = decode_image(message.payload, ENCODING, WIDTH, HEIGHT)
-            velocity, says = walker.act(picture, numbers(header, "state", 3, channel.peer))
-            channel.send({"type": "act", "step": header.get("step"), "velocity": velocity, "text": says})
+            velocity, explanation = walker.act(picture, numbers(header, "state", 3, channel.peer))
+            channel.send({"type": "act", "step": header.get("step"), "velocity": velocity, "text": explanation})
 
 
 def _max_speed(header: Any) -> float:
@@ -102,14 +102,14 @@ class _UnixServer(socketserver.ThreadingUnixStreamServer):
 
 
 def server(address: Address) -> socketserver.BaseServer:
-    """Listening already; `serve_forever` answers. Raises OSError."""
+    """Return a server that listens at `address`; `serve_forever` answers requests. Raises OSError."""
     if address.path:
         return _UnixServer(address.path, _Handler)
     return _TcpServer((address.host, address.port), _Handler)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m sim_hil.benchmark.external_example",
         description=__doc__,

@@ -1,4 +1,4 @@
-"""Runs of the benchmark asked for by a program instead of a command line; what is there already is kept."""
+"""Run the benchmark from a program instead of the command line; existing results are kept."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RESULT = "result.json"
 
 
 class RunsError(RuntimeError):
-    """A run whose episodes have no result; one line."""
+    """A run in which an episode has no result; one line."""
 
 
 def run_episodes(
@@ -35,11 +35,11 @@ def run_episodes(
     stopped: Callable[[], bool] = lambda: False,
     watcher: RunWatcher | None = None,
 ) -> list[EpisodeResult]:
-    """Results of all `episodes` of a suite, run where `out` does not hold them yet; `result.json` is written too.
+    """Return the results of all `episodes`, sorted by id; run those that `out` lacks and write `result.json`.
 
-    Raises KeyboardInterrupt when `stopped` ended it (what is finished stays), StoreError where `out` holds a run that
-    was asked for differently or by other code, RunsError for episodes whose processes died, and what
-    `BenchRun.plan` raises.
+    Raises KeyboardInterrupt when `stopped` ended the run (finished episodes are kept), StoreError when `out` contains a
+    run with other conditions or other code, RunsError for episodes whose process died, and the errors of
+    `BenchRun.plan`.
     """
     chosen = reworded(episodes, conditions, lambda: load_suite(suite))
     run = BenchRun.plan(suite, chosen, conditions)
@@ -49,15 +49,15 @@ def run_episodes(
     try:
         store = (ResultStore.resume if (out / CONFIG).is_file() else ResultStore.create)(out, run.config())
         before = len(store.results)
-        whole = run.run(store, backend, "none", stopped, watcher or RunWatcher())
+        finished = run.run(store, backend, "none", stopped, watcher or RunWatcher())
     finally:
         backend.close()
         if store is not None:
             store.close()
     if len(store.results) > before or not (out / RESULT).is_file():
-        result = bench_result(run, store, finished=whole, started_ns=started_ns)
+        result = bench_result(run, store, finished=finished, started_ns=started_ns)
         write_whole(out / RESULT, json.dumps(result, indent=1) + "\n")
-    if not whole:
+    if not finished:
         raise KeyboardInterrupt
     if store.failed:
         raise RunsError(f"{out}: {len(store.failed)} episodes have no result, the first: {store.failed[0].why}")
@@ -65,6 +65,6 @@ def run_episodes(
 
 
 def read_result(out: Path) -> dict[str, Any]:
-    """`result.json` of a finished run."""
+    """Return the content of `result.json` of a finished run."""
     content: dict[str, Any] = json.loads((out / RESULT).read_text(encoding="utf-8"))
     return content

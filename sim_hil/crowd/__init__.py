@@ -1,1 +1,1 @@
-"""People who walk, stand, sit and queue in a scene and give way to the robot."""
+"""Crowd simulation: people walk, stand, sit and queue in a scene and avoid each other and the robot."""

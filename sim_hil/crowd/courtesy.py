@@ -1,16 +1,16 @@
-"""Stepping aside for a robot that waits before somebody who stands in its way: nobody pins it down for ever."""
+"""Stepping aside: a standing person makes room for a robot that waits in front, so that nobody blocks it forever."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sim_hil.crowd.senses import RobotSeen
-from sim_hil.crowd.state import Array, Crowd, Doing, Ints
+from sim_hil.crowd.senses import ObservedRobot
+from sim_hil.crowd.state import Activity, Array, Crowd, Ints
 from sim_hil.crowd.walkable_map import CrowdMap
 
-_AHEAD_M, _HALF_WAY_M = 1.8, 0.6  # who is in front of the robot is in its way
-_SLOW_MPS = 0.25
-_NOTICE_S = 1.2  # after that, and a share of one's patience, one understands that it wants to get past
+_AHEAD_M, _HALF_WAY_M = 1.8, 0.6  # length and half width of the area in which a person blocks the robot
+_SLOW_MPS = 0.25  # robot speed below which it counts as waiting
+_NOTICE_S = 1.2  # waiting time, in addition to a share of the patience, after which a person steps aside
 _ASIDE_M, _FURTHER_M = 0.95, 1.3
 _STAY_ASIDE_S = 7.0
 _PACE_MPS = 0.55
@@ -19,19 +19,19 @@ _STAY_BACK_S = 3.0
 
 
 class Courtesy:
-    """Remembers who has been in the robot's way for how long, and where they stepped to."""
+    """For every person: time spent blocking the robot, and the point to step to."""
 
     def __init__(self, count: int) -> None:
         self._waits_s = np.zeros(count)
         self._until_s = np.zeros(count)
         self._x, self._y = np.zeros(count), np.zeros(count)
 
-    def update(self, crowd: Crowd, ways: CrowdMap, robot: RobotSeen, dt: float) -> None:
-        """Let people who stand before the waiting robot understand, and choose where to step."""
+    def update(self, crowd: Crowd, ways: CrowdMap, robot: ObservedRobot, dt: float) -> None:
+        """Update the blocking times and choose where due persons step to."""
         rx, ry = crowd.x - robot.x, crowd.y - robot.y
         ahead, left = rx * robot.c + ry * robot.s, ry * robot.c - rx * robot.s
         stands = crowd.vx * crowd.vx + crowd.vy * crowd.vy < 0.04
-        stands &= (crowd.doing != Doing.SIT) & crowd.aware
+        stands &= (crowd.activity != Activity.SIT) & crowd.aware
         waits = abs(robot.vx * robot.c + robot.vy * robot.s) < _SLOW_MPS
         blocks = stands & (ahead > 0.0) & (ahead < _AHEAD_M) & (np.abs(left) < _HALF_WAY_M) & waits
         self._waits_s = np.where(blocks, self._waits_s + dt, np.maximum(self._waits_s - dt, 0.0))
@@ -39,9 +39,9 @@ class Courtesy:
         for person in np.flatnonzero(due):
             self._step_aside(int(person), float(left[person]), crowd, ways, robot)
 
-    def _step_aside(self, person: int, left: float, crowd: Crowd, ways: CrowdMap, robot: RobotSeen) -> None:
+    def _step_aside(self, person: int, left: float, crowd: Crowd, ways: CrowdMap, robot: ObservedRobot) -> None:
         nearer = 1.0 if left >= 0 else -1.0
-        # To the nearer side, the other side, and if there is no room on either, on ahead of the robot.
+        # Candidates: the nearer side, the other side, and if neither has room, further ahead of the robot.
         moves = [(0.0, nearer * _ASIDE_M - left), (0.5, nearer * _ASIDE_M - left), (0.0, -nearer * _ASIDE_M - left)]
         moves += [(_FURTHER_M, 0.0), (_FURTHER_M, 0.8), (_FURTHER_M, -0.8)]
         x = crowd.x[person] + np.array([robot.c * u - robot.s * v for u, v in moves])
@@ -58,7 +58,7 @@ class Courtesy:
             self._waits_s[person] = 0.0
 
     def step_back(self, person: int, crowd: Crowd, ways: CrowdMap) -> None:
-        """Make room for others where nobody gets on: go for a moment to where there is most of it."""
+        """Send a person in a jam for a moment to the nearby point with most free space."""
         angles = np.arange(8) * (np.pi / 4)
         x = crowd.x[person] + np.outer(_BACK_M, np.cos(angles)).ravel()
         y = crowd.y[person] + np.outer(_BACK_M, np.sin(angles)).ravel()
@@ -72,11 +72,11 @@ class Courtesy:
             self._x[person], self._y[person] = x[best], y[best]
             self._until_s[person] = crowd.now_s + _STAY_BACK_S
 
-    def like(self, crowd: Crowd, like_x: Array, like_y: Array) -> None:
-        """Overrule what those who step aside would like otherwise."""
+    def override(self, crowd: Crowd, preferred_vx: Array, preferred_vy: Array) -> None:
+        """Override the preferred velocities of people who step aside."""
         who: Ints = np.flatnonzero(self._until_s > crowd.now_s)
         if len(who):
             dx, dy = self._x[who] - crowd.x[who], self._y[who] - crowd.y[who]
             gap = np.sqrt(dx * dx + dy * dy) + 1e-9
             pace = np.where(gap > 0.15, np.minimum(_PACE_MPS, 0.2 + gap), 0.0) / gap
-            like_x[who], like_y[who] = dx * pace, dy * pace
+            preferred_vx[who], preferred_vy[who] = dx * pace, dy * pace

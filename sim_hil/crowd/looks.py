@@ -1,4 +1,4 @@
-"""What each person of a crowd looks like: build, clothes, skin and hair, drawn from a seed; work clothes at work."""
+"""Appearance of each person: build, clothes, skin and hair, drawn from a seed; some wear work clothes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Rgb = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Appearance:
-    """How a person looks: colours as RGB 0..255, body scale (1 is 1.72 m tall) and build (1 is average width).
+    """Appearance of a person: colours as RGB 0..255, body scale (1: 1.72 m tall) and build (1: average width).
 
     top: shirt, jacket, coat, scrubs, lab_coat or vest (hi-vis); legs: trousers, skirt, shorts or dress;
     hair_style: short, long, bun, bald, cap or helmet; carries: "", backpack or bag.
@@ -65,7 +65,7 @@ _SCRUBS: Final[tuple[Rgb, ...]] = ((60, 130, 140), (70, 120, 180), (90, 150, 120
 _VESTS: Final[tuple[Rgb, ...]] = ((240, 120, 20), (200, 230, 40))
 _HELMETS: Final[tuple[Rgb, ...]] = ((250, 205, 40), (245, 245, 240), (40, 90, 190), (230, 90, 30))
 
-# Share of people who wear what; the rest is dressed as on any day. Keyed by how a scene's name begins.
+# Shares of people in work clothes, by the prefix of the scene's name; the others wear everyday clothes.
 _AT_WORK: Final = MappingProxyType(
     {
         "hospital": (("scrubs", 0.28), ("lab_coat", 0.22)),
@@ -75,7 +75,7 @@ _AT_WORK: Final = MappingProxyType(
 
 
 def appearances(count: int, seed: int, scene_name: str = "") -> list[Appearance]:
-    """Looks of the first `count` people of a seed in a scene: the same in the physics and in the camera process."""
+    """Return the appearances of the first `count` people of a seed; equal in physics and camera process."""
     work = next((clothes for kind, clothes in _AT_WORK.items() if scene_name.startswith(kind)), ())
     outdoors = scene_name.startswith("sidewalk")
     return [_draw(np.random.default_rng((seed, 11, index)), work, outdoors) for index in range(count)]
@@ -88,7 +88,7 @@ def _one(rng: np.random.Generator, pool: tuple[Rgb, ...]) -> Rgb:
 def _draw(rng: np.random.Generator, work: tuple[tuple[str, float], ...], outdoors: bool) -> Appearance:
     top = _top(rng, work, outdoors)
     woman = bool(rng.uniform() < 0.5)
-    # Adults: 1.66 +- 0.07 m and 1.78 +- 0.07 m, cut at what a doorway still lets through.
+    # Heights of adults: 1.66 +- 0.07 m and 1.78 +- 0.07 m, clipped so that everybody fits through doorways.
     height = float(np.clip(rng.normal(1.66 if woman else 1.78, 0.07), 1.5, 1.97))
     legs = "trousers"
     draw = float(rng.uniform())

@@ -1,7 +1,7 @@
-"""People of a scene: they walk to places, stand, sit, queue, go in groups, and give way to each other and the robot.
+"""People of a scene: they walk to places, stand, sit, queue, walk in groups, and avoid each other and the robot.
 
-Thirty times a second everybody moves with limited acceleration towards the velocity picked last, and nobody gets into
-a wall, another person or the robot; ten times a second they look around, decide and pick. No physics engine.
+At 30 Hz everybody accelerates towards the chosen velocity and is kept out of walls, other people and the robot. At
+10 Hz people perceive, decide and choose a velocity. There is no physics engine.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from sim_hil.crowd.looks import Appearance, appearances
 from sim_hil.crowd.plans import Plans
-from sim_hil.crowd.senses import RobotSeen, RobotWatch, notice
-from sim_hil.crowd.state import Array, Crowd, Doing, Ints
+from sim_hil.crowd.senses import ObservedRobot, RobotWatch, notice
+from sim_hil.crowd.state import Activity, Array, Crowd, Ints
 from sim_hil.crowd.steering import Nearby, choose
 from sim_hil.crowd.walkable_map import BODY_RADIUS_M, CrowdMap
 from sim_hil.scene.scene import Scene
@@ -32,31 +32,31 @@ RENDER_FIELDS = 8
 GESTURES = ("none", "talking", "phone")
 
 _DECIDE_EVERY = 3  # steps
-_STAGGER_FROM = 40  # more people than this decide in turn, a third of them a step
-_START_CLEAR_M = 2.5  # nobody starts closer to the robot than this
+_STAGGER_FROM = 40  # with more people than this, a third of them decides in each step
+_START_CLEAR_M = 2.5  # least distance from the robot's start to a person's
 _NEIGHBOURS, _NEIGHBOURS_M = 8, 5.0
-_TOUCH_M, _CLOSE_M = 0.50, 0.85  # between the middles of two people: steered for, and liked
+_TOUCH_M, _CLOSE_M = 0.50, 0.85  # centre distance of two people: least when steering, and preferred
 _MATES_TOUCH_M, _MATES_CLOSE_M = 0.48, 0.60
 _SQUEEZE_TOUCH_M, _SQUEEZE_CLOSE_M = 0.45, 0.55
-_BODIES_M = 0.45  # two people are never closer
+_BODIES_M = 0.45  # least centre distance of two people
 _ROBOT_AXIS_M = 0.22  # the robot is a capsule of this half length around its heading
-_ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # from its axis: steered for, and never entered by oneself
-_ROBOT_TOUCHED_M = 0.40  # where bodies meet: who has not noticed the robot walks on until there
+_ROBOT_TOUCH_M, _ROBOT_BODY_M = 0.62, 0.56  # distance from its axis: least when steering, and limit of own motion
+_ROBOT_TOUCHED_M = 0.40  # distance at which bodies touch; a person unaware of the robot walks up to it
 _ROBOT_STANDS_MPS = 0.15
-_PUSHED: Final = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # how readily one is pushed, by what one does
+_PUSHED: Final = np.array((1.0, 1.0, 0.15, 0.3, 0.0))  # mobility when pushed, by activity
 _WALL_M = 0.22
-_HURRY_PER_S = 0.3  # see crowd_steering.choose
+_HURRY_PER_S = 0.3  # see steering.choose
 _SPEED_UP_MPS2, _BRAKE_MPS2 = 1.8, 3.5
 _FASTEST_MPS, _SIT_DOWN_MPS = 1.9, 0.6
 _TURN_RADPS, _TURN = 2.8, 2 * pi
 _STEP_PER_ROOT_SPEED = 0.6245  # step length m = this * sqrt(speed): a walk ratio of 0.0065 m min (Sekiya et al. 1996)
-_FULL_STEP_M = 0.71  # of an amplitude of 1
+_FULL_STEP_M = 0.71  # step length at swing amplitude 1
 
 
 class People:
-    """Everybody in a scene. Deterministic per seed; `step` once every 1/UPDATE_HZ seconds of simulation time.
+    """All people of a scene; deterministic per seed. Call `step` every 1/UPDATE_HZ seconds of simulation time.
 
-    Raises ValueError when the scene has no room for `count` people. Nobody starts within 2.5 m of the scene's start.
+    Nobody starts within 2.5 m of the scene's start. Raises ValueError if the scene has no room for `count` people.
     """
 
     def __init__(self, scene: Scene, count: int, seed: int) -> None:
@@ -77,26 +77,26 @@ class People:
         return self._crowd.n
 
     def poses(self) -> Array:
-        """[n, 3]: x m, y m, heading rad."""
+        """Return the poses [n, 3]: x m, y m, heading rad."""
         return np.stack((self._crowd.x, self._crowd.y, self._crowd.heading), axis=1)
 
     def velocities(self) -> Array:
-        """[n, 2]: vx, vy in the world, m/s."""
+        """Return the velocities [n, 2] in the world frame, m/s."""
         return np.stack((self._crowd.vx, self._crowd.vy), axis=1)
 
     def blocked_s(self) -> Array:
-        """[n]: for how long each has wanted to get on without getting 0.4 m further, s; 0 for who stays on purpose."""
+        """Return for how long each person has tried to move without getting 0.4 m further [n], s."""
         return self._crowd.blocked_s.copy()
 
     def render_rows(self) -> Array:
-        """[n, RENDER_FIELDS]: what a renderer needs of each person."""
+        """Return the render state of each person [n, RENDER_FIELDS]."""
         crowd = self._crowd
         ground = self._ways.heights_at(crowd.x, crowd.y) if crowd.n else np.zeros(0)
         columns = (crowd.x, crowd.y, crowd.heading, crowd.phase, crowd.swing, ground, crowd.sitting, crowd.gesture)
         return np.stack(columns, axis=1)
 
     def step(self, robot_x_m: float, robot_y_m: float, robot_heading_rad: float) -> None:
-        """Move everybody by 1/UPDATE_HZ s, given where the robot is."""
+        """Advance everybody by 1/UPDATE_HZ s, given the robot's pose."""
         crowd = self._crowd
         if not crowd.n:
             return
@@ -116,8 +116,8 @@ class People:
 
     # -- picking a velocity ----------------------------------------------------------------------------------------
 
-    def _decide(self, who: Ints, turn: int, robot: RobotSeen) -> None:
-        """Let these people look around and pick a velocity."""
+    def _decide(self, who: Ints, turn: int, robot: ObservedRobot) -> None:
+        """Choose new velocities for these people."""
         crowd = self._crowd
         dx = crowd.x[None, :] - crowd.x[who, None]
         dy = crowd.y[None, :] - crowd.y[who, None]
@@ -126,8 +126,8 @@ class People:
         mine, theirs = np.nonzero(gap2 < 1.0)
         self._pairs[turn] = (who[mine], theirs)
 
-        active = np.flatnonzero((crowd.like_x[who] != 0.0) | (crowd.like_y[who] != 0.0))
-        crowd.wish_x[who] = crowd.wish_y[who] = 0.0
+        active = np.flatnonzero((crowd.preferred_vx[who] != 0.0) | (crowd.preferred_vy[who] != 0.0))
+        crowd.chosen_vx[who] = crowd.chosen_vy[who] = 0.0
         crowd.meet_s[who] = 1e3
         if not len(active):
             return
@@ -139,19 +139,19 @@ class People:
         )  # fmt: skip
         rows = np.arange(len(me))[:, None]
         nearby = self._around(me, near, dx[active[:, None], near], dy[active[:, None], near], gap2[rows, near], robot)
-        liking = crowd.like_x[me], crowd.like_y[me]
-        pace = np.maximum(np.sqrt(liking[0] * liking[0] + liking[1] * liking[1]), 0.35)
+        preferred = crowd.preferred_vx[me], crowd.preferred_vy[me]
+        pace = np.maximum(np.sqrt(preferred[0] * preferred[0] + preferred[1] * preferred[1]), 0.35)
         hurry = _HURRY_PER_S * np.minimum(crowd.stuck_s[me], 5.0)
         picked = choose(
-            self._ways, (crowd.x[me], crowd.y[me]), (crowd.vx[me], crowd.vy[me]), liking, pace, hurry, nearby
+            self._ways, (crowd.x[me], crowd.y[me]), (crowd.vx[me], crowd.vy[me]), preferred, pace, hurry, nearby
         )  # fmt: skip
-        crowd.wish_x[me], crowd.wish_y[me], crowd.meet_s[me] = picked
+        crowd.chosen_vx[me], crowd.chosen_vy[me], crowd.meet_s[me] = picked
 
-    def _around(self, me: Ints, near: Ints, dx: Array, dy: Array, gap2: Array, robot: RobotSeen) -> Nearby:
+    def _around(self, me: Ints, near: Ints, dx: Array, dy: Array, gap2: Array, robot: ObservedRobot) -> Nearby:
         crowd = self._crowd
         vx, vy = crowd.vx[near], crowd.vy[near]
-        # Who walks avoids too; who stands is a thing to walk round.
-        walks = (crowd.like_x[near] != 0.0) | (crowd.like_y[near] != 0.0)
+        # Walking people share the avoidance; standing people are obstacles.
+        walks = (crowd.preferred_vx[near] != 0.0) | (crowd.preferred_vy[near] != 0.0)
         mates = crowd.group[near] == crowd.group[me][:, None]
         squeeze = (crowd.squeeze_s[me] > 0.0)[:, None]
         touch = np.where(squeeze, _SQUEEZE_TOUCH_M, np.where(mates, _MATES_TOUCH_M, _TOUCH_M))
@@ -161,7 +161,7 @@ class People:
         ux = np.where(walks, vx + crowd.vx[me][:, None], vx)
         uy = np.where(walks, vy + crowd.vy[me][:, None], vy)
 
-        # The robot: three circles along its body. It may not avoid, so all of the avoiding is one's own.
+        # The robot: three circles along its body. People do not rely on it to avoid them.
         aware = crowd.aware[me][:, None]
         along = np.array((-robot.axis_m, 0.0, robot.axis_m))
         rx = np.where(aware, robot.x + robot.c * along - crowd.x[me][:, None], 1e3)
@@ -180,9 +180,9 @@ class People:
 
     # -- moving ----------------------------------------------------------------------------------------------------
 
-    def _move(self, robot: RobotSeen, dt: float) -> None:
+    def _move(self, robot: ObservedRobot, dt: float) -> None:
         crowd = self._crowd
-        ax, ay = crowd.wish_x - crowd.vx, crowd.wish_y - crowd.vy
+        ax, ay = crowd.chosen_vx - crowd.vx, crowd.chosen_vy - crowd.vy
         size = np.sqrt(ax * ax + ay * ay) + 1e-9
         braking = (crowd.meet_s < 1.0) | (ax * crowd.vx + ay * crowd.vy < 0.0)
         limit = np.where(braking, _BRAKE_MPS2, _SPEED_UP_MPS2) * dt
@@ -193,9 +193,9 @@ class People:
         self._keep_off_robot(x, y, robot)
         self._keep_off_walls(x, y)
 
-        sits = np.flatnonzero(crowd.doing == Doing.SIT)
+        sits = np.flatnonzero(crowd.activity == Activity.SIT)
         if len(sits):
-            # Onto a seat and off it is a movement of its own, at the pace of sitting down.
+            # Sitting down and getting up move the person at a fixed speed.
             dx, dy = crowd.target_x[sits] - crowd.x[sits], crowd.target_y[sits] - crowd.y[sits]
             share = np.minimum(_SIT_DOWN_MPS * dt / (np.sqrt(dx * dx + dy * dy) + 1e-9), 1.0)
             x[sits], y[sits] = crowd.x[sits] + dx * share, crowd.y[sits] + dy * share
@@ -206,7 +206,7 @@ class People:
         crowd.x, crowd.y = crowd.x + dx * share, crowd.y + dy * share
 
     def _keep_apart(self, x: Array, y: Array) -> None:
-        """Push people who would overlap away from each other; who stands gives way less than who walks."""
+        """Push overlapping people apart; standing people move less than walking ones."""
         crowd = self._crowd
         turns = self._pairs if crowd.n > _STAGGER_FROM else self._pairs[:1]
         me = np.concatenate([pair[0] for pair in turns])
@@ -219,18 +219,18 @@ class People:
         if not len(over):
             return
         me, other = me[over], other[over]
-        mine, theirs = _PUSHED[crowd.doing[me]], _PUSHED[crowd.doing[other]]
+        mine, theirs = _PUSHED[crowd.activity[me]], _PUSHED[crowd.activity[other]]
         push = (_BODIES_M - gap[over]) * mine / (mine + theirs + 1e-9) / gap[over]
         x += np.bincount(me, dx[over] * push, crowd.n)
         y += np.bincount(me, dy[over] * push, crowd.n)
 
-    def _keep_off_robot(self, x: Array, y: Array, robot: RobotSeen) -> None:
-        """Who has noticed the robot does not walk into it; who is touched by it is pushed, not passed through."""
+    def _keep_off_robot(self, x: Array, y: Array, robot: ObservedRobot) -> None:
+        """Keep people who are aware of the robot out of it, and push people whom it touches."""
         crowd = self._crowd
         if not (np.abs(x - robot.x) + np.abs(y - robot.y)).min() < 2.0:
             return
         rx, ry, gap = robot.nearest(x, y)
-        close = np.flatnonzero((gap < _ROBOT_BODY_M) & (crowd.doing != Doing.SIT))
+        close = np.flatnonzero((gap < _ROBOT_BODY_M) & (crowd.activity != Activity.SIT))
         stands = hypot(robot.vx, robot.vy) < _ROBOT_STANDS_MPS
         for k in close:
             if gap[k] > _ROBOT_TOUCHED_M and not crowd.aware[k]:
@@ -241,16 +241,16 @@ class People:
             if gap[k] <= _ROBOT_TOUCHED_M:
                 push += min(_ROBOT_TOUCHED_M - gap[k], 0.03)
             elif stands:
-                # Next to one that has come to a stop people move off; from one that drives they must have walked.
+                # People move away from a standing robot; a driving robot must keep its own distance.
                 push += min(_ROBOT_BODY_M - gap[k], 0.02)
             x[k] += nx * push
             y[k] += ny * push
 
     def _keep_off_walls(self, x: Array, y: Array) -> None:
-        """Slide along walls; what is left of the way into one is not walked."""
+        """Keep people out of walls; they slide along them."""
         crowd = self._crowd
         gap, slope_x, slope_y = self._ways.slopes_at(x, y)
-        near = np.flatnonzero((gap < _WALL_M) & (crowd.doing != Doing.SIT))
+        near = np.flatnonzero((gap < _WALL_M) & (crowd.activity != Activity.SIT))
         if not len(near):
             return
         norm = np.sqrt(slope_x[near] ** 2 + slope_y[near] ** 2) + 1e-9
@@ -268,14 +268,14 @@ class People:
         walks = speed > 0.2
         off = np.where(walks, np.arctan2(crowd.vy, crowd.vx), crowd.facing) - crowd.heading
         off -= _TURN * np.rint(off * (1.0 / _TURN))
-        # A step back or aside is not turning round; whoever has nowhere to look keeps looking there.
+        # A step back or aside does not change the heading; neither does an undefined direction (NaN).
         turns = (np.abs(off) < 2.0) | (speed > 0.6) | ~walks
         off = np.where(turns & (off == off), off, 0.0) * (6.0 * dt)
         heading = crowd.heading + np.minimum(np.maximum(off, -_TURN_RADPS * dt), _TURN_RADPS * dt)
         crowd.heading = heading - _TURN * np.rint(heading * (1.0 / _TURN))
         walking = speed * (crowd.sitting == 0.0)
         root = np.sqrt(walking) * crowd.stride
-        # One cycle is two steps: speed / (2 step). Hands of who stands and talks move by the phase, too.
+        # One cycle is two steps: speed / (2 step). The phase also moves the hands of people who talk.
         rate = np.where(
             walking > 0.05, root * (dt / (2.0 * _STEP_PER_ROOT_SPEED)), (crowd.gesture == 1.0) * (0.35 * dt)
         )

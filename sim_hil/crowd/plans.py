@@ -1,4 +1,4 @@
-"""What everybody in a crowd is about: destinations, dwelling, sitting, queues, groups; and the velocity it asks for."""
+"""Activities of people: destinations, waiting, sitting, queues and groups, and the resulting preferred velocities."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from sim_hil.crowd.courtesy import Courtesy
 from sim_hil.crowd.groups import Groups
 from sim_hil.crowd.jams import Jams
-from sim_hil.crowd.senses import RobotSeen
+from sim_hil.crowd.senses import ObservedRobot
 from sim_hil.crowd.spots import route_spots, spots_of
 from sim_hil.crowd.start import Start
-from sim_hil.crowd.state import Crowd, Doing
+from sim_hil.crowd.state import Activity, Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Scene, Vec2
 
@@ -22,17 +22,17 @@ _WEIGHTS = {"way": 1.0, "stand": 1.6, "queue": 1.6, "sit": 1.2, "door": 1.0}
 _STAY_S = {"way": (8.0, 30.0), "stand": (15.0, 60.0), "door": (1.5, 3.0), "sit": (30.0, 120.0)}
 _SERVED_S = (4.0, 10.0)
 _NEAR_M, _AT_M, _PASSED_M = 1.3, 0.3, 0.9
-_OPEN_M, _WALL_SIDE_M = 0.85, 0.5  # who stands about does so in the open, or close by a wall
-_GIVE_WAY_M = 0.75  # from the robot's body axis
+_OPEN_M, _WALL_SIDE_M = 0.85, 0.5  # people stand at points with more clearance than the first or less than the second
+_GIVE_WAY_M = 0.75  # distance from the robot's body axis within which a standing person gives way
 _SEAT_S = 1.2
 _PASSAGES = frozenset(("corridor", "aisle", "street", "crossing"))
-_GROUP_GAP_M = 0.9  # groups do not crowd into corners
-_STEP_BACK_S = 8.0  # blocked so long, one steps back and lets the others past
-_PROGRESS_M = 0.4  # who has not got this far from where one was is stuck
+_GROUP_GAP_M = 0.9  # least clearance of a spot for a group
+_STEP_BACK_S = 8.0  # blocked time after which a person steps back to let others pass
+_PROGRESS_M = 0.4  # progress below which a person counts as stuck
 
 
 class Plans:
-    """Decides for everybody. `update` is called ten times a second; it fills the crowd's liking and facing."""
+    """Decision making for all people; `update`, called at 10 Hz, sets preferred velocities and facing directions."""
 
     def __init__(self, scene: Scene, ways: CrowdMap, crowd: Crowd, rng: np.random.Generator) -> None:
         self._ways, self._crowd, self._rng = ways, crowd, rng
@@ -57,7 +57,7 @@ class Plans:
     # -- the beginning ---------------------------------------------------------------------------------------------
 
     def settle(self, scene: Scene, clear_m: float) -> None:
-        """Place everybody, further than `clear_m` from the robot's start; raises ValueError when there is no room."""
+        """Place everybody, further than `clear_m` from the robot's start. Raises ValueError if there is no room."""
         crowd, rng = self._crowd, self._rng
         start = Start(scene, clear_m, self._ways, crowd, rng)
         for person in range(crowd.n):
@@ -92,7 +92,7 @@ class Plans:
         raise start.no_room()
 
     def _start_at_spot(self, person: int, start: Start) -> bool:
-        """Be at a free place from the beginning, as if one had come before; false when none is found."""
+        """Start a person at a free spot, as if it had arrived earlier; return False if none is found."""
         crowd, rng = self._crowd, self._rng
         for _ in range(6):
             spot = int(rng.integers(len(self._spots)))
@@ -119,7 +119,7 @@ class Plans:
     def _go(self, person: int, spot: int) -> None:
         crowd = self._crowd
         self._leave(person)
-        crowd.spot[person], crowd.doing[person] = spot, Doing.WALK
+        crowd.spot[person], crowd.activity[person] = spot, Activity.WALK
         crowd.facing[person], crowd.stuck_s[person] = np.nan, 0.0
         crowd.gesture[person] = PHONE if crowd.inattentive[person] else 0.0
         what = self._spots[spot]
@@ -140,14 +140,14 @@ class Plans:
             self._slot[person] = -1
 
     def _free_slot(self, spot: int) -> int:
-        """A slot of a spot that nobody has; -1 when it is full."""
+        """Return a free slot of a spot; -1 if it is full."""
         slots = self._spots[spot].slots
         if spot in self._queues:
             return len(self._queues[spot]) if len(self._queues[spot]) < len(slots) else -1
         return next((k for k in range(len(slots)) if (spot, k) not in self._taken), -1)
 
     def _next(self, person: int, away_from: Vec2 | None = None) -> None:
-        """Choose where to go now; `away_from` is a direction (unit x, y) that is blocked."""
+        """Choose the next destination; `away_from` is a blocked direction (unit x, y)."""
         crowd, rng = self._crowd, self._rng
         if self._routes:
             legs = self._routes[int(self._route[person])]
@@ -183,7 +183,7 @@ class Plans:
 
     def _hold(self, person: int, heading: float, stay_s: tuple[float, float]) -> None:
         crowd, rng = self._crowd, self._rng
-        crowd.doing[person] = Doing.HOLD
+        crowd.activity[person] = Activity.HOLD
         crowd.target_x[person], crowd.target_y[person] = crowd.x[person], crowd.y[person]
         crowd.facing[person] = heading
         crowd.until_s[person] = crowd.now_s + float(rng.uniform(*stay_s))
@@ -193,19 +193,19 @@ class Plans:
             crowd.gesture[person] = PHONE if rng.uniform() < 0.4 else 0.0
 
     def _arrive(self, person: int) -> None:
-        """Do what one came for."""
+        """Start the activity of the reached spot."""
         crowd, rng = self._crowd, self._rng
         spot = int(crowd.spot[person])
         what = self._spots[spot]
         if what.kind == "sit" and (spot, 0) not in self._taken:
             self._taken[spot, 0], self._slot[person] = person, 0
-            crowd.doing[person] = Doing.SIT
+            crowd.activity[person] = Activity.SIT
             crowd.facing[person] = what.heading_rad
             crowd.gesture[person] = PHONE if rng.uniform() < 0.4 else 0.0
             crowd.until_s[person] = crowd.now_s + float(rng.uniform(*_STAY_S["sit"]))
         elif what.kind == "queue" and self._free_slot(spot) >= 0:
             self._queues[spot].append(person)
-            crowd.doing[person], crowd.until_s[person] = Doing.QUEUE, np.inf
+            crowd.activity[person], crowd.until_s[person] = Activity.QUEUE, np.inf
             crowd.gesture[person] = PHONE if rng.uniform() < 0.3 else 0.0
         elif what.kind in ("stand", "door") and self._slot[person] >= 0:
             self._hold(person, what.heading_rad, _STAY_S[what.kind])
@@ -220,24 +220,24 @@ class Plans:
             self._next(person)
 
     def _roomy(self, person: int, area_allows: bool) -> bool:
-        """Whether one may stand about here: in the open, or alone close by a wall."""
+        """Return whether a person may stand here: in the open, or alone next to a wall."""
         at = self._crowd.x[person : person + 1], self._crowd.y[person : person + 1]
         gap = float(self._ways.gaps_at(*at)[0])
         return (area_allows and gap > _OPEN_M) or (int(self._groups.size[person]) == 1 and gap < _WALL_SIDE_M)
 
     # -- ten times a second ----------------------------------------------------------------------------------------
 
-    def update(self, now_s: float, dt: float, robot: RobotSeen) -> None:
-        """Take the decisions that are due and set what velocity everybody would like."""
+    def update(self, now_s: float, dt: float, robot: ObservedRobot) -> None:
+        """Take the decisions that are due and set everybody's preferred velocity."""
         crowd = self._crowd
         crowd.now_s = now_s
-        walking = crowd.doing == Doing.WALK
+        walking = crowd.activity == Activity.WALK
         dx, dy = crowd.target_x - crowd.x, crowd.target_y - crowd.y
         distance = np.sqrt(dx * dx + dy * dy)
         for person in np.flatnonzero(walking & (distance < 3.0)):
             self._approach(int(person), float(distance[person]))
-        for person in np.flatnonzero((now_s > crowd.until_s) & (crowd.doing >= Doing.HOLD)):
-            if crowd.doing[person] != Doing.SIT or crowd.sitting[person] > 0.99:
+        for person in np.flatnonzero((now_s > crowd.until_s) & (crowd.activity >= Activity.HOLD)):
+            if crowd.activity[person] != Activity.SIT or crowd.sitting[person] > 0.99:
                 self._get_up(int(person))
         for spot, line in self._queues.items():
             if line:
@@ -248,7 +248,7 @@ class Plans:
             for person in self._jams.turn_round(crowd, self._ways, self._rng):
                 self._next(int(person))
         self._courtesy.update(crowd, self._ways, robot, dt)
-        self._like(robot)
+        self._set_preferred(robot)
         self._sit(dt)
 
     def _approach(self, person: int, distance: float) -> None:
@@ -256,7 +256,7 @@ class Plans:
         if what.kind == "way":
             reached = distance < _PASSED_M
         elif what.kind == "queue":
-            # Who comes to a queue joins at its tail, wherever that is.
+            # A person joins a queue at its current tail.
             tail = self._free_slot(int(self._crowd.spot[person]))
             x, y = what.slots[tail]
             gap = hypot(self._crowd.x[person] - x, self._crowd.y[person] - y)
@@ -268,11 +268,11 @@ class Plans:
 
     def _get_up(self, person: int) -> None:
         crowd = self._crowd
-        if crowd.doing[person] == Doing.SIT:
+        if crowd.activity[person] == Activity.SIT:
             what = self._spots[int(crowd.spot[person])]
             near = np.hypot(crowd.x - what.reach[0], crowd.y - what.reach[1]) < 0.55
             near[person] = False
-            if near.any():  # somebody stands before the chair
+            if near.any():  # the space in front of the chair is occupied
                 crowd.until_s[person] = crowd.now_s + 1.0
                 return
             crowd.until_s[person] = -1.0  # getting up; _sit does the rest
@@ -294,9 +294,9 @@ class Plans:
             crowd.until_s[first] = crowd.now_s + float(self._rng.uniform(*_SERVED_S))
 
     def _unstick(self, dt: float) -> None:
-        """Who wants to move and cannot loses patience, sooner or later: squeezes, turns back, or settles for here."""
+        """Update the blocked times; a person without progress squeezes through, turns back, or stays here."""
         crowd = self._crowd
-        wants = crowd.like_x * crowd.like_x + crowd.like_y * crowd.like_y > 0.02
+        wants = crowd.preferred_vx * crowd.preferred_vx + crowd.preferred_vy * crowd.preferred_vy > 0.02
         got_on = np.hypot(crowd.x - crowd.anchor_x, crowd.y - crowd.anchor_y) > _PROGRESS_M
         fresh = got_on | ~wants
         crowd.anchor_x = np.where(fresh, crowd.x, crowd.anchor_x)
@@ -311,35 +311,35 @@ class Plans:
         crowd = self._crowd
         crowd.stuck_s[person] = 0.0
         crowd.squeeze_s[person] = 3.0
-        if crowd.blocked_s[person] > _STEP_BACK_S and crowd.doing[person] in (Doing.WALK, Doing.QUEUE):
+        if crowd.blocked_s[person] > _STEP_BACK_S and crowd.activity[person] in (Activity.WALK, Activity.QUEUE):
             self._courtesy.step_back(person, crowd, self._ways)
-        if crowd.doing[person] == Doing.WALK:
+        if crowd.activity[person] == Activity.WALK:
             spot = self._spots[int(crowd.spot[person])]
             left = hypot(crowd.target_x[person] - crowd.x[person], crowd.target_y[person] - crowd.y[person])
             if left < 1.2 and spot.kind == "stand":
                 self._hold(person, float(crowd.heading[person]), (3.0, 8.0))
                 return
-            norm = hypot(crowd.like_x[person], crowd.like_y[person]) or 1.0
-            self._next(person, away_from=(crowd.like_x[person] / norm, crowd.like_y[person] / norm))
-        elif crowd.doing[person] == Doing.QUEUE and crowd.blocked_s[person] > _STEP_BACK_S:
-            self._next(person)  # who cannot get to the queue's next place gives it up
-        elif crowd.doing[person] == Doing.FOLLOW:
+            norm = hypot(crowd.preferred_vx[person], crowd.preferred_vy[person]) or 1.0
+            self._next(person, away_from=(crowd.preferred_vx[person] / norm, crowd.preferred_vy[person] / norm))
+        elif crowd.activity[person] == Activity.QUEUE and crowd.blocked_s[person] > _STEP_BACK_S:
+            self._next(person)  # cannot reach the next place of the queue: leave it
+        elif crowd.activity[person] == Activity.FOLLOW:
             self._groups.lose_patience(crowd, person)
-        elif crowd.doing[person] == Doing.HOLD:
+        elif crowd.activity[person] == Activity.HOLD:
             crowd.target_x[person], crowd.target_y[person] = crowd.x[person], crowd.y[person]
 
-    def _like(self, robot: RobotSeen) -> None:
+    def _set_preferred(self, robot: ObservedRobot) -> None:
         crowd, ways = self._crowd, self._ways
-        walking = np.flatnonzero(crowd.doing == Doing.WALK)
-        like_x, like_y = np.zeros(crowd.n), np.zeros(crowd.n)
+        walking = np.flatnonzero(crowd.activity == Activity.WALK)
+        preferred_vx, preferred_vy = np.zeros(crowd.n), np.zeros(crowd.n)
         if len(walking):
-            like_x[walking], like_y[walking] = self._on_the_way(walking)
-        standing = np.flatnonzero((crowd.doing == Doing.HOLD) | (crowd.doing == Doing.QUEUE))
+            preferred_vx[walking], preferred_vy[walking] = self._on_the_way(walking)
+        standing = np.flatnonzero((crowd.activity == Activity.HOLD) | (crowd.activity == Activity.QUEUE))
         if len(standing):
-            like_x[standing], like_y[standing] = self._stay_put(standing, robot)
-        self._groups.like(crowd, ways, like_x, like_y)
-        self._courtesy.like(crowd, like_x, like_y)
-        crowd.like_x, crowd.like_y = like_x, like_y
+            preferred_vx[standing], preferred_vy[standing] = self._stay_put(standing, robot)
+        self._groups.set_preferred(crowd, ways, preferred_vx, preferred_vy)
+        self._courtesy.override(crowd, preferred_vx, preferred_vy)
+        crowd.preferred_vx, crowd.preferred_vy = preferred_vx, preferred_vy
 
     def _on_the_way(self, who: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         crowd, ways = self._crowd, self._ways
@@ -349,7 +349,7 @@ class Plans:
         left = np.sqrt(fx * fx + fy * fy)
         dx, dy = tx - x, ty - y
         norm = np.sqrt(dx * dx + dy * dy) + 1e-9
-        # Keeping to the right of the way, where there is room for it.
+        # Keep to the right of the route where there is room.
         lane = crowd.lane_m[who]
         sx, sy = tx + dy / norm * lane, ty - dx / norm * lane
         roomy = ways.gaps_at(sx, sy) > 0.5
@@ -362,8 +362,10 @@ class Plans:
         pace = np.where(near & ends, np.minimum(pace, 0.35 + 0.6 * left), pace)
         return dx / norm * pace, dy / norm * pace
 
-    def _stay_put(self, who: NDArray[np.int64], robot: RobotSeen) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Back to one's spot when pushed off it; a slow step aside for the robot that comes up to one."""
+    def _stay_put(
+        self, who: NDArray[np.int64], robot: ObservedRobot
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return standing people to their spots when pushed away, or slowly aside from an approaching robot."""
         crowd = self._crowd
         dx, dy = crowd.target_x[who] - crowd.x[who], crowd.target_y[who] - crowd.y[who]
         left = np.sqrt(dx * dx + dy * dy) + 1e-9
@@ -371,14 +373,14 @@ class Plans:
         pace = np.where((left > 0.22) & (gap > _GIVE_WAY_M + 0.3), np.minimum(0.75, 0.25 + left), 0.0)
         aside = crowd.aware[who] & (gap < _GIVE_WAY_M)
         back = 0.3 + 0.5 * (_GIVE_WAY_M - gap)
-        like_x = np.where(aside, rx / (gap + 1e-9) * back, dx / left * pace)
-        like_y = np.where(aside, ry / (gap + 1e-9) * back, dy / left * pace)
-        return like_x, like_y
+        preferred_vx = np.where(aside, rx / (gap + 1e-9) * back, dx / left * pace)
+        preferred_vy = np.where(aside, ry / (gap + 1e-9) * back, dy / left * pace)
+        return preferred_vx, preferred_vy
 
     def _sit(self, dt: float) -> None:
-        """Between standing before a seat and sitting on it: a movement of its own, out of everybody's way."""
+        """Advance sitting down and getting up, which ignore other people."""
         crowd = self._crowd
-        for person in np.flatnonzero(crowd.doing == Doing.SIT):
+        for person in np.flatnonzero(crowd.activity == Activity.SIT):
             what = self._spots[int(crowd.spot[person])]
             down = crowd.until_s[person] >= 0.0
             crowd.sitting[person] = min(max(crowd.sitting[person] + (dt if down else -dt) / _SEAT_S, 0.0), 1.0)
@@ -389,6 +391,6 @@ class Plans:
 
 
 def _may_stop(scene: Scene, x: float, y: float) -> bool:
-    """Whether people stand about there: not where others come through."""
+    """Return whether people may stand at a point: not in passages."""
     area = scene.area_at(x, y)
     return area is not None and area.kind not in _PASSAGES

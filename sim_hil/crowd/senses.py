@@ -1,4 +1,4 @@
-"""What people notice of the robot: who has it in view, for how long, and who has lost sight of it."""
+"""Perception of the robot: who sees it, for how long, and who has lost sight of it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from sim_hil.crowd.state import Array, Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
 
-NEAR_M = 0.75  # this close to its body it is felt and heard, whichever way one looks
-_HEARD_M, _HEARING_SHARE = 1.7, 0.3
+NEAR_M = 0.75  # distance from its body within which everybody notices the robot, regardless of heading
+_HEARING_M, _HEARING_SHARE = 1.7, 0.3  # range of hearing, and its rate of noticing relative to sight
 _FORGET_S = 2.5
 _FASTEST_MPS = 3.0
 
 
 @dataclass(frozen=True)
-class RobotSeen:
-    """Where the robot is: middle m, unit heading, velocity m/s; a capsule of half length `axis_m` for those around."""
+class ObservedRobot:
+    """Observed robot: centre, m; unit heading; velocity, m/s; a capsule with half length `axis_m`."""
 
     x: float
     y: float
@@ -29,7 +29,7 @@ class RobotSeen:
     axis_m: float
 
     def nearest(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Offsets from the nearest point of the robot's body axis to points, and their lengths, m."""
+        """Return the offsets from the nearest point of the robot's body axis to points, and their lengths, m."""
         rx, ry = x - self.x, y - self.y
         along = np.clip(rx * self.c + ry * self.s, -self.axis_m, self.axis_m)
         rx -= along * self.c
@@ -38,40 +38,40 @@ class RobotSeen:
 
 
 class RobotWatch:
-    """Follows the robot's pose from step to step: its velocity is seen, not told."""
+    """Tracker of the robot's pose that estimates its velocity."""
 
     def __init__(self, axis_m: float) -> None:
         self._axis_m = axis_m
         self._last: tuple[float, float] | None = None
         self._vx = self._vy = 0.0
 
-    def step(self, x: float, y: float, heading: float, dt: float) -> RobotSeen:
-        """Take the pose of now."""
+    def step(self, x: float, y: float, heading: float, dt: float) -> ObservedRobot:
+        """Add the current pose and return the observed robot."""
         if self._last is not None:
             vx, vy = (x - self._last[0]) / dt, (y - self._last[1]) / dt
-            if hypot(vx, vy) > _FASTEST_MPS:  # put elsewhere, not moved there
+            if hypot(vx, vy) > _FASTEST_MPS:  # teleported
                 vx = vy = 0.0
-            # About 0.15 s of smoothing: a walking robot sways.
+            # Smoothing over about 0.15 s, because a walking robot sways.
             self._vx += (vx - self._vx) * 0.2
             self._vy += (vy - self._vy) * 0.2
         self._last = (x, y)
-        return RobotSeen(x, y, cos(heading), sin(heading), self._vx, self._vy, self._axis_m)
+        return ObservedRobot(x, y, cos(heading), sin(heading), self._vx, self._vy, self._axis_m)
 
 
-def notice(crowd: Crowd, ways: CrowdMap, robot: RobotSeen, dt: float) -> None:
-    """Update who is aware of the robot, after `dt` seconds more."""
+def notice(crowd: Crowd, ways: CrowdMap, robot: ObservedRobot, dt: float) -> None:
+    """Update everybody's awareness of the robot after `dt` seconds."""
     rx, ry = robot.x - crowd.x, robot.y - crowd.y
     distance = np.hypot(rx, ry)
     in_range = distance < crowd.sight_m
     in_range &= rx * np.cos(crowd.heading) + ry * np.sin(crowd.heading) > crowd.sight_cos * distance
     in_range |= distance < NEAR_M + robot.axis_m
-    heard = distance < _HEARD_M
-    who = np.flatnonzero(in_range | heard)
+    audible = distance < _HEARING_M
+    who = np.flatnonzero(in_range | audible)
     visible = np.zeros(crowd.n, dtype=np.bool_)
     if len(who):
         robot_x, robot_y = np.full(len(who), robot.x), np.full(len(who), robot.y)
         visible[who] = ways.sees(crowd.x[who], crowd.y[who], robot_x, robot_y)
-    # Feet and motors behind one's back are noticed, too, but it takes longer.
+    # A robot behind a person is noticed by its sound, but later.
     crowd.seen_s = np.where(visible, crowd.seen_s + np.where(in_range, dt, _HEARING_SHARE * dt), 0.0)
     crowd.lost_s = np.where(visible, 0.0, crowd.lost_s + dt)
     crowd.aware |= crowd.seen_s >= crowd.reaction_s

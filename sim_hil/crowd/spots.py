@@ -1,4 +1,4 @@
-"""Where people of a scene go: its places and points spread over the floor, or the way points of its routes."""
+"""Destinations of people: places of the scene and points spread over the floor, or the points of its routes."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Place, Scene, Vec2
 
-_REACH_M = 1.3  # a place further than this from any walkable floor is of no use
+_REACH_M = 1.3  # largest distance from a place to walkable floor
 _QUEUE_STEP_M = 0.75
 _SIDE_M = 0.8
 _WANDER_M2, _WANDER_MIN, _WANDER_MAX = 35.0, 10, 20
-_PLACES_MIN, _PLACES_MAX = 10, 40  # each costs a field of ways over the whole floor
+_PLACES_MIN, _PLACES_MAX = 10, 40  # limited, because each needs a distance field over the whole floor
 _WANDER_GAP_M = 0.55
-_JUNCTION_M = 2.6  # more than two free ways of this length meet at a junction
+_JUNCTION_M = 2.6  # a junction has more than two free directions of this length
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A destination: `slots` are where people stand or sit, m, the first one served first; they face `heading_rad`.
+    """Destination; `slots`: points where people stand or sit, m, in order of service; they face `heading_rad`.
 
-    kind: way (walked through), stand, sit, queue or door. `reach` is the walkable point before it.
+    `kind`: way (walked through), stand, sit, queue or door. `reach`: the walkable point in front of it.
     """
 
     kind: str
@@ -33,7 +33,7 @@ class Spot:
 
 
 def spots_of(scene: Scene, ways: CrowdMap, people: int, rng: np.random.Generator) -> list[Spot]:
-    """Where so many people go: some of a large scene's places, drawn from the seed, and points of its floor."""
+    """Return the destinations for a number of people: a random subset of the places, and points on the floor."""
     most = int(np.clip(people + _PLACES_MIN, _PLACES_MIN, _PLACES_MAX))
     drawn = sorted(rng.permutation(len(scene.places))[:most].tolist())
     places = (scene.places[k] for k in drawn)
@@ -55,7 +55,7 @@ def _of_place(place: Place, ways: CrowdMap) -> Spot | None:
 
 
 def _at_junction(scene: Scene, place: Place, ways: CrowdMap) -> bool:
-    """Whether a place lies where corridors meet: who stands there stands in everybody's way."""
+    """Return whether a place lies at a junction of corridors, where a standing person blocks the others."""
     x, y = place.position_m
     area = scene.area_at(x, y)
     if area is None or area.kind != "corridor":
@@ -66,7 +66,7 @@ def _at_junction(scene: Scene, place: Place, ways: CrowdMap) -> bool:
 
 
 def _in_line(place: Place, ways: CrowdMap) -> tuple[Vec2, ...]:
-    """One behind the other, against the heading; bent aside where the straight line runs into something."""
+    """Return the slots of a queue against the heading; it bends where the straight line is blocked."""
     x, y = place.position_m
     slots, turn = [(x, y)], place.heading_rad + pi
     while len(slots) < place.capacity:
@@ -84,7 +84,7 @@ def _in_line(place: Place, ways: CrowdMap) -> tuple[Vec2, ...]:
 
 
 def _abreast(place: Place) -> list[Vec2]:
-    """Side by side before the place, the middle first."""
+    """Return slots side by side at the place, starting in the middle."""
     (x, y), c, s = place.position_m, cos(place.heading_rad), sin(place.heading_rad)
     sides = [((k + 1) // 2) * (1 if k % 2 else -1) * _SIDE_M for k in range(place.capacity)]
     return [(x - s * side, y + c * side) for side in sides]
@@ -95,7 +95,7 @@ def _gap(ways: CrowdMap, point: Vec2) -> float:
 
 
 def _scattered(ways: CrowdMap, rng: np.random.Generator) -> list[Spot]:
-    """Points to walk to, as far from each other as the floor allows."""
+    """Return points to walk to, as far apart as possible."""
     x, y, gaps = ways.walkable()
     wide = gaps >= min(_WANDER_GAP_M, float(gaps.max()))
     x, y = x[wide], y[wide]
@@ -111,7 +111,7 @@ def _scattered(ways: CrowdMap, rng: np.random.Generator) -> list[Spot]:
 
 
 def route_spots(scene: Scene) -> tuple[list[Spot], list[list[int]]]:
-    """The way points of a scene's routes as spots, and each route as their indices."""
+    """Return the points of a scene's routes as spots, and each route as their indices."""
     spots: list[Spot] = []
     routes = []
     for route in scene.routes:

@@ -1,4 +1,4 @@
-"""Where people are at the beginning: on free floor, apart from each other and from the robot's start."""
+"""Start positions of people: on free floor, apart from each other and from the robot's start."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from math import hypot, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.crowd.state import Crowd, Doing
+from sim_hil.crowd.state import Activity, Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Scene
 
-_APART_M, _CLOSER_M = 1.1, 0.6  # from others; closer when the floor fills up
+_APART_M, _CLOSER_M = 1.1, 0.6  # least distance between people, and the one for a crowded floor
 _TRIES, _EASY_TRIES = 400, 300
 _GROUP_M = 4.0
 
 
 class Start:
-    """Places people one after the other; those before count as placed. Raises ValueError when there is no room."""
+    """Placement of people one after another, in order of index. Raises ValueError if there is no room."""
 
     def __init__(self, scene: Scene, clear_m: float, ways: CrowdMap, crowd: Crowd, rng: np.random.Generator) -> None:
         self._crowd, self._rng, self._scene, self._clear_m = crowd, rng, scene, clear_m
@@ -29,7 +29,7 @@ class Start:
         return np.asarray(np.hypot(x - self._scene.start[0], y - self._scene.start[1]) > self._clear_m)
 
     def fits(self, person: int, x: float, y: float, apart_m: float = _APART_M) -> bool:
-        """Whether a person may begin at a point."""
+        """Return whether a person may start at a point."""
         crowd = self._crowd
         if hypot(x - self._scene.start[0], y - self._scene.start[1]) <= self._clear_m:
             return False
@@ -37,11 +37,11 @@ class Start:
         return bool(person == 0 or others.min() > apart_m)
 
     def no_room(self) -> ValueError:
-        """What to raise when nothing fits."""
+        """Return the error for a scene without room."""
         return ValueError(f"people: no room for another person in scene {self._scene.name}")
 
     def anywhere(self, person: int) -> None:
-        """Begin on any free floor, looking anywhere."""
+        """Place a person at a random free point with a random heading."""
         crowd, rng = self._crowd, self._rng
         for attempt in range(_TRIES if len(self._x) else 0):
             k = int(rng.integers(len(self._x)))
@@ -52,7 +52,7 @@ class Start:
         raise self.no_room()
 
     def beside(self, person: int, leader: int) -> None:
-        """Begin near the leader of one's group."""
+        """Place a person near the leader of the group."""
         crowd = self._crowd
         distance = np.hypot(self._x - crowd.x[leader], self._y - crowd.y[leader])
         near = np.flatnonzero((distance < _GROUP_M) & (distance > _CLOSER_M))
@@ -63,4 +63,4 @@ class Start:
         else:
             self.anywhere(person)
         crowd.heading[person] = crowd.heading[leader]
-        crowd.doing[person] = Doing.FOLLOW
+        crowd.activity[person] = Activity.FOLLOW

@@ -1,4 +1,4 @@
-"""The state of everybody in a crowd as arrays, one entry a person."""
+"""State of a crowd as arrays with one entry per person."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-class Doing:
-    """What a person is about; plain numbers, because arrays of them are compared all the time."""
+class Activity:
+    """Activities of a person; plain integers, because arrays of them are compared often."""
 
-    WALK: Final = 0  # on the way to a spot
-    FOLLOW: Final = 1  # in the group of somebody
+    WALK: Final = 0  # walking to a spot
+    FOLLOW: Final = 1  # following the leader of a group
     HOLD: Final = 2  # standing at a spot: looking, talking, on the phone
     QUEUE: Final = 3  # in a queue
     SIT: Final = 4  # sitting, sitting down or getting up
 
 
 class Crowd:
-    """n people. Positions m, velocities m/s, headings rad; traits are drawn once from `rng`."""
+    """State of n people: positions m, velocities m/s, headings rad; traits are drawn once from `rng`."""
 
     def __init__(self, count: int, rng: np.random.Generator) -> None:
         n = count
         self.n = n
         self.now_s = 0.0
         self.x, self.y, self.vx, self.vy = (np.zeros(n) for _ in range(4))
-        self.wish_x, self.wish_y = np.zeros(n), np.zeros(n)  # the velocity picked last
-        self.meet_s = np.full(n, 1e3)  # when it would run into somebody
-        self.heading, self.facing = np.zeros(n), np.full(n, np.nan)  # facing: where a standing person wants to look
+        self.chosen_vx, self.chosen_vy = np.zeros(n), np.zeros(n)  # the chosen velocity, m/s
+        self.meet_s = np.full(n, 1e3)  # time to collision at that velocity, s
+        self.heading, self.facing = np.zeros(n), np.full(n, np.nan)  # facing: desired heading while standing
         self.phase, self.swing = rng.uniform(0.0, 1.0, n), np.zeros(n)
         self.sitting, self.gesture = np.zeros(n), np.zeros(n)
 
@@ -44,20 +44,23 @@ class Crowd:
         self.reaction_s = rng.uniform(0.25, 0.6, n) + np.where(self.inattentive, 0.3, 0.0)
         self.sight_m = np.where(self.inattentive, rng.uniform(1.6, 2.4, n), rng.uniform(5.0, 9.0, n))
         self.sight_cos = np.cos(np.where(self.inattentive, np.radians(40.0), np.radians(95.0)))
-        self.personal_m = rng.uniform(0.85, 1.1, n)  # distance kept from the robot's body axis when there is room
-        self.lane_m = np.clip(rng.normal(0.30, 0.15, n), 0.0, 0.6)  # how far to the right of the way one keeps
+        self.personal_m = rng.uniform(0.85, 1.1, n)  # preferred distance from the robot's body axis
+        self.lane_m = np.clip(rng.normal(0.30, 0.15, n), 0.0, 0.6)  # preferred offset to the right of the route
         self.stride = rng.uniform(0.94, 1.06, n)
 
-        self.doing = np.zeros(n, dtype=np.int64)
-        self.spot = np.full(n, -1, dtype=np.int64)  # where one is bound for, or is
+        self.activity = np.zeros(n, dtype=np.int64)
+        self.spot = np.full(n, -1, dtype=np.int64)  # current destination
         self.target_x, self.target_y = np.zeros(n), np.zeros(n)
-        self.like_x, self.like_y = np.zeros(n), np.zeros(n)  # velocity one would walk at if alone; 0 stands
+        self.preferred_vx, self.preferred_vy = (
+            np.zeros(n),
+            np.zeros(n),
+        )  # preferred velocity without others, m/s; 0: stands
         self.until_s = np.zeros(n)
         self.leader = np.full(n, -1, dtype=np.int64)
         self.group = np.arange(n, dtype=np.int64)
         self.place_in_group = np.zeros(n, dtype=np.int64)
-        self.anchor_x, self.anchor_y = np.zeros(n), np.zeros(n)  # where one last got on
-        self.blocked_s = np.zeros(n)  # how long one has wanted to get on since
+        self.anchor_x, self.anchor_y = np.zeros(n), np.zeros(n)  # position at the last progress
+        self.blocked_s = np.zeros(n)  # time since then in which the person tried to move, s
         self.stuck_s, self.squeeze_s = np.zeros(n), np.zeros(n)
 
         self.seen_s, self.lost_s = np.zeros(n), np.zeros(n)

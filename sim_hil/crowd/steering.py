@@ -1,8 +1,8 @@
-"""Which velocity a walking person picks: reciprocal velocity obstacles, sampled; pure functions on arrays.
+"""Choice of a walking person's velocity by sampled reciprocal velocity obstacles; pure functions on arrays.
 
-Everybody compares a few velocities around the one they would like (van den Berg et al. 2008: each of two people who
-meet takes half of the avoiding, so that neither overreacts): how far from the liking, how soon a collision, how close
-a pass, how near the walls. What one does not see or does not share is left out or taken whole by the caller.
+Each person compares candidate velocities around the preferred one (van den Berg et al. 2008: two people who meet share
+the avoidance equally). The cost rates the deviation from the preferred velocity, time to collision, passing distance
+and distance to walls. The caller leaves out what a person does not see.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from sim_hil.crowd.walkable_map import CrowdMap
 
 Array = NDArray[np.float64]
 
-HORIZON_S = 2.6  # collisions further off than this worry nobody
-# Turns, rad (left positive), and shares of the own pace; then standing, half a step back, and going on as now.
+HORIZON_S = 2.6  # later collisions are ignored
+# Candidates: turns, rad (left positive), and shares of the speed; then standing, a slow step back, and no change.
 _TURNS = np.array((0.0, 0.18, -0.18, 0.4, -0.4, 0.7, -0.7, 1.05, -1.05, 1.6, -1.6))
 _FAST = len(_TURNS)
 _SLOW = np.array((0.0, 0.25, -0.25, 0.7, -0.7, 1.3, -1.3, 2.1, -2.1))
@@ -25,7 +25,7 @@ _ANGLES = np.concatenate((_TURNS, _SLOW, (0.0, np.pi)))
 _SHARES = np.concatenate((np.full(_FAST, 1.0), np.full(len(_SLOW), 0.5), (0.0, 0.3)))
 _COS, _SIN = np.cos(_ANGLES) * _SHARES, np.sin(_ANGLES) * _SHARES
 _IDLE = np.append(1.0 - _SHARES, 0.5)
-_LEFT = np.append(np.where((_ANGLES > 0) & (_ANGLES < 3), 0.05, 0.0), 0.0)  # passing on the right is the habit
+_LEFT = np.append(np.where((_ANGLES > 0) & (_ANGLES < 3), 0.05, 0.0), 0.0)  # small cost: people prefer the right side
 
 _COLLISION, _CLOSE, _INERTIA, _WALL, _WALL_AIR = 3.2, 0.9, 0.65, 2.6, 0.45
 _SOON_S = 0.25  # a collision now costs _COLLISION / _SOON_S
@@ -37,10 +37,10 @@ _WALL_M, _AIR_M = 0.25, 0.5
 
 @dataclass(frozen=True)
 class Nearby:
-    """What m people have around them, [m, k] each; x and y are offsets, m.
+    """Surroundings of m people, arrays [m, k]; x and y are offsets, m.
 
-    A collision is a centre distance below `touch`, a close pass one below `close`, m. With `share` 2 the other one
-    avoids too and (ux, uy) is the sum of both velocities; with 1 it does not, and (ux, uy) is the other's alone.
+    A collision is a centre distance below `touch`, a close pass one below `close`, m. With `share` 2 the neighbour
+    avoids too, and (ux, uy) is the sum of both velocities; with 1 it does not, and (ux, uy) is the neighbour's.
     """
 
     x: Array
@@ -53,15 +53,15 @@ class Nearby:
 
 
 def choose(
-    ways: CrowdMap, position: tuple[Array, Array], velocity: tuple[Array, Array], liking: tuple[Array, Array],
+    ways: CrowdMap, position: tuple[Array, Array], velocity: tuple[Array, Array], preferred: tuple[Array, Array],
     pace_mps: Array, hurry: Array, nearby: Nearby,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Velocities picked by m people, and when they would run into somebody at that, s.
+    """Return the chosen velocities of m people, m/s, and their times to collision, s.
 
-    position, velocity, liking: x and y of each [m], m and m/s; pace_mps [m] is the speed of the fastest candidates;
-    hurry [m] is what standing still costs beyond not getting on: who has waited long rather goes round about.
+    position, velocity, preferred (velocity): x and y arrays [m], m and m/s. pace_mps [m]: speed of the fastest
+    candidates. hurry [m]: extra cost of standing still, so that people who have waited long accept detours.
     """
-    (x, y), (vx, vy), (lx, ly) = position, velocity, liking
+    (x, y), (vx, vy), (lx, ly) = position, velocity, preferred
     norm = np.sqrt(lx * lx + ly * ly)
     scale = pace_mps / np.maximum(norm, 1e-6)
     ex, ey = lx * scale, ly * scale
@@ -87,7 +87,7 @@ def _length(x: Array, y: Array) -> Array:
 
 
 def _meetings(cx: Array, cy: Array, near: Nearby) -> tuple[Array, Array]:
-    """[m, c]: time until each candidate meets anybody, s, and how close the closest pass comes: 0 clear, 1 touching."""
+    """Return for each candidate [m, c] the time to collision, s, and the closeness of the closest pass, 0..1."""
     share = near.share[:, None, :]
     wx = cx[:, :, None] * share - near.ux[:, None, :]
     wy = cy[:, :, None] * share - near.uy[:, None, :]
@@ -109,12 +109,12 @@ def _meetings(cx: Array, cy: Array, near: Nearby) -> tuple[Array, Array]:
 
 
 def _walls(ways: CrowdMap, x: Array, y: Array, cx: Array, cy: Array) -> Array:
-    """[m, c]: cost of walking into a wall, or along it closer than one likes."""
+    """Return for each candidate [m, c] the cost of hitting a wall or of walking close along it."""
     gaps = ways.gaps_at(
         x[:, None, None] + cx[:, :, None] * _WALL_TIMES_S, y[:, None, None] + cy[:, :, None] * _WALL_TIMES_S
     )
     here = ways.gaps_at(x, y)[:, None, None]
-    # Who stands closer to a wall than that already may walk along it and away from it.
+    # A person already closer to a wall may walk along it and away from it.
     limit = np.minimum(_WALL_M, here - 0.03)
     hit = np.where(gaps < limit, _WALL_COSTS, 0.0).max(axis=2)
     air = np.minimum(np.maximum((_AIR_M - gaps[:, :, 1]) * (1.0 / _AIR_M), 0.0), 1.0)

@@ -1,7 +1,7 @@
-"""Where people can walk in a scene, how far the nearest obstacle is, and which way leads to a destination.
+"""Map for people: walkable floor, clearances, and shortest paths to destinations.
 
-The clearances are those of the robot's navigation grid. Ways are shortest paths over a coarser grid on which a metre
-beside a wall or on a street costs more than one in the open; every cell knows the cell a few steps further on.
+Clearances come from the navigation grid. Paths are computed on a coarser grid with higher cost beside walls and on
+streets; for every destination, each cell stores the cell a few steps further on.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ Ints = NDArray[np.int64]
 Cell = TypeVar("Cell", bound=np.generic)
 
 BODY_RADIUS_M = 0.22
-_REQUIRED_M = 0.30  # a person's radius and a little air
-_HEAD_M = 1.9  # what hangs higher stops nobody
-_KERB_M = 0.25  # people step up and down this much
+_REQUIRED_M = 0.30  # a person's radius plus a margin
+_HEAD_M = 1.9  # objects that begin above this height are no obstacles
+_KERB_M = 0.25  # height of a step that people can climb
 _FINE_CELLS, _COARSE_CELLS = 150_000, 30_000
 _AHEAD_M = 1.3
-_WALL_PRICE, _WALL_PRICE_M = 2.0, 0.8  # a metre along a wall costs up to three
+_WALL_PRICE, _WALL_PRICE_M = 2.0, 0.8  # extra price of a metre directly at a wall, and the distance where it ends
 _STREET_PRICE = 6.0
 _SIGHT_SAMPLES = 24
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
 class CrowdMap:
-    """Clearances and ways of one scene. Raises ValueError when nobody has room in it."""
+    """Clearances and paths of one scene. Raises ValueError if it has no walkable floor."""
 
     def __init__(self, scene: Scene) -> None:
         (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
@@ -77,7 +77,7 @@ class CrowdMap:
         count = int(free.sum())
         graph = csr_matrix((cost, (source, target)), shape=(count, count))
         _, parts = connected_components(graph, directed=False)
-        # Pockets that cannot be reached are no place to be: everybody lives in the largest connected part.
+        # People only use the largest connected part; other parts cannot be reached.
         largest = int(np.argmax(np.bincount(parts))) if count else 0
         self._graph = graph
         self._cells = np.argwhere(free)
@@ -87,7 +87,7 @@ class CrowdMap:
         inside[self._cells[self._home, 0], self._cells[self._home, 1]] = 1
         if not inside.any():
             raise ValueError(f"people: scene {scene.name} has no room for anybody")
-        # For each cell the nearest one of that part: who is pushed off it finds back.
+        # For each cell the nearest cell of that part, so that people pushed off it can return.
         _, labels = cv2.distanceTransformWithLabels(
             1 - inside, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
         )
@@ -96,7 +96,7 @@ class CrowdMap:
         self._node = lookup[labels].ravel()
 
     def _between(self, dx: int, dy: int) -> Array:
-        """Clearance half way between each coarse cell and its neighbour."""
+        """Return the clearance half way between each coarse cell and its neighbour."""
         half, skip = self._skip // 2, self._skip
         rows = half + skip * np.arange(self._shape[0])
         columns = half + skip * np.arange(self._shape[1])
@@ -106,7 +106,7 @@ class CrowdMap:
         return _pair(middles, dx, dy)[0]
 
     def _streets(self, scene: Scene) -> Array:
-        """What a metre costs where: a street more than the crossing over it."""
+        """Return the price factor of each cell: higher on streets, except on crossings."""
         prices = np.ones(self._shape, dtype=np.float32)
         for kind, price in (("street", _STREET_PRICE), ("crossing", 1.0)):
             for area in scene.areas:
@@ -123,7 +123,7 @@ class CrowdMap:
     # -- clearances ------------------------------------------------------------------------------------------------
 
     def gaps_at(self, x: Array, y: Array) -> Array:
-        """Distance to the nearest obstacle from points of any shape, m, exact to a grid cell."""
+        """Return the distance to the nearest obstacle for points of any shape, m, with the grid's resolution."""
         column = ((x - self._origin[0]) * (1.0 / self._fine)).astype(np.int64)
         row = ((y - self._origin[1]) * (1.0 / self._fine)).astype(np.int64)
         column = np.minimum(np.maximum(column, 0), self._columns - 1)
@@ -131,14 +131,14 @@ class CrowdMap:
         return np.asarray(self._flat[row * self._columns + column])
 
     def slopes_at(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Distance to the nearest obstacle, m, and the direction (x, y; not normalised) in which it grows fastest."""
+        """Return the distance to the nearest obstacle, m, and its gradient (x, y; not normalised)."""
         g00, g10, g01, g11, a, b = self._around(self._flat, x, y)
         low, high = g00 + (g10 - g00) * a, g01 + (g11 - g01) * a
         slope_x = (g10 - g00) + ((g11 - g01) - (g10 - g00)) * b
         return low + (high - low) * b, slope_x, high - low
 
     def heights_at(self, x: Array, y: Array) -> Array:
-        """[n]: height of the ground, m; a kerb is gone up within one cell of the grid, as by a step."""
+        """Return the height of the ground [n], m; a kerb is climbed within one cell of the grid."""
         if self._ground is None:
             return np.zeros(len(x))
         g00, g10, g01, g11, a, b = self._around(self._ground, x, y)
@@ -146,7 +146,7 @@ class CrowdMap:
         return low + (high - low) * b
 
     def _around(self, flat: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """A grid's values at the four cells around each point, and how far the point is towards the upper ones."""
+        """Return a grid's values at the four cells around each point, and the interpolation weights."""
         u = (x - self._origin[0]) * (1.0 / self._fine) - 0.5
         v = (y - self._origin[1]) * (1.0 / self._fine) - 0.5
         u = np.minimum(np.maximum(u, 0.0), self._columns - 1.001)
@@ -159,7 +159,7 @@ class CrowdMap:
     # -- destinations ----------------------------------------------------------------------------------------------
 
     def nodes_at(self, x: Array, y: Array) -> Ints:
-        """The walkable cell nearest to each point."""
+        """Return the walkable cell nearest to each point."""
         column = ((x - self._origin[0]) * (1.0 / self._coarse)).astype(np.int64)
         row = ((y - self._origin[1]) * (1.0 / self._coarse)).astype(np.int64)
         column = np.minimum(np.maximum(column, 0), self._shape[1] - 1)
@@ -167,7 +167,7 @@ class CrowdMap:
         return np.asarray(self._node[row * self._shape[1] + column])
 
     def point(self, node: int) -> Vec2:
-        """Centre of a walkable cell, m."""
+        """Return the centre of a walkable cell, m."""
         row, column = self._cells[node]
         offset = (self._skip // 2 + 0.5) * self._fine
         return (
@@ -176,7 +176,7 @@ class CrowdMap:
         )
 
     def walkable(self) -> tuple[Array, Array, Array]:
-        """x, y and clearance, m, of every cell that people can reach, but for streets."""
+        """Return x, y and clearance, m, of every reachable cell outside streets."""
         cells = self._cells[self._home & self._calm]
         offset = (self._skip // 2 + 0.5) * self._fine
         x = self._origin[0] + cells[:, 1] * self._coarse + offset
@@ -184,7 +184,7 @@ class CrowdMap:
         return x, y, self._gaps[cells[:, 0] * self._skip + self._skip // 2, cells[:, 1] * self._skip + self._skip // 2]
 
     def add_destinations(self, points: list[Vec2]) -> None:
-        """Compute the ways to these points; they get the next indices in order."""
+        """Compute the paths to these points; they get the next destination indices in order."""
         if not points:
             return
         goals = self.nodes_at(np.array([p[0] for p in points]), np.array([p[1] for p in points]))
@@ -204,27 +204,27 @@ class CrowdMap:
         self._y = self._origin[1] + self._cells[:, 0] * self._coarse + offset
 
     def ahead(self, destinations: Ints, x: Array, y: Array) -> tuple[Array, Array]:
-        """The point to walk towards now, a good metre further on the way, for people bound for `destinations`."""
+        """Return the point to walk towards, about 1.3 m ahead on the path to each of `destinations`."""
         nodes = self._table[destinations, self.nodes_at(x, y)]
         return self._x[nodes], self._y[nodes]
 
     def ways_m(self, x: float, y: float) -> Array:
-        """[destinations]: what the way to each costs, in m of open floor; inf where there is none."""
+        """Return the cost of the path to each destination, in m of open floor; inf if there is none."""
         node = int(self.nodes_at(np.array((x,)), np.array((y,)))[0])
         return self._costs[:, node].astype(np.float64)
 
     def sees(self, ax: Array, ay: Array, bx: Array, by: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between points a and b, [n]."""
+        """Return whether the line between points a and b is free [n]."""
         shares = np.linspace(0.0, 1.0, _SIGHT_SAMPLES)
         dx, dy = bx - ax, by - ay
         gaps = self.gaps_at(ax[:, None] + dx[:, None] * shares, ay[:, None] + dy[:, None] * shares)
-        # Half the distance between samples: no wall is so thin that it fits between two of them.
+        # Half the distance between samples, so that a thin wall between two samples is detected.
         reach = np.maximum(np.hypot(dx, dy) * (0.5 / (_SIGHT_SAMPLES - 1)), 0.06)
         return np.asarray(gaps.min(axis=1) > reach)
 
 
 def _ground(scene: Scene, shape: tuple[int, int], origin: Vec2, resolution: float) -> Array:
-    """[rows * columns]: height of the ground at every cell's centre, m."""
+    """Return the height of the ground at every cell's centre [rows * columns], m."""
     heights = np.zeros(shape)
     y, x = (origin[axis] + (np.arange(shape[1 - axis]) + 0.5) * resolution for axis in (1, 0))
     for terrain in scene.terrain:
@@ -240,7 +240,7 @@ def _ground(scene: Scene, shape: tuple[int, int], origin: Vec2, resolution: floa
 
 
 def _pair(grid: NDArray[Cell], dx: int, dy: int) -> tuple[NDArray[Cell], NDArray[Cell]]:
-    """A grid cut to the cells that have a neighbour (dx, dy) further on, and those neighbours."""
+    """Return the cells of a grid that have a neighbour at offset (dx, dy), and those neighbours."""
     rows, columns = grid.shape
     here_rows = slice(0, rows - dy) if dy >= 0 else slice(-dy, rows)
     there_rows = slice(dy, rows) if dy >= 0 else slice(0, rows + dy)

@@ -1,1 +1,1 @@
-"""`edge-hil`: the simulated robot on the other end of a real protocol, in real time."""
+"""`edge-hil`: a simulated robot in real time behind its maker's protocol."""

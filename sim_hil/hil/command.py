@@ -1,18 +1,14 @@
-"""`edge-hil`: the simulated robot on the other end of a real protocol, in real time. Its command line."""
+"""Command line of `edge-hil`: a simulated robot in real time behind its maker's protocol."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import os
-import signal
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 import pybullet
@@ -24,6 +20,7 @@ from edge.core.cli import (
     OutputError,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import ConfigError
@@ -37,8 +34,8 @@ from sim_hil.robots.odometry_noise import LEVELS
 from sim_hil.scene.scene import Scene, SceneError, load_scene, scene_names
 from sim_hil.simulation.physics import Simulation
 
-# What the world can do to a run: the camera process dies, the window is closed, a disk is full. Anything else is a bug
-# and keeps its traceback.
+# Errors with an external cause: camera process died, window closed, disk full. Other errors are bugs and keep their
+# traceback.
 _RUN_FAILURES: Final = (RuntimeError, ValueError, OSError, pybullet.error, *DDS_ERRORS)
 
 EPILOG: Final = """examples:
@@ -55,37 +52,21 @@ EPILOG: Final = """examples:
   INTERFACE  serial (a serial line; a path that does not exist becomes the client's end of a pty),
              socketcan (a real bus), udp_multicast (between processes of this machine: udp_multicast:239.74.163.2)
   FAULT      drop, corrupt, duplicate, delay: probability per frame; delay_s (0.05); bus_off_every_s (0: never) and
-             bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that talks without end
+             bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that sends continuously
   default    serial:RUNTIME/carter-can in the user's runtime directory; the ready line names it
 --link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE]
-  to         is called without having been heard; key: the file of a signing key, then only signed packets are obeyed
+  to         address that receives heartbeats unasked; key: file of a signing key, then unsigned packets are ignored
   default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
-camera: the TCP port that pictures are served at over HTTP, 8090 if not given
+camera: TCP port of the HTTP camera stream, default 8090
 
-with --faults, one JSON object a datagram switches a fault on or off, such as {"fault": "camera-stop", "on": true}; the
-answer says when it took effect, and an unknown name is answered with all that there are
-exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed), its result
-is written all the same, or trace or result could not be written; 2 bad arguments"""
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """A list that receives the number of every SIGINT and SIGTERM until the end of the block."""
-    received: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+with --faults, a datagram with one JSON object switches a fault, such as {"fault": "camera-stop", "on": true}; the
+answer contains the time at which it took effect; the answer to an unknown name lists all faults
+exit codes: 0 ended by --duration, SIGINT or SIGTERM; 1 the run failed (camera process died, window closed; the result
+is still written), or trace or result could not be written; 2 bad arguments"""
 
 
 def parse_size(text: str) -> tuple[int, int] | None:
-    """`WxH` in pixels, None for `none`; raises argparse.ArgumentTypeError."""
+    """Parse `WxH` in pixels; `none` gives None. Raises argparse.ArgumentTypeError."""
     if text == "none":
         return None
     width, times, height = text.partition("x")
@@ -97,7 +78,7 @@ def parse_size(text: str) -> tuple[int, int] | None:
 
 
 def parse_start(text: str) -> tuple[float, float, float]:
-    """`X,Y,DEG` as (x_m, y_m, theta_rad); raises argparse.ArgumentTypeError."""
+    """Parse `X,Y,DEG` to (x_m, y_m, theta_rad). Raises argparse.ArgumentTypeError."""
     try:
         x_m, y_m, degrees = (float(part) for part in text.split(","))
     except ValueError:
@@ -110,30 +91,38 @@ def parse_start(text: str) -> tuple[float, float, float]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="edge-hil",
-        description="A simulated robot that answers its maker's protocol, in real time.",
+        description="Simulate a robot in real time behind its maker's protocol.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--robot", required=True, choices=robots(), help="which robot")
+    parser.add_argument("--robot", required=True, choices=robots(), help="robot to simulate")
     parser.add_argument(
         "--scene", required=True, metavar="NAME|FILE", help=f"a scene file, or one of: {', '.join(scene_names())}"
     )
-    parser.add_argument("--protocol", required=True, choices=protocols(), help="what it speaks")
+    parser.add_argument("--protocol", required=True, choices=protocols(), help="protocol of the robot")
     parser.add_argument(
-        "--start", type=parse_start, metavar="X,Y,DEG", help="where it starts, m and degrees (default: the scene's)"
+        "--start", type=parse_start, metavar="X,Y,DEG", help="start pose, m and degrees (default: the scene's)"
     )
     parser.add_argument("--people", type=int, default=0, metavar="N", help="walking people (default 0)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of people and odometry noise (default 0)")
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds (default: at a signal)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="random seed of people and odometry noise (default 0)"
+    )
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="end after S seconds (default: at SIGINT or SIGTERM)"
+    )
     parser.add_argument("--domain", type=int, metavar="N", help="unitree: DDS domain (default 0)")
     parser.add_argument("--interface", metavar="NAME", help="unitree: network interface (default lo)")
-    parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: where it is reached; forms and defaults below")
-    parser.add_argument("--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="default 320x180")
+    parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: address; forms and defaults below")
     parser.add_argument(
-        "--odometry-noise", choices=tuple(LEVELS), default="none", help="let the reported pose drift (default none)"
+        "--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="camera image size (default 320x180)"
     )
-    parser.add_argument("--faults", type=Path, metavar="PATH", help="take faults at this local datagram socket")
-    parser.add_argument("--trace", type=Path, metavar="FILE.jsonl", help="write what happened, one object a line")
+    parser.add_argument(
+        "--odometry-noise", choices=tuple(LEVELS), default="none", help="drift of the reported pose (default none)"
+    )
+    parser.add_argument("--faults", type=Path, metavar="PATH", help="accept faults at this local datagram socket")
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE.jsonl", help="write poses, commands and people, one JSON object per line"
+    )
     parser.add_argument(
         "--pose-hz", type=int, default=POSE_HZ, metavar="N", help=f"poses a second in the trace (default {POSE_HZ})"
     )
@@ -144,28 +133,28 @@ def _parser() -> argparse.ArgumentParser:
 
 @command_line("edge-hil")
 def main(argv: list[str] | None = None) -> int:
-    """Command line; see EPILOG for the exit codes."""
+    """Run the command and return its exit code (see EPILOG)."""
     args = _parser().parse_args(argv)
     with stop_signals() as stop:
         try:
             _check(args)
-            loop, where = _open(args)
+            loop, address = _open(args)
         except (ConfigError, SceneError, DdsError, FrontEndError, ValueError, OSError) as error:
-            return _complain(error, EXIT_BAD_INPUT)
+            return _report_error(error, EXIT_BAD_INPUT)
         try:
             trace = None if args.trace is None else TraceWriter(args.trace)
         except OSError as error:
             loop.close()
-            return _complain(f"--trace {args.trace}: expected a file to write, {error.strerror}", EXIT_BAD_INPUT)
+            return _report_error(f"--trace {args.trace}: expected a file to write, {error.strerror}", EXIT_BAD_INPUT)
         try:
-            code = _run(loop, trace, stop, args, where)
+            code = _run(loop, trace, stop, args, address)
         finally:
             written = _write_results(loop, trace, args)
         return code or written
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse bad arguments before anything is started or overwritten; raises ValueError or OSError with one line."""
+    """Check the arguments before anything is started or overwritten. Raises ValueError or OSError with one line."""
     check_combination(args.robot, args.protocol)
     check_flags(args.protocol, [flag for flag in FLAGS if getattr(args, flag.removeprefix("--")) is not None])
     if args.gui:
@@ -181,7 +170,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _open(args: argparse.Namespace) -> tuple[HilLoop, str]:
-    """The loop, and where its robot can be reached."""
+    """Open simulation and front end; return the loop and the robot's address as text."""
     scene = _scene(args)
     options = FrontEndOptions(
         robot=args.robot,
@@ -211,21 +200,21 @@ def _scene(args: argparse.Namespace) -> Scene:
         return scene
     (x_m, y_m, _), (x0, y0), (x1, y1) = args.start, scene.floor_min_m, scene.floor_max_m
     if not (x0 < x_m < x1 and y0 < y_m < y1):
-        raise SceneError(f"--start: expected a place on the floor, {x0:g}..{x1:g}, {y0:g}..{y1:g} m, found {x_m},{y_m}")
+        raise SceneError(f"--start: expected a point on the floor, {x0:g}..{x1:g}, {y0:g}..{y1:g} m, found {x_m},{y_m}")
     return replace(scene, start=args.start)
 
 
-def _run(loop: HilLoop, trace: TraceWriter | None, stop: list[int], args: argparse.Namespace, where: str) -> int:
+def _run(loop: HilLoop, trace: TraceWriter | None, stop: list[int], args: argparse.Namespace, address: str) -> int:
     try:
         try:
             if loop.start(trace, stop):
-                sys.stderr.write(f"edge-hil: ready, {where}\n")
+                sys.stderr.write(f"edge-hil: ready, {address}\n")
                 sys.stderr.flush()
                 loop.run(stop, args.duration)
         finally:
             loop.close()
     except _RUN_FAILURES as error:
-        return _complain(f"the run has failed: {error}", EXIT_CHECK_FAILED)
+        return _report_error(f"the run failed: {error}", EXIT_CHECK_FAILED)
     return EXIT_DONE
 
 
@@ -234,16 +223,16 @@ def _write_results(loop: HilLoop, trace: TraceWriter | None, args: argparse.Name
     if trace is not None:
         trace.close(time.monotonic_ns(), **summary)
         if trace.error is not None:
-            code = _complain(f"trace {args.trace} is incomplete: {trace.error}", EXIT_CHECK_FAILED)
+            code = _report_error(f"trace {args.trace} is incomplete: {trace.error}", EXIT_CHECK_FAILED)
     try:
         write_result(args.json, summary)
     except OutputError as error:
-        code = _complain(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
+        code = _report_error(f"the result could not be written: {error}", EXIT_CHECK_FAILED)
     return code
 
 
-def _complain(what: object, code: int) -> int:
-    sys.stderr.write(f"edge-hil: {what}\n")
+def _report_error(message: object, code: int) -> int:
+    sys.stderr.write(f"edge-hil: {message}\n")
     return code
 
 

@@ -1,4 +1,4 @@
-"""Is there an X server behind DISPLAY? PyBullet ends the whole process when there is none."""
+"""Check for an X server at DISPLAY before opening a window: without one, PyBullet ends the whole process."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import socket
 from contextlib import closing
 from typing import Final
 
-SOCKETS: Final = "/tmp/.X11-unix"  # X(7): where the server of this machine with number N listens, as XN
-FIRST_PORT: Final = 6000  # of one that is reached over TCP, plus its number
+SOCKETS: Final = "/tmp/.X11-unix"  # X(7): folder of local sockets; display number N listens at XN
+FIRST_PORT: Final = 6000  # TCP port of display 0; display N listens at 6000 + N
 TIMEOUT_S: Final = 2.0
 _NAME: Final = re.compile(r"(?:(?P<protocol>unix|tcp|inet6?)/)?(?P<host>.*):(?P<number>\d{1,4})(?:\.\d+)?")
 
 
 class DisplayError(ValueError):
-    """No window can be opened; one line for the operator."""
+    """No X server at the display; one line for the user."""
 
 
 def check_display(name: str | None, sockets: str = SOCKETS) -> None:
-    """Raises DisplayError unless something listens at the display `name`, as DISPLAY has it: [HOST]:N[.SCREEN]."""
+    """Check that an X server listens at display `name`, [HOST]:N[.SCREEN] as in DISPLAY. Raises DisplayError."""
     if not name:
-        raise DisplayError("--gui: expected a display, DISPLAY is not set; run without --gui or on a desktop")
+        raise DisplayError("--gui: expected a display, found DISPLAY unset; run without --gui or on a desktop")
     found = _NAME.fullmatch(name)
     if found is None:
         raise DisplayError(f"--gui: DISPLAY={name}: expected [HOST]:NUMBER such as :0; run without --gui")
@@ -37,13 +37,13 @@ def check_display(name: str | None, sockets: str = SOCKETS) -> None:
     except OSError as error:
         why = error.strerror or error
         raise DisplayError(
-            f"--gui: DISPLAY={name}: expected an X server, nobody answers ({why}); run without --gui or on a desktop"
+            f"--gui: DISPLAY={name}: expected an X server, found none ({why}); run without --gui or on a desktop"
         ) from error
 
 
 def _reach_local(path: str) -> None:
     try:
-        _reach("\0" + path)  # Linux's abstract name, which is there without a file
+        _reach("\0" + path)  # Linux's abstract socket name, which needs no file
     except OSError:
         _reach(path)
 

@@ -1,6 +1,6 @@
-"""The loop of `edge-hil`: wait on the wire until the next 4 ms batch is due, obey, step the physics, publish.
+"""Real-time loop of `edge-hil`: serve requests until the next batch (4 ms) is due, step the physics, publish.
 
-Physics runs to where real time is; what a machine that stood still has missed beyond MAX_LAG_NS is left out.
+The physics follows real time. After a pause of the machine, time missed beyond MAX_LAG_NS is skipped.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from sim_hil.protocols.front_end import FrontEnd, FrontEndOptions
 from sim_hil.simulation.physics import Simulation
 
 BATCH_NS: Final = 4_000_000
-MAX_LAG_NS: Final = 200_000_000  # behind by more than this, the simulated world falls behind instead of racing
-MAX_STEPS: Final = 4  # at once, then requests are answered again: also a robot that catches up is to be heard
+MAX_LAG_NS: Final = 200_000_000  # largest lag that is caught up; beyond it, the simulated world falls behind
+MAX_STEPS: Final = 4  # physics steps between two services of the front end, also while catching up
 POSE_HZ: Final = 10
 PEOPLE_HZ: Final = 5
 STEPS_PER_S: Final = round(1 / Simulation.DT_S)
@@ -24,12 +24,12 @@ _STEP_NS: Final = 1_000_000_000 // STEPS_PER_S
 
 
 class HilLoop:
-    """One simulated robot on one wire, until it is told to stop."""
+    """Real-time loop of one simulated robot and one front end."""
 
     def __init__(
         self, simulation: Simulation, front_end: FrontEnd, options: FrontEndOptions, *, pose_hz: int = POSE_HZ
     ) -> None:
-        """Takes over `simulation` and `front_end`: `close` closes them. `pose_hz`: poses a second in the trace."""
+        """Take ownership of `simulation` and `front_end`, which `close` closes; `pose_hz`: trace poses a second."""
         self._pose_hz = pose_hz
         self._simulation = simulation
         self._front_end = front_end
@@ -43,7 +43,7 @@ class HilLoop:
         self._last_xy: tuple[float, float] | None = None
 
     def start(self, trace: TraceWriter | None, stop: Sequence[int]) -> bool:
-        """Write the first line of `trace`, wait for the front end; False when `stop` gets an element first.
+        """Write the first line of `trace` and wait for the front end; return False if `stop` gets an element first.
 
         Raises RuntimeError or OSError.
         """
@@ -58,14 +58,17 @@ class HilLoop:
         return self._front_end.start(self._simulation.render_state(), stop)
 
     def run(self, stop: Sequence[int], duration_s: float | None) -> None:
-        """Simulate in real time until `stop` gets an element. Raises what the simulation or the front end raises."""
+        """Simulate in real time until `stop` gets an element or `duration_s` is over.
+
+        Raises the errors of the simulation and the front end.
+        """
         begin_ns = schedule_ns = next_ns = time.monotonic_ns()
         end_ns = None if duration_s is None else begin_ns + int(duration_s * 1e9)
         try:
             while not stop and (end_ns is None or time.monotonic_ns() < end_ns):
                 left_ns = next_ns - time.monotonic_ns()
                 if left_ns > 0:
-                    self._front_end.wait(left_ns)  # wakes up early for a request
+                    self._front_end.wait(left_ns)  # returns early on a request
                 self._serve()
                 now_ns = time.monotonic_ns()
                 if now_ns < next_ns:
@@ -73,7 +76,7 @@ class HilLoop:
                 lag_ns = now_ns - schedule_ns - self._steps * _STEP_NS
                 if lag_ns > MAX_LAG_NS:
                     schedule_ns += lag_ns - MAX_LAG_NS
-                    self._slipped_s += (lag_ns - MAX_LAG_NS) / 1e9  # the robot's clock does not stand still with it
+                    self._slipped_s += (lag_ns - MAX_LAG_NS) / 1e9  # the robot's clock still follows real time
                 missing = min(lag_ns, MAX_LAG_NS) // _STEP_NS
                 for _ in range(min(missing, MAX_STEPS)):
                     self._step()
@@ -83,21 +86,21 @@ class HilLoop:
             self._duration_s = (time.monotonic_ns() - begin_ns) / 1e9
 
     def close(self) -> None:
-        """End the front end and the simulation."""
+        """Close the front end and the simulation."""
         self._front_end.close()
         self._simulation.close()
 
     def _serve(self) -> None:
-        for heard in self._front_end.serve():
+        for command in self._front_end.serve():
             if self._trace is not None:
                 self._trace.put(
-                    heard.received_ns,
+                    command.received_ns,
                     "wire",
-                    service=heard.service,
-                    api_id=heard.api_id,
-                    name=heard.name,
-                    parameter=heard.parameter,
-                    request_id=heard.request_id,
+                    service=command.service,
+                    api_id=command.api_id,
+                    name=command.name,
+                    parameter=command.parameter,
+                    request_id=command.request_id,
                 )
 
     def _step(self) -> None:
@@ -113,7 +116,7 @@ class HilLoop:
             self._note("people", poses=[[float(v) for v in row] for row in self._simulation.people()])
 
     def _note_command(self) -> None:
-        """Trace when the robot itself begins and ends to obey a velocity: what it hears may have come late, or not."""
+        """Trace when the robot starts and stops obeying a velocity; commands on the wire may be late or lost."""
         commanded = self._simulation.commanded
         if any(commanded) != self._was_commanded:
             self._was_commanded = any(commanded)
@@ -128,8 +131,8 @@ class HilLoop:
             self._path_m += math.hypot(x - self._last_xy[0], y - self._last_xy[1])
         self._last_xy = (x, y)
         wz = float(truth.gyro_radps[2])
-        mode = getattr(truth, "mode", None)  # of a robot that has modes
-        touching = sorted(self._simulation.touching)  # of the last 0.1 s: nothing is missed between two lines
+        mode = getattr(truth, "mode", None)  # None for a robot without modes
+        touching = sorted(self._simulation.touching)  # contacts of the last 0.1 s, so no contact between lines is lost
         self._note("pose", x=x, y=y, z=z, theta=theta, vx=vx_world, vy=vy_world, wz=wz, mode=mode, touching=touching)
 
     def _note(self, kind: str, **fields: object) -> None:
@@ -137,7 +140,7 @@ class HilLoop:
             self._trace.put(time.monotonic_ns(), kind, **fields)
 
     def summary(self) -> dict[str, object]:
-        """The result, of a run that has ended or never begun."""
+        """Return the result of a run that has ended or never begun."""
         duration_s, options = self._duration_s, self._options
         wire = self._front_end.summary()
         states = wire["states"]

@@ -1,4 +1,4 @@
-"""The trace of a simulated run: one JSON object a line, written by a thread: the physics never waits for a disk."""
+"""Trace of a simulated run: one JSON object per line, written by a thread so that physics never waits for a disk."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Final
 from edge.core.cli import open_stream
 
 _CAPACITY: Final = 4096
-_CLOSE_S: Final = 10.0  # a reader of a FIFO that hangs must not keep the run from ending
+_CLOSE_S: Final = 10.0  # longest wait at the end, s: a hanging reader of a FIFO must not block it
 
 
 class TraceWriter:
-    """`put` never blocks; what does not fit is counted in `dropped`. Raises OSError when the file cannot be made.
+    """Writer of a trace whose `put` never blocks; lines that do not fit the queue are counted in `dropped`.
 
-    Every object has `t_ns`, time.monotonic_ns of what it describes. Lines are in the order of arrival here, which for
-    the camera's requests is a few milliseconds after their `t_ns`.
+    Every object has `t_ns`, the time.monotonic_ns of the described event. Lines are in order of arrival, which for
+    camera requests is a few milliseconds after `t_ns`. Raises OSError if the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,16 +38,16 @@ class TraceWriter:
             self.dropped += 1
 
     def close(self, t_ns: int, **summary: object) -> None:
-        """Write what is queued and the `end` line, then close the file."""
+        """Write the queued lines and the `end` line, then close the file."""
         try:
             self._queue.put({"t_ns": t_ns, "kind": "end", **summary, "trace_dropped": self.dropped}, timeout=_CLOSE_S)
             self._queue.put(None, timeout=_CLOSE_S)
         except queue.Full:
-            self.error = OSError(errno.ETIMEDOUT, f"took nothing for {_CLOSE_S:g} s")
+            self.error = OSError(errno.ETIMEDOUT, f"no write for {_CLOSE_S:g} s")
             return
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
-            self.error = OSError(errno.ETIMEDOUT, f"took nothing for {_CLOSE_S:g} s")
+            self.error = OSError(errno.ETIMEDOUT, f"no write for {_CLOSE_S:g} s")
             return
         try:
             self._file.close()
@@ -60,5 +60,5 @@ class TraceWriter:
                 self._file.write(json.dumps(line) + "\n")
                 if self._queue.empty():
                     self._file.flush()
-            except OSError as error:  # disk full: keep draining, the run goes on and reports it
+            except OSError as error:  # such as a full disk: keep draining; the run continues and reports it
                 self.error = error

@@ -1,4 +1,4 @@
-"""Layouts of DynaNav's four environments, generated: every seed another building or block, all of them sound."""
+"""Generator of layouts for DynaNav's four environments: every seed gives another valid scene."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ _MAKERS: dict[str, tuple[int, Callable[[np.random.Generator], Scene]]] = {
     "sidewalk": (4, sidewalk),
 }
 KINDS = tuple(_MAKERS)
-RESERVED_BELOW = 100  # these seeds are the benchmark's: no training scene may come from them
+RESERVED_BELOW = 100  # seeds reserved for the benchmark, not allowed for training
 BENCHMARK_SEEDS = {"hospital": 7, "office": 11, "warehouse": 5, "sidewalk": 3}
 _ATTEMPTS = 60
 
 
 def is_reserved(seed: int) -> bool:
-    """Whether a seed belongs to the benchmark, so that nothing may be trained on its layouts."""
+    """Return whether a seed is reserved for the benchmark, so that training must not use it."""
     return 0 <= seed < RESERVED_BELOW
 
 
 def generate(kind: str, seed: int, *, reserved: bool = False) -> Scene:
-    """A sound layout; the same kind and seed give the same scene. Raises LayoutError.
+    """Generate a valid layout; the same kind and seed give the same scene. Raises LayoutError.
 
-    Seeds that is_reserved are refused unless `reserved` says that the scene is not for training.
+    Reserved seeds are refused unless `reserved` is true, which is not allowed for training.
     """
     if kind not in _MAKERS:
         raise LayoutError(f"unknown kind of layout {kind!r}, expected one of {', '.join(KINDS)}")

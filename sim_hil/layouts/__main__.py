@@ -1,4 +1,4 @@
-"""`python -m sim_hil.layouts`: write a generated layout as a scene file, with a picture of it from above if wanted."""
+"""`python -m sim_hil.layouts`: write a generated layout as a scene file, optionally with a map."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _summary(scene: Scene) -> dict[str, object]:
 
 @command_line("layouts")
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command and return its exit code."""
     args = _parser().parse_args(argv)
     if args.out.suffix != ".toml":
         sys.stderr.write(f"--out: expected a file that ends in .toml, found {args.out}" + "\n")

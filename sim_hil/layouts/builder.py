@@ -1,4 +1,4 @@
-"""Collects a layout's rooms, openings, things and places, refusing whatever would stand in something else's way."""
+"""Builder of a layout: collects rooms, openings, objects and places, and rejects objects that would collide."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from sim_hil.layouts.plan import WALL_THICKNESS_M, Border, LayoutError, Rect, Vec2, shared_border, wall_lines
 from sim_hil.scene.scene import KINDS, SKY, Area, Floor, Place, Scene, SceneObject, Terrain, Vec3, Wall
 
-# Colours that have a name: what an instruction calls red must be red.
+# Named colours; an instruction may only use them for objects of exactly this colour.
 COLOURS: dict[str, Vec3] = {
     "red": (0.80, 0.08, 0.10),
     "blue": (0.10, 0.28, 0.72),
@@ -25,22 +25,22 @@ COLOURS: dict[str, Vec3] = {
     "pink": (0.92, 0.45, 0.62),
     "grey": (0.55, 0.56, 0.58),
 }
-# Height of the underside of what hangs on a wall, m.
+# Height of the underside of objects on walls, m.
 _HUNG_M = {
     "window": 1.0, "notice_board": 0.9, "painting": 1.1, "screen": 1.1, "clock": 1.9, "room_sign": 1.45,
     "exit_sign": 2.2, "sign": 2.2, "whiteboard": 0.8, "fire_extinguisher": 0.3, "handrail": 0.0,
 }  # fmt: skip
-_FACING = {"n": -pi / 2, "s": pi / 2, "w": 0.0, "e": pi}  # where a thing looks whose back is on that side
-_WALL_GAP_M = 0.012  # behind a thing, so that its back and the wall do not share a plane
+_FACING = {"n": -pi / 2, "s": pi / 2, "w": 0.0, "e": pi}  # heading of an object whose back is on that side
+_WALL_GAP_M = 0.012  # gap behind an object, so that its back and the wall do not coincide
 _OVERHEAD = frozenset(("light", "sign", "exit_sign", "awning"))
-_STEMS: dict[str, Vec3] = {"tree": (0.7, 0.7, 5.0), "lamp_post": (0.3, 0.3, 4.4)}  # what one meets of them
+_STEMS: dict[str, Vec3] = {"tree": (0.7, 0.7, 5.0), "lamp_post": (0.3, 0.3, 4.4)}  # size of their parts on the ground
 _LYING = frozenset(("carpet",))
 PERSON_CLEARANCE_M = 0.32
 
 
 @dataclass(frozen=True)
 class Room:
-    """One rectangle of the plan: an area in the making."""
+    """One rectangle of the plan, which becomes an area."""
 
     label: str
     kind: str
@@ -50,7 +50,7 @@ class Room:
 
 
 class Builder:
-    """One layout in the making. `rng` is the only source of chance; `flip` mirrors and turns the whole at the end."""
+    """Builder of one layout; `rng` is the only random source, `flip` mirrors and rotates the result."""
 
     def __init__(self, kind: str, rng: np.random.Generator, wall_texture: str, ceiling_m: float) -> None:
         self.kind, self.rng = kind, rng
@@ -61,21 +61,21 @@ class Builder:
         self.floors: list[Floor] = []
         self.terrain: list[Terrain] = []
         self.places: list[Place] = []
-        self._taken: list[Rect] = []  # outlines of what stands or hangs
-        self._clear: list[Rect] = []  # where nothing solid may stand
+        self._taken: list[Rect] = []  # outlines of placed objects
+        self._clear: list[Rect] = []  # areas without solid objects
         self._counts: dict[str, int] = {}
 
     def number(self, what: str) -> int:
-        """1, 2, 3 … for each kind of thing: labels are unique."""
+        """Return the next number for a kind of object, so that labels are unique."""
         self._counts[what] = self._counts.get(what, 0) + 1
         return self._counts[what]
 
     def pick(self, choices: Sequence[str]) -> str:
-        """One of them by chance."""
+        """Return a random item."""
         return choices[int(self.rng.integers(len(choices)))]
 
     def room(self, rect: Rect, kind: str, name: str, floor: str = "") -> Room:
-        """Add a rectangle of the plan; raises LayoutError where it overlaps another."""
+        """Add a rectangle of the plan. Raises LayoutError if it overlaps another."""
         for other in self.rooms:
             if rect.overlaps(other.rect):
                 raise LayoutError(f"{name} overlaps {other.label}")
@@ -84,7 +84,7 @@ class Builder:
         return room
 
     def open(self, a: Room, b: Room, width_m: float = 0.0, at: float | None = None, margin_m: float = 0.55) -> Border:
-        """Open the wall between two rooms: all of it (width 0), or a doorway of that width, by chance or at `at`."""
+        """Open the wall between two rooms: completely (width 0), or by a doorway at `at` or at a random position."""
         border = shared_border(a.rect, b.rect)
         if width_m > 0:
             low, high = border.low + margin_m + width_m / 2, border.high - margin_m - width_m / 2
@@ -100,11 +100,11 @@ class Builder:
         return border
 
     def keep_clear(self, rect: Rect) -> None:
-        """Nothing solid shall stand here."""
+        """Keep an area free of solid objects."""
         self._clear.append(rect)
 
     def fits(self, outline: Rect, solid: bool, gap_m: float = 0.1) -> bool:
-        """Whether a thing of this outline would be in nobody's way."""
+        """Return whether an object with this outline collides with nothing."""
         if solid and any(outline.overlaps(zone) for zone in self._clear):
             return False
         grown = outline.grown(gap_m)
@@ -114,11 +114,11 @@ class Builder:
         self, kind: str, x: float, y: float, heading_rad: float, *, z: float = 0.0, size: Vec3 | None = None,
         colour: str = "", landmark: str = "", text: str = "", label: str = "", gap_m: float = 0.1, force: bool = False,
     ) -> SceneObject | None:  # fmt: skip
-        """Add a thing; None where it would be in the way of another. `force` leaves that to the caller."""
+        """Add an object; return None if it would collide. `force` skips that check."""
         size = size or KINDS[kind].size_m
         outline = outline_of(x, y, heading_rad, _STEMS.get(kind, size))
         overhead = kind in _OVERHEAD or kind in _LYING
-        # A door or elevator hangs in a wall, but nothing may stand before it.
+        # A door or elevator is part of a wall, but the space in front of it must stay free.
         if not (force or overhead or self.fits(outline, KINDS[kind].solid, gap_m)):
             return None
         name = label or f"{kind.replace('_', ' ')} {self.number(kind)}"
@@ -134,9 +134,9 @@ class Builder:
         colour: str = "", landmark: str = "", text: str = "", label: str = "", tries: int = 24, lone: bool = False,
         margin_m: float = 0.25,
     ) -> SceneObject | None:  # fmt: skip
-        """Put a thing with its back to one of the room's walls; None where there was no room.
+        """Place an object with its back to one of the room's walls; return None if there is no free space.
 
-        `along` is where, as a share of the wall's length; `lone` also keeps the opposite side of a corridor clear.
+        `along`: position as a share of the wall's length; `lone`: also keep the opposite side of a corridor free.
         """
         depth, width, _ = size or KINDS[kind].size_m
         rect = room.rect
@@ -153,7 +153,7 @@ class Builder:
             u = low + edge + share * (high - low - 2 * edge)
             x, y = {"n": (u, rect.y1 - back), "s": (u, rect.y0 + back), "w": (rect.x0 + back, u),
                     "e": (rect.x1 - back, u)}[where]  # fmt: skip
-            # Flat things too: one over a doorway would hang in the air.
+            # Flat objects too: over a doorway they would float.
             outline = outline_of(x, y, _FACING[where], size or KINDS[kind].size_m)
             if any(outline.overlaps(zone) for zone in self._clear):
                 continue
@@ -172,17 +172,17 @@ class Builder:
         return None
 
     def place(self, kind: str, x: float, y: float, heading_rad: float, capacity: int = 1) -> None:
-        """Add a spot where people go; what is not free in the end is left out."""
+        """Add a place for people; places that are not free in the finished layout are dropped."""
         self.places.append(Place(f"{kind} {self.number('place ' + kind)}", (x, y), heading_rad, kind, capacity))
 
     def place_before(self, thing: SceneObject, kind: str, capacity: int = 1, gap_m: float = 0.55) -> None:
-        """A spot before a thing's front, facing it."""
+        """Add a place in front of an object, facing it."""
         reach = thing.size_m[0] / 2 + gap_m
         h = thing.heading_rad
         self.place(kind, thing.position_m[0] + reach * cos(h), thing.position_m[1] + reach * sin(h), h + pi, capacity)
 
     def stand_in(self, rect: Rect, count: int) -> None:
-        """Spots to stand in a free part of a rectangle."""
+        """Add places to stand in a free part of a rectangle."""
         for _ in range(count * 4):
             if count <= 0:
                 return
@@ -193,7 +193,7 @@ class Builder:
                 count -= 1
 
     def walls(self) -> list[Wall]:
-        """The walls of the rooms."""
+        """Return the walls of the rooms."""
         lines = wall_lines([room.rect for room in self.rooms], [border for border, _, _ in self.openings])
         return [
             Wall(f"wall {i + 1}", a, b, WALL_THICKNESS_M, self.ceiling_m, self.wall_texture)
@@ -202,7 +202,7 @@ class Builder:
 
     def scene(self, name: str, start: Vec3, goal: Vec2, *, floor: str, ceiling: str = "ceiling_panels",
               walls: list[Wall] | None = None, bounds: Rect | None = None, sky: Vec3 = SKY) -> Scene:  # fmt: skip
-        """Everything as a scene, mirrored and turned by chance so that left and right come equally often."""
+        """Return the scene, randomly mirrored and rotated so that left and right turns are equally frequent."""
         walls = self.walls() if walls is None else walls
         bounds = bounds or Rect(
             min(room.rect.x0 for room in self.rooms), min(room.rect.y0 for room in self.rooms),
@@ -221,7 +221,7 @@ class Builder:
 
 
 def outline_of(x: float, y: float, heading_rad: float, size: Vec3) -> Rect:
-    """The upright rectangle round a thing, m."""
+    """Return the axis-aligned rectangle around an object, m."""
     c, s = abs(cos(heading_rad)), abs(sin(heading_rad))
     half_x, half_y = (size[0] * c + size[1] * s) / 2, (size[0] * s + size[1] * c) / 2
     return Rect(x - half_x, y - half_y, x + half_x, y + half_y)
@@ -233,25 +233,25 @@ def _gap(rect: Rect, x: float, y: float) -> float:
 
 @dataclass(frozen=True)
 class Turn:
-    """A symmetry of the square: swap x and y, then mirror either. Keeps rectangles upright."""
+    """Symmetry of the square: swap x and y, then mirror either axis; keeps rectangles axis-aligned."""
 
     swap: bool
     flip_x: bool
     flip_y: bool
 
     def point(self, p: Vec2) -> Vec2:
-        """Where a point comes to lie (about the origin)."""
+        """Transform a point about the origin."""
         x, y = (p[1], p[0]) if self.swap else (p[0], p[1])
         return (-x if self.flip_x else x, -y if self.flip_y else y)
 
     def heading(self, heading_rad: float) -> float:
-        """Where a direction then points."""
+        """Transform a heading."""
         x, y = self.point((cos(heading_rad), sin(heading_rad)))
         return radians(round(degrees(atan2(y, x)), 3))
 
 
 def turned(scene: Scene, turn: Turn) -> Scene:
-    """The scene under a symmetry, moved back so that its floor begins at (0, 0); every number to 1 mm."""
+    """Return the scene under a symmetry, shifted so that its floor begins at (0, 0); numbers rounded to 1 mm."""
     corners = [turn.point(scene.floor_min_m), turn.point(scene.floor_max_m)]
     x0, y0 = min(c[0] for c in corners), min(c[1] for c in corners)
     x1, y1 = max(c[0] for c in corners), max(c[1] for c in corners)

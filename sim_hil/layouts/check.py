@@ -1,4 +1,4 @@
-"""Whether a layout is sound: nothing stands in anything, every doorway and area can be reached, places are free."""
+"""Validity checks of a layout: objects do not overlap, all areas can be reached, and places are free."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from sim_hil.scene.scene import Box, Scene
 
 ROBOT_RADIUS_M = 0.4
 PERSON_RADIUS_M = 0.25
-_LARGE_M2 = 3000.0  # outdoors nothing is so narrow that it takes a fine grid
-_TOUCH_M = 0.004  # things may stand flush
+_LARGE_M2 = 3000.0  # area above which a coarse grid suffices (outdoor scenes have no narrow passages)
+_TOUCH_M = 0.004  # overlap that is allowed, because objects may touch
 
 
 def problems(scene: Scene, grid: NavGrid | None = None) -> list[str]:
-    """What is wrong with a scene, one line each; empty when it is sound. `grid`: one of ROBOT_RADIUS_M, if at hand."""
+    """Return the problems of a scene, one line each; `grid`: its navigation grid for ROBOT_RADIUS_M, if available."""
     found = overlaps(scene)
     if grid is None:
         (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
@@ -33,7 +33,7 @@ def problems(scene: Scene, grid: NavGrid | None = None) -> list[str]:
 
 
 def overlaps(scene: Scene) -> list[str]:
-    """Pairs of solid things, or of a thing and a wall, that share room."""
+    """Return the pairs of solid objects, or of an object and a wall, that overlap."""
     boxes = [(thing.label, box) for thing in scene.objects for box in thing.boxes]
     walls = [(wall.label, wall.box) for wall in scene.walls]
     found = []
@@ -47,7 +47,7 @@ def overlaps(scene: Scene) -> list[str]:
 
 
 def boxes_overlap(a: Box, b: Box) -> bool:
-    """Whether two upright boxes share room (separating axes; things that touch do not)."""
+    """Return whether two upright boxes overlap (separating axes; touching boxes do not)."""
     if abs(a.centre_m[2] - b.centre_m[2]) >= (a.size_m[2] + b.size_m[2]) / 2 - _TOUCH_M:
         return False
     dx, dy = b.centre_m[0] - a.centre_m[0], b.centre_m[1] - a.centre_m[1]
@@ -64,7 +64,7 @@ def boxes_overlap(a: Box, b: Box) -> bool:
 
 
 def unreached_areas(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> list[str]:
-    """Areas of which no free cell can be reached."""
+    """Return the areas without a reachable free cell."""
     reached = np.isfinite(field)
     rows, columns = np.nonzero(reached)
     xs = grid.origin_m[0] + (columns + 0.5) * grid.resolution_m
@@ -72,7 +72,7 @@ def unreached_areas(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> 
     found = []
     for area in scene.areas:
         px, py = zip(*area.polygon, strict=True)
-        # Areas are upright rectangles or nearly so: the inner part of the bounding box will do.
+        # Areas are nearly axis-aligned rectangles, so the inner part of the bounding box suffices.
         inside = (xs > min(px) + 0.3) & (xs < max(px) - 0.3) & (ys > min(py) + 0.3) & (ys < max(py) - 0.3)
         if area.kind not in ("garden", "street") and not inside.any():
             found.append(f"{area.label} cannot be reached by a robot of radius {ROBOT_RADIUS_M} m")
@@ -80,7 +80,7 @@ def unreached_areas(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> 
 
 
 def bad_places(scene: Scene, grid: NavGrid, field: NDArray[np.float64]) -> list[str]:
-    """Places to stand, queue or enter that are not free for a person or cannot be reached."""
+    """Return the places that are not free for a person or cannot be reached."""
     found = []
     for place in scene.places:
         if place.kind == "sit":

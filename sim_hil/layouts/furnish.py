@@ -1,4 +1,4 @@
-"""What every building has: lights, lintels over doorways, windows, ends of corridors, things along corridors."""
+"""Furnishing common to all buildings: lights, lintels, windows, ends of corridors, objects along corridors."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sim_hil.layouts.skeleton import Building
 from sim_hil.scene.scene import KINDS, SceneObject
 
 _LINTEL_M = 2.15  # underside
-_SHORT = {"desk": "desk"}  # what people call it, where its kind says more
+_SHORT = {"desk": "desk"}  # shorter name for instructions
 
 
 def named(kind: str, colour: str = "") -> str:
-    """A thing's name in words, with its colour where it has one to be told by."""
+    """Return an object's name for instructions, with its colour if that distinguishes it."""
     return f"{colour} {_SHORT.get(kind, KINDS[kind].words)}".strip()
 
 
 def lights(builder: Builder, spacing_m: float = 5.0) -> None:
-    """Lamps under the ceiling: in a row along corridors and aisles, one in the middle of a room."""
+    """Add ceiling lamps: in a row along corridors and aisles, one in the middle of a room."""
     for room in builder.rooms:
         rect = room.rect
         along_x = rect.width >= rect.depth
@@ -33,7 +33,7 @@ def lights(builder: Builder, spacing_m: float = 5.0) -> None:
 
 
 def lintel(builder: Builder, border: Border, outside: Rect, colour: str, text: str) -> None:
-    """A coloured plate over a doorway, from the lintel to the ceiling, its lettering towards `outside`."""
+    """Add a coloured plate over a doorway, from the lintel to the ceiling, with its text towards `outside`."""
     x, y = border.middle
     across = pi / 2 if outside.centre[1] > y else -pi / 2
     heading = across if border.along_x else (0.0 if outside.centre[0] > x else pi)
@@ -42,21 +42,21 @@ def lintel(builder: Builder, border: Border, outside: Rect, colour: str, text: s
 
 
 def door(builder: Builder, room: Room, corridor: Room, width_m: float, colour: str, text: str) -> Border:
-    """A doorway between a room and its corridor, with a lintel, and a spot where people wait before it."""
+    """Add a doorway between a room and its corridor, with a lintel and a place where people wait."""
     border = builder.open(room, corridor, width_m)
     lintel(builder, border, corridor.rect, colour, text)
     return border
 
 
 def wide_opening(builder: Builder, room: Room, corridor: Room, width_m: float, colour: str, text: str) -> Border:
-    """A room that lies open to its corridor, with its name above."""
+    """Open a room completely to its corridor, with its name above."""
     border = builder.open(room, corridor, min(width_m, room.rect.width - 0.8), margin_m=0.3)
     lintel(builder, border, corridor.rect, colour, text)
     return border
 
 
 def corridor_ends(building: Building, exit_kind: str = "double_door") -> list[SceneObject]:
-    """An exit door or a window where a corridor ends at the outer wall; people come and go by the doors."""
+    """Add an exit door or a window at the end of a corridor; people enter and leave by the doors."""
     builder, made = building.builder, []
     ends: list[tuple[Room, str]] = []
     for room in building.long:
@@ -87,7 +87,7 @@ def _extent(room: Room, side: str) -> float:
 
 
 def outer_windows(builder: Builder, bounds: Rect, rooms: list[Room]) -> None:
-    """Windows in the outer walls of rooms."""
+    """Add windows in the outer walls of rooms."""
     for room in rooms:
         rect = room.rect
         for side, outer in (
@@ -99,5 +99,5 @@ def outer_windows(builder: Builder, bounds: Rect, rooms: list[Room]) -> None:
 
 
 def sit_on(builder: Builder, thing: SceneObject, seats: int) -> None:
-    """A spot to sit on a bench, chair or sofa."""
+    """Add a place to sit on a bench, chair or sofa."""
     builder.place("sit", thing.position_m[0], thing.position_m[1], thing.heading_rad, seats)

@@ -1,4 +1,4 @@
-"""A hospital: long narrow corridors, patient rooms with beds, reception, waiting and service areas, carts in the way.
+"""Hospital: long narrow corridors with carts, patient rooms with beds, reception, waiting and service areas.
 
 Paper appendix C: "long corridors, patient rooms, medical equipment, and service areas … narrow passages".
 """
@@ -28,7 +28,7 @@ _MACHINES = ("red", "blue", "green", "yellow")
 
 
 def hospital(rng: np.random.Generator) -> Scene:
-    """One hospital; raises LayoutError or SceneError when what was drawn does not go together."""
+    """Generate a hospital. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("hospital", rng, "wall_hospital", 2.8)
     building = raise_bones(builder, _BONES)
     bounds = Rect(0, 0, building.long[0].rect.x1, max(slot.y1 for slot, _ in building.slots))
@@ -39,7 +39,7 @@ def hospital(rng: np.random.Generator) -> Scene:
         raise LayoutError("too few rooms")
     colours = [_MACHINES[int(i)] for i in rng.permutation(len(_MACHINES))]
 
-    # Ends of corridors first: a door belongs in the middle of its wall.
+    # Ends of corridors come first, so that their doors are in the middle of the wall.
     corridor_ends(building)
     _reception(builder, *wide[0])
     _waiting(builder, *wide[1])
@@ -161,7 +161,7 @@ def _furnish(builder: Builder, room: Room, name: str) -> None:
 
 
 def _along_corridors(building: Building, colours: list[str]) -> None:
-    """Things along the corridors, each alone on its stretch: a robot and a person still pass each other beside it."""
+    """Add single objects along the corridors, so that a robot and a person can still pass each other."""
     builder = building.builder
     machine = builder.against(
         building.long[int(builder.rng.integers(2))], "vending_machine", side=builder.pick(("n", "s")), tries=60,

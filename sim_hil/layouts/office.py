@@ -1,4 +1,4 @@
-"""An office: connected rooms, branching corridors, elevators, an open floor of desks, lounges with coloured carpets.
+"""Office: connected rooms, branching corridors, elevators, an open area with desks, lounges with coloured carpets.
 
 Paper appendix C: "interconnected rooms, corridors, elevators, and desk areas … greater topological diversity".
 """
@@ -35,7 +35,7 @@ _CARPETS = ("red", "green", "yellow", "purple", "blue")
 
 
 def office(rng: np.random.Generator) -> Scene:
-    """One office floor; raises LayoutError or SceneError when what was drawn does not go together."""
+    """Generate an office floor. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("office", rng, "wall_office", 2.7)
     building = raise_bones(builder, _BONES)
     bounds = Rect(0, 0, building.long[0].rect.x1, max(slot.y1 for slot, _ in building.slots))
@@ -49,7 +49,7 @@ def office(rng: np.random.Generator) -> Scene:
     _elevators(builder, *order.pop())
     carpets = [_CARPETS[int(i)] for i in rng.permutation(len(_CARPETS))]
     for number, (slot, corridor) in enumerate(sorted(order, key=lambda s: (s[0].y0, s[0].x0))):
-        # One of each first, so that every office has a kitchen and a lounge; then by chance.
+        # First one of each kind, so that every office has a kitchen and a lounge; then random ones.
         name = _NAMES[number] if number < len(_NAMES) else builder.pick(_NAMES)
         room = builder.room(slot, "room", name, _FLOORS[name])
         rooms.append(room)
@@ -73,7 +73,7 @@ def office(rng: np.random.Generator) -> Scene:
 def _merged(
     builder: Builder, slots: list[tuple[Rect, Room]]
 ) -> tuple[list[tuple[Rect, Room]], tuple[Rect, Room]]:  # fmt: skip
-    """Two or three neighbouring slots become one large one; raises LayoutError where there are none."""
+    """Merge two or three neighbouring slots into a large one. Raises LayoutError if there are none."""
     runs = []
     for index, (first, corridor) in enumerate(slots):
         run = [(first, corridor)]
@@ -90,7 +90,7 @@ def _merged(
 
 
 def _open_floor(builder: Builder, rect: Rect, corridor: Room) -> Room:
-    """Rows of desks with partitions, open to the corridor."""
+    """Add rows of desks with partitions, open to the corridor."""
     room = builder.room(rect, "lobby", "open office", "carpet_blue")
     border = builder.open(room, corridor, 3.2, margin_m=0.4)
     lintel(builder, border, corridor.rect, "blue", "OPEN OFFICE")
@@ -114,7 +114,7 @@ def _elevators(builder: Builder, rect: Rect, corridor: Room) -> None:
     room = builder.room(rect, "lobby", "elevator lobby", "marble")
     wide_opening(builder, room, corridor, 3.0, "red", "ELEVATOR")
     back = "n" if corridor.rect.y0 < rect.y0 else "s"
-    # One door: "the elevator" must mean one place.
+    # Only one door, so that "the elevator" is unambiguous.
     lift = builder.against(room, "elevator", side=back, along=0.5, landmark=named("elevator"))
     if lift is None:
         raise LayoutError("no room for the elevator")
@@ -127,7 +127,7 @@ def _elevators(builder: Builder, rect: Rect, corridor: Room) -> None:
 
 
 def _connect(builder: Builder, rooms: list[Room]) -> None:
-    """Doors between some neighbouring rooms."""
+    """Add doors between some neighbouring rooms."""
     for index, a in enumerate(rooms):
         for b in rooms[index + 1 :]:
             try:

@@ -1,4 +1,4 @@
-"""Floor plans: rectangles that tile a building, the openings between them, and the walls that follow."""
+"""Floor plans: rectangles that tile a building, openings between them, and the resulting walls."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _EPS = 1e-6
 
 
 class LayoutError(ValueError):
-    """A layout that cannot be made; one line."""
+    """A layout that cannot be generated; one line."""
 
 
 @dataclass(frozen=True)
 class Rect:
-    """An upright rectangle on the floor, m."""
+    """Axis-aligned rectangle on the floor, m."""
 
     x0: float
     y0: float
@@ -41,31 +41,31 @@ class Rect:
 
     @property
     def centre(self) -> Vec2:
-        """The middle, m."""
+        """Centre, m."""
         return ((self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2)
 
     def grown(self, margin_m: float) -> Rect:
-        """The rectangle with every side moved out (in, when negative)."""
+        """Return the rectangle with every side moved outwards (negative: inwards)."""
         return Rect(self.x0 - margin_m, self.y0 - margin_m, self.x1 + margin_m, self.y1 + margin_m)
 
     def overlaps(self, other: Rect) -> bool:
-        """Whether the two share more than a border."""
+        """Return whether two rectangles overlap by more than a border."""
         apart_x = self.x1 <= other.x0 + _EPS or other.x1 <= self.x0 + _EPS
         apart_y = self.y1 <= other.y0 + _EPS or other.y1 <= self.y0 + _EPS
         return not (apart_x or apart_y)
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a point lies within."""
+        """Return whether a point lies inside."""
         return self.x0 <= x <= self.x1 and self.y0 <= y <= self.y1
 
     def corners(self) -> tuple[Vec2, ...]:
-        """Counter-clockwise."""
+        """Return the corners, counter-clockwise."""
         return ((self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1))
 
 
 @dataclass(frozen=True)
 class Border:
-    """A stretch that two rectangles share: along x at y = `at` (or along y at x = `at`), from `low` to `high`."""
+    """Border segment shared by two rectangles: along x at y = `at`, or along y at x = `at`, from `low` to `high`."""
 
     along_x: bool
     at: float
@@ -74,22 +74,22 @@ class Border:
 
     @property
     def middle(self) -> Vec2:
-        """Its middle, m."""
+        """Middle of the segment, m."""
         along = (self.low + self.high) / 2
         return (along, self.at) if self.along_x else (self.at, along)
 
     @property
     def length(self) -> float:
-        """Its length, m."""
+        """Length of the segment, m."""
         return self.high - self.low
 
     def cut(self, low: float, high: float) -> Border:
-        """A part of it."""
+        """Return a part of the segment."""
         return Border(self.along_x, self.at, low, high)
 
 
 def shared_border(a: Rect, b: Rect) -> Border:
-    """Where two rectangles touch; raises LayoutError when they do not."""
+    """Return the shared border of two rectangles. Raises LayoutError if they do not touch."""
     for along_x, at_a, at_b, low, high in (
         (True, a.y1, b.y0, max(a.x0, b.x0), min(a.x1, b.x1)),
         (True, a.y0, b.y1, max(a.x0, b.x0), min(a.x1, b.x1)),
@@ -128,7 +128,7 @@ def _without(spans: list[list[float]], gaps: list[Vec2]) -> list[Vec2]:
 
 
 def wall_lines(rects: list[Rect], openings: list[Border]) -> list[tuple[Vec2, Vec2]]:
-    """Centre lines of the walls round all rectangles, less the openings; corners are filled, nothing overlaps twice."""
+    """Return the walls' centre lines around all rectangles without the openings; corners are filled once."""
     lines: dict[tuple[bool, float], list[Vec2]] = defaultdict(list)
     for rect in rects:
         for along_x, at, low, high in (
@@ -149,7 +149,7 @@ def wall_lines(rects: list[Rect], openings: list[Border]) -> list[tuple[Vec2, Ve
             if not along_x:
                 out.append(((at, low), (at, high)))
                 continue
-            # Only where two walls end in one point is a corner left open; a wall that runs through has none.
+            # A corner needs filling only where two walls end in one point.
             first = low - _FILL_M * _ends_there(upright, low, at)
             last = high + _FILL_M * _ends_there(upright, high, at)
             out.append(((first, at), (last, at)))

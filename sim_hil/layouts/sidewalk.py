@@ -1,4 +1,4 @@
-"""Two streets of a city: sidewalks with kerbs, zebra crossings, shops, a plaza with a fountain, a park, uneven ground.
+"""City junction: sidewalks with kerbs, zebra crossings, shops, a plaza with a fountain, a park, uneven ground.
 
 Paper appendix C: "uneven terrain, ramps, streets, and large open spaces … umbrellas, fountains, and storefronts".
 """
@@ -18,12 +18,12 @@ from sim_hil.scene.scene import Floor, Scene, SceneObject, Terrain
 _SHOPS = ("BAKERY", "CAFE", "BOOKS", "FLOWERS", "PIZZA", "TOYS", "BANK", "SHOES", "MUSIC", "BIKES")
 _SHOP_COLOURS = ("red", "blue", "green", "yellow", "orange", "purple", "white", "pink")
 _BRICKS = ((0.70, 0.42, 0.32), (0.78, 0.70, 0.58), (0.56, 0.58, 0.62), (0.62, 0.50, 0.40), (0.72, 0.62, 0.52))
-_KERB_M = (0.25, 0.14)  # width, height: higher than what a robot may drive over
+_KERB_M = (0.25, 0.14)  # width, height; too high for a robot
 _BUMP_M = 0.04
 
 
 def sidewalk(rng: np.random.Generator) -> Scene:
-    """One street corner and its four blocks; raises LayoutError or SceneError when the draw does not go together."""
+    """Generate a junction and its four blocks. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("sidewalk", rng, "wall_brick", 0.0)
     length, depth = 120.0, 60.0
     road = [round(float(v), 2) for v in rng.uniform(7.0, 8.0, 2)]
@@ -75,7 +75,7 @@ def sidewalk(rng: np.random.Generator) -> Scene:
 def _streets(
     builder: Builder, length: float, depth: float, road: tuple[float, float, float, float], walk: float, zebra: float
 ) -> list[Room]:  # fmt: skip
-    """The two streets, cut up by zebra crossings at the junction's four arms and one in mid-block."""
+    """Add the two streets, with zebra crossings at the junction's four arms and one in mid-block."""
     x0, y0, x1, y1 = road
     inset = (walk - zebra) / 2
     west = (x0 - walk + inset, x0 - inset)
@@ -118,7 +118,7 @@ def _crossing(builder: Builder, rect: Rect, heading_rad: float) -> Room:
 def _sidewalks(
     builder: Builder, length: float, depth: float, road: tuple[float, float, float, float], walk: float
 ) -> list[Room]:  # fmt: skip
-    """Eight strips: along the main street (with the corners) first, then along the other."""
+    """Add eight sidewalks: first along the main street (with the corners), then along the other."""
     x0, y0, x1, y1 = road
     rects = [
         Rect(0, y0 - walk, x0, y0), Rect(x1, y0 - walk, length, y0),
@@ -133,7 +133,7 @@ def _kerbs(
     builder: Builder, strips: list[Room], crossings: list[Room], road: tuple[float, float, float, float],
     length: float, depth: float,
 ) -> None:  # fmt: skip
-    """Kerb stones along every edge between sidewalk and street, but for the crossings, where they are lowered."""
+    """Add kerb stones along every edge between sidewalk and street; they are lowered at crossings."""
     x0, y0, x1, y1 = road
     width, rise = _KERB_M
     lines: list[tuple[bool, float, float, float]] = []
@@ -167,7 +167,7 @@ def _kerbs(
 def _buildings(
     builder: Builder, lot: Rect, north: bool, colours: list[str], words: list[str], x_street: float
 ) -> None:  # fmt: skip
-    """A row of houses that fills a lot, each with a shop towards the main street."""
+    """Fill a lot with a row of houses, each with a shop towards the main street."""
     count = max(1, round(lot.width / float(builder.rng.uniform(9.0, 13.0))))
     edges = [lot.x0 + lot.width * i / count for i in range(count + 1)]
     front, heading = (lot.y0, -pi / 2) if north else (lot.y1, pi / 2)
@@ -196,7 +196,7 @@ def _buildings(
 
 
 def _furniture(builder: Builder, strips: list[Room], road: tuple[float, float, float, float]) -> None:
-    """Lamps, trees, bins, benches, a bus stop and parked cars along the kerbs; the middle of every walk stays free."""
+    """Add lamps, trees, bins, benches, a bus stop and parked cars; the middle of every sidewalk stays free."""
     x0, y0, x1, y1 = road
     for number, strip in enumerate(strips):
         rect, along_x = strip.rect, number < 4
@@ -246,7 +246,7 @@ def _length(strips: list[Room]) -> float:
 
 
 def _bumps(builder: Builder, strips: list[Room]) -> None:
-    """Paving that tree roots have lifted: low swells across a walk."""
+    """Add low bumps across a sidewalk, like paving lifted by tree roots."""
     for strip in strips[:4]:
         rect = strip.rect
         for _ in range(2):

@@ -1,4 +1,4 @@
-"""The bones of a building: two long corridors, cross corridors between them, dead ends, and rows of rooms."""
+"""Skeleton of a building: two long corridors, cross corridors between them, dead ends, and rows of rooms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim_hil.layouts.plan import LayoutError, Rect, Vec2
 
 @dataclass(frozen=True)
 class Bones:
-    """Ranges (low, high), m, from which a building's measures are drawn."""
+    """Ranges (low, high), m, of a building's random dimensions."""
 
     length_m: Vec2
     corridor_m: Vec2  # width
@@ -26,7 +26,7 @@ class Bones:
 
 @dataclass
 class Building:
-    """The rooms by what they are; `slots` are rooms of no purpose yet, with their corridor."""
+    """Rooms of a skeleton by type; `slots` are rooms without a purpose yet, with their corridor."""
 
     builder: Builder
     long: list[Room] = field(default_factory=list)
@@ -36,7 +36,7 @@ class Building:
 
 
 def raise_bones(builder: Builder, bones: Bones) -> Building:
-    """Lay out corridors and the rectangles of rooms; raises LayoutError when the drawn measures do not go together."""
+    """Place corridors and rooms. Raises LayoutError if the random dimensions are not feasible."""
     rng = builder.rng
     building = Building(builder)
     length = _drawn(builder, bones.length_m)
@@ -89,7 +89,7 @@ def _drawn(builder: Builder, limits: Vec2) -> float:
 
 
 def _spans(builder: Builder, length: float, count: int, bones: Bones) -> list[Vec2]:
-    """Where cross corridors run: apart by two rooms, and either at an end of the building or a room's width from it."""
+    """Return the positions of cross corridors: two rooms apart, at an end of the building or a room away from it."""
     for _ in range(200):
         spans = []
         for _ in range(count):
@@ -112,7 +112,7 @@ def _spans(builder: Builder, length: float, count: int, bones: Bones) -> list[Ve
 def _stub_span(
     builder: Builder, length: float, cross: list[Vec2], taken: list[Vec2], bones: Bones
 ) -> Vec2 | None:  # fmt: skip
-    """Where a dead end runs: right across from a cross corridor, or well away from all of them."""
+    """Return the position of a dead end: opposite a cross corridor, or far from all of them."""
     for _ in range(40):
         if cross and builder.rng.uniform() < 0.5:
             span = cross[int(builder.rng.integers(len(cross)))]
@@ -136,7 +136,7 @@ def _gaps(spans: list[Vec2], length: float) -> list[Vec2]:
 
 
 def _split(builder: Builder, low: float, high: float, room_m: Vec2) -> list[Vec2]:
-    """Cut a stretch into rooms of uneven width."""
+    """Divide a segment into rooms of random width."""
     stretch = high - low
     count = max(1, round(stretch / float(builder.rng.uniform(*room_m))))
     while count > 1 and stretch / count < room_m[0]:

@@ -1,4 +1,4 @@
-"""Open spaces of a city: a plaza with a fountain, parasols and a terrace with ramps; a park with trees and benches."""
+"""Open spaces: a plaza with a fountain, parasols and a terrace with ramps; a park with trees and benches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RAMP_RAD = radians(7.0)
 
 
 def plaza(builder: Builder, lot: Rect, north: bool) -> None:
-    """Paved and open to the sidewalk; a hedge ends it on the far side."""
+    """Add a paved plaza, open to the sidewalk, with a hedge on the far side."""
     builder.room(lot, "plaza", "plaza", "cobbles")
     rng = builder.rng
     cx, cy = lot.centre
@@ -59,7 +59,7 @@ def plaza(builder: Builder, lot: Rect, north: bool) -> None:
 
 
 def terrace(builder: Builder, lot: Rect, avoid: tuple[float, float]) -> None:
-    """A raised platform with a ramp at either end."""
+    """Add a raised platform with a ramp at each end."""
     rng = builder.rng
     size = (round(float(rng.uniform(4.0, 5.5)), 2), round(float(rng.uniform(3.2, 4.4)), 2))
     run = round(_RISE_M / tan(_RAMP_RAD), 2)
@@ -83,7 +83,7 @@ def terrace(builder: Builder, lot: Rect, avoid: tuple[float, float]) -> None:
 
 
 def park(builder: Builder, lot: Rect, north: bool) -> None:
-    """Grass with a paved way in from the sidewalk, trees, benches and a statue."""
+    """Add a park with grass, a paved path from the sidewalk, trees, benches and a statue."""
     builder.room(lot, "plaza", "park", "grass")
     cx, cy = lot.centre
     statue = builder.put("statue", cx, cy, pi / 2 if not north else -pi / 2, landmark=named("statue"), label="statue")
@@ -113,7 +113,7 @@ def _somewhere(builder: Builder, lot: Rect, kind: str, count: int, gap_m: float,
 
 
 def _edge(builder: Builder, lot: Rect, north: bool) -> None:
-    """A hedge along the side away from the street: behind it the world ends."""
+    """Add a hedge along the side away from the street, where the scene ends."""
     y = lot.y1 - 0.5 if north else lot.y0 + 0.5
     count = int(lot.width // 3.2)
     for index in range(count):

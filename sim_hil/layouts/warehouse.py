@@ -1,4 +1,4 @@
-"""A warehouse: repeated rows of racks with aisles between them, a main aisle, a loading yard with forklifts and cones.
+"""Warehouse: rows of racks with aisles between them, a main aisle, a loading yard with forklifts and cones.
 
 Paper appendix C: "long aisles, racks, forklifts, cones, and fire extinguishers … high visual repetition".
 """
@@ -15,12 +15,12 @@ from sim_hil.layouts.plan import Rect
 from sim_hil.scene.scene import Scene, Wall
 
 _RACK_DEPTH_M = 1.1
-_MARGIN_M = 0.1  # between the outermost racks and the walls' centre lines
+_MARGIN_M = 0.1  # distance between the outermost racks and the walls' centre lines
 _RACK_COLOURS = ("orange", "blue", "green", "red", "yellow", "purple")
 
 
 def warehouse(rng: np.random.Generator) -> Scene:
-    """One warehouse; raises LayoutError or SceneError when what was drawn does not go together."""
+    """Generate a warehouse. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("warehouse", rng, "wall_warehouse", 5.0)
     aisles = int(rng.integers(5, 7))
     width = round(float(rng.uniform(2.3, 2.7)), 2)
@@ -79,7 +79,7 @@ def _racks(
     builder: Builder, blocks: list[tuple[float, float]], cross: list[Room], aisles: int, width: float, block: float,
     bay: float,
 ) -> list[Room]:  # fmt: skip
-    """Rows of racks, two back to back between aisles, one colour a block; the aisles between them."""
+    """Add rows of racks, back to back between aisles, with one colour per block, and the aisles."""
     colours = [_RACK_COLOURS[int(i)] for i in builder.rng.permutation(len(_RACK_COLOURS))]
     made = []
     for y0, y1 in blocks:
@@ -102,7 +102,7 @@ def _racks(
 
 
 def _loading(builder: Builder, yard: Room) -> None:
-    """Dock doors in the outer wall, forklifts, pallets and drums, and room to walk between them."""
+    """Add dock doors in the outer wall, forklifts, pallets and drums, with space to walk between them."""
     rect = yard.rect
     doors = 3
     for index in range(doors):
@@ -133,7 +133,7 @@ def _loading(builder: Builder, yard: Room) -> None:
 
 
 def _things(builder: Builder, main: Room, aisles: list[Room]) -> None:
-    """What tells one aisle from another: cones, extinguishers, barriers, pallets, a pallet jack."""
+    """Add objects that distinguish the aisles: cones, extinguishers, barriers, pallets, a pallet jack."""
     for side in ("w", "e"):
         builder.against(main, "fire_extinguisher", side=side, landmark=named("fire_extinguisher"))
     kinds = ["traffic_cone", "box_stack", "pallet_jack", "drum", "fire_extinguisher", "wet_floor_sign"]
@@ -142,7 +142,7 @@ def _things(builder: Builder, main: Room, aisles: list[Room]) -> None:
     for row, y0 in enumerate(starts):
         rooms = [room for room in aisles if room.rect.y0 == y0]
         order = [rooms[int(i)] for i in builder.rng.permutation(len(rooms))]
-        # Each row of aisles has each kind once, and no aisle has one kind twice along its whole length.
+        # Each kind occurs once per row of aisles, and at most once along the whole length of an aisle.
         for index, room in enumerate(rooms if row else order):
             kind = kinds[(index + 2 * row) % len(kinds)] if row == 0 else _other(builder, kinds, room)
             if kind:
@@ -154,7 +154,7 @@ def _things(builder: Builder, main: Room, aisles: list[Room]) -> None:
 
 
 def _other(builder: Builder, kinds: list[str], room: Room) -> str:
-    """A kind that no aisle of this row has yet, nor the one that leads to this aisle."""
+    """Return a kind that is new in this row of aisles and in the aisle that leads to this one."""
     rect = room.rect
     used = set()
     for thing in builder.things:
@@ -165,7 +165,7 @@ def _other(builder: Builder, kinds: list[str], room: Room) -> str:
 
 
 def _in_aisle(builder: Builder, room: Room, kind: str) -> None:
-    """Something at one side of an aisle, so that two people still pass beside it."""
+    """Place an object at one side of an aisle, so that two people can still pass."""
     rect = room.rect
     colour = builder.pick(("blue", "green")) if kind == "drum" else ""
     size = {"box_stack": (0.7, 0.5, 1.1), "pallet_jack": (1.6, 0.6, 1.2)}.get(kind)

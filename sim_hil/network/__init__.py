@@ -1,1 +1,1 @@
-"""Bad networks on purpose: loss, delay, duplication, reordering, partition and rate limits on any link, repeatably."""
+"""Network shim: reproducible loss, delay, duplication, reordering, partition and rate limits on any link."""

@@ -1,4 +1,4 @@
-"""The file that says which links there are and how bad they are: TOML, checked."""
+"""Configuration of links and their impairments, read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ else:
     import tomli as tomllib
 
 KINDS: Final = {
-    "udp": "datagrams that come to `left` (HOST:PORT) go on to `right` (HOST:PORT), answers come back",
-    "serial": "two pseudo terminals at the paths `left` and `right`; whatever is written at once is a packet",
+    "udp": "datagrams to `left` (HOST:PORT) are forwarded to `right` (HOST:PORT), answers back",
+    "serial": "two pseudo terminals at the paths `left` and `right`; each write is a packet",
     "can-serial": "the same, and a packet is a frame of python-can's serial interface",
-    "frames": "the network interfaces `left` and `right` are one cable: Ethernet frames, so any protocol, DDS too",
+    "frames": "the network interfaces `left` and `right` form one cable: Ethernet frames of any protocol, also DDS",
 }
 
 
 class NetworkError(ValueError):
-    """A file that cannot be used; one line: what, expected, found."""
+    """An invalid configuration; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """One link: `there` is what happens to packets from left to right, `back` the other way."""
+    """One link; `there`: impairment from left to right, `back`: from right to left."""
 
     name: str
     kind: str
@@ -50,7 +50,7 @@ class LinkConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """All links, and the seed of what happens on them."""
+    """All links, and the seed of their random impairments."""
 
     links: tuple[LinkConfig, ...]
     seed: int = 0
@@ -58,13 +58,13 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         names = [link.name for link in self.links]
         if not names or len(set(names)) != len(names):
-            raise NetworkError(f"links: expected at least one, each with a name of its own, found {names}")
+            raise NetworkError(f"links: expected at least one, with different names, found {names}")
         if not isinstance(self.seed, int) or self.seed < 0:
             raise NetworkError(f"seed: expected 0 or more, found {self.seed!r}")
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """HOST:PORT; raises NetworkError."""
+    """Parse HOST:PORT. Raises NetworkError."""
     host, _, port = text.rpartition(":")
     if not (host and port.isdecimal() and 0 <= int(port) < 65536):
         raise NetworkError(f"expected HOST:PORT such as 127.0.0.1:14550, found {text!r}")
@@ -72,11 +72,11 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 def load_network(path: Path) -> NetworkConfig:
-    """Raises NetworkError."""
+    """Read a configuration file. Raises NetworkError."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise NetworkError(f"{path}: expected a file of links, {error.strerror}") from error
+        raise NetworkError(f"{path}: expected a readable file of links, {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise NetworkError(f"{path}: expected TOML: {error}") from error
     try:
@@ -86,7 +86,7 @@ def load_network(path: Path) -> NetworkConfig:
 
 
 def parse_network(table: Mapping[str, Any]) -> NetworkConfig:
-    """The file's content; `impairment` of a link stands for both directions, `there` and `back` for one."""
+    """Parse a file's content; a link's `impairment` applies to both directions, `there` and `back` to one."""
     _known("the file", table, ("seed", "links"))
     links = table.get("links", [])
     if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
@@ -111,7 +111,7 @@ def _link(table: Mapping[str, Any]) -> LinkConfig:
 
 
 def parse_impairment(where: str, table: Mapping[str, Any]) -> Impairment:
-    """One direction; raises NetworkError that begins with `where`."""
+    """Parse one direction's impairment. Raises NetworkError that begins with `where`."""
     _known(where, table, tuple(field.name for field in fields(Impairment)))
     values = dict(table)
     if "partitions" in values:

@@ -1,7 +1,7 @@
-"""What one direction of a link does to packets. Pure: sizes and times in, times of arrival out.
+"""Impairment of one direction of a link. Pure: packet sizes and times in, arrival times out.
 
-The fate of the n-th packet (lost, doubled, overtaken, how much later than others) is the same for the same seed,
-whatever the clock says; only queueing and partitions are a matter of time.
+With the same seed, the n-th packet is lost, duplicated, reordered and delayed in the same way at any time; only
+queueing and partitions depend on the clock.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ _STALE_S: Final = 1e9
 
 @dataclass(frozen=True)
 class Impairment:
-    """One direction of a link. All zero, as by default, is a perfect one.
+    """Impairment of one direction of a link; the defaults describe a perfect link.
 
-    `loss_percent` of packets are lost, in bursts of `loss_burst` on average (1: each for itself). A packet arrives
-    after `delay_ms`, more or less `jitter_ms` (standard deviation), never before the one sent before it, unless it is
-    one of the `reorder_percent` that are held `reorder_ms` longer and overtaken. `duplicate_percent` arrive twice.
-    `rate_kbps` (0: any) is what passes, in kilobits a second; up to `queue_bytes` wait, the rest is lost. Nothing
-    passes during `partitions`, seconds from the start: [[from, to], ...].
+    `loss_percent` of packets are lost, in bursts of `loss_burst` packets on average (1: independently). A packet
+    arrives after `delay_ms` with `jitter_ms` (standard deviation), in order of sending, except for the
+    `reorder_percent` that arrive `reorder_ms` later. `duplicate_percent` arrive twice. `rate_kbps`: capacity in
+    kilobits a second (0: unlimited); up to `queue_bytes` are queued, the rest is lost. During `partitions`, in seconds
+    from the start ([[from, to], ...]), all packets are lost.
     """
 
     loss_percent: float = 0.0
@@ -57,7 +57,7 @@ PERFECT: Final = Impairment()
 
 @dataclass
 class Tally:
-    """What has happened to packets so far."""
+    """Packet counts so far."""
 
     packets: int = 0
     delivered: int = 0
@@ -69,24 +69,24 @@ class Tally:
 
 
 class Direction:
-    """One direction of a link; its clock starts at 0 and never goes back."""
+    """State of one direction of a link; its clock starts at 0 and is monotonic."""
 
     def __init__(self, impairment: Impairment, seed: tuple[int, ...]) -> None:
         self.impairment = impairment
-        """May be replaced while packets pass."""
+        """Current impairment; may be replaced at any time."""
         self.cut = False
-        """A partition for as long as this is set."""
+        """While true, all packets are lost (partition)."""
         self.tally = Tally()
         self._rng = np.random.default_rng(seed)
         self._losing = False
-        self._free_s = 0.0  # when the line has sent what is queued
+        self._free_s = 0.0  # time at which the queue is empty
         self._last_s = -_STALE_S
 
     def offer(self, size_bytes: int, now_s: float) -> tuple[float, ...]:
-        """When a packet given to the line now arrives: never, once or twice."""
+        """Send a packet; return its arrival times: none, one or two."""
         tally, rule = self.tally, self.impairment
         tally.packets += 1
-        # As many draws for every packet, so that one's fate does not move the next one's dice.
+        # Always the same number of draws, so that one packet's impairment does not change the next one's.
         change, duplicate, reorder = (float(value) for value in self._rng.random(3))
         wobble, late_wobble = (float(value) for value in self._rng.standard_normal(2))
         lost = self._loses(rule, change)
@@ -113,7 +113,7 @@ class Direction:
         return (arrives_s, arrives_s + 1e-3 * abs(rule.jitter_ms * late_wobble))
 
     def _loses(self, rule: Impairment, chance: float) -> bool:
-        """Two states, passing and losing (Gilbert): bursts of the mean length, in the long run the share of losses."""
+        """Return whether a packet is lost, by Gilbert's two-state model with the given loss share and burst length."""
         share = 0.01 * rule.loss_percent
         if share in (0.0, 1.0):
             self._losing = share == 1.0
@@ -126,7 +126,7 @@ class Direction:
         return self._losing
 
     def _sent(self, rule: Impairment, size_bytes: int, now_s: float) -> float | None:
-        """When the line has sent the packet; None when its queue is full."""
+        """Return the time at which the packet is sent; None if the queue is full."""
         if rule.rate_kbps == 0.0:
             return now_s
         bytes_per_s = 125.0 * rule.rate_kbps

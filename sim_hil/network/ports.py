@@ -1,4 +1,4 @@
-"""The two ends of a link of each kind: real sockets, pseudo terminals and network interfaces, none of which waits."""
+"""Ends of a link for each kind: sockets, pseudo terminals and network interfaces, all non-blocking."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from sim_hil.network.config import LinkConfig, NetworkError, parse_address
 LEFT: Final = 0
 RIGHT: Final = 1
 _MAX_DATAGRAM: Final = 65535 + 64
-_MAX_CLIENTS: Final = 32  # of one udp link; the one that was silent longest makes room
-_BATCH: Final = 64  # packets taken at one look
+_MAX_CLIENTS: Final = 32  # clients of one udp link; a new client replaces the one silent for longest
+_BATCH: Final = 64  # packets read per call
 _SOL_PACKET, _PACKET_VNET_HDR = 263, 15  # <linux/if_packet.h>
 _ETH_P_ALL: Final = 3
 _CAN_START, _CAN_END = 0xAA, 0xBB  # python-can's serial frame: start, 4 stamp, 1 length, 4 id, data, end
 _CAN_FIXED: Final = 11
 
-Packet = tuple[int, bytes, object]  # the side that it came from, its content, and where its answer belongs
+Packet = tuple[int, bytes, object]  # side of origin, content, and the client for answers
 
 
 class Ends(Protocol):
     """Both ends of one link."""
 
     def sources(self) -> list[int]:
-        """File descriptors that something may arrive at, as of now."""
+        """Return the file descriptors to poll for input."""
         ...
 
     def take(self, descriptor: int) -> list[Packet]:
-        """What has arrived there, at most some; never waits."""
+        """Return packets that have arrived at a descriptor, a limited number, without waiting."""
         ...
 
     def give(self, packet: Packet) -> None:
-        """Hand a packet out at the other side than it came from; what does not fit is lost."""
+        """Send a packet out at the opposite side; it is lost if the output is full."""
         ...
 
     def close(self) -> None:
-        """Let go."""
+        """Close both ends."""
         ...
 
 
 class UdpEnds:
-    """A socket that clients send to, and one of its own for each of them towards the other address."""
+    """UDP ends: a socket for clients, and one socket per client towards the other address."""
 
     def __init__(self, left: str, right: str) -> None:
         self._right = parse_address(right)
@@ -61,7 +61,7 @@ class UdpEnds:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where clients send to."""
+        """Address to which clients send."""
         host, port = self._listener.getsockname()
         return host, port
 
@@ -72,7 +72,7 @@ class UdpEnds:
         owners = {out.fileno(): (client, out) for client, out in self._clients.items()}
         owner, end = owners.get(descriptor, (None, self._listener))
         packets: list[Packet] = []
-        # Nobody listens at the other address, or no way leads there: on a network that is silence.
+        # An unreachable address is an error here, but on a network there would be no answer.
         with contextlib.suppress(OSError):
             for _ in range(_BATCH):
                 data, sender = end.recvfrom(_MAX_DATAGRAM)
@@ -111,7 +111,7 @@ class UdpEnds:
 
 
 class SerialEnds:
-    """Two pseudo terminals; with `can` the bytes are cut into python-can's serial frames first."""
+    """Serial ends: two pseudo terminals; with `can` the bytes are split into python-can's serial frames."""
 
     def __init__(self, left: str, right: str, *, can: bool) -> None:
         self._can = can
@@ -124,7 +124,7 @@ class SerialEnds:
             for link in self._links:
                 master, slave = os.openpty()
                 self._masters.append(master)
-                self._slaves.append(slave)  # kept open: without a reader the master would only give errors
+                self._slaves.append(slave)  # kept open: without a reader, the master returns errors
                 tty.setraw(slave)
                 os.set_blocking(master, False)
                 link.symlink_to(os.ttyname(slave))
@@ -161,7 +161,7 @@ class SerialEnds:
 
 
 def can_frames(data: bytes) -> tuple[list[bytes], bytes]:
-    """The whole frames of python-can's serial interface in `data`, and what is left; bytes that are none pass alone."""
+    """Split `data` into frames of python-can's serial interface and the rest; invalid bytes pass separately."""
     frames = []
     while data:
         start = data.find(bytes([_CAN_START]))
@@ -186,10 +186,10 @@ def can_frames(data: bytes) -> tuple[list[bytes], bytes]:
 
 
 class FrameEnds:
-    """Two network interfaces as the ends of one cable. Raises OSError without the right to (CAP_NET_RAW).
+    """Two network interfaces as the ends of one cable. Raises OSError without permission (CAP_NET_RAW).
 
-    Checksums and segments that an interface leaves to its hardware stay described beside the frame (PACKET_VNET_HDR):
-    without that the receiver would throw every UDP datagram away.
+    With PACKET_VNET_HDR, each frame carries the description of offloaded checksums and segments; without it, the
+    receiver would drop every UDP datagram.
     """
 
     def __init__(self, left: str, right: str) -> None:
@@ -203,7 +203,7 @@ class FrameEnds:
                 end.setblocking(False)
         except OSError as error:
             self.close()
-            raise OSError(f"{left}, {right}: expected two interfaces we may use, {error.strerror}") from error
+            raise OSError(f"{left}, {right}: expected two accessible interfaces, {error.strerror}") from error
 
     def sources(self) -> list[int]:
         return [end.fileno() for end in self._sockets]
@@ -214,9 +214,9 @@ class FrameEnds:
         for _ in range(_BATCH):
             try:
                 data, origin = self._sockets[side].recvfrom(_MAX_DATAGRAM)
-            except OSError:  # nothing more, or the interface is down
+            except OSError:  # no more packets, or the interface is down
                 break
-            if origin[2] != socket.PACKET_OUTGOING:  # not what we have sent there ourselves
+            if origin[2] != socket.PACKET_OUTGOING:  # ignore packets sent by this relay
                 packets.append((side, data, None))
         return packets
 
@@ -232,7 +232,7 @@ class FrameEnds:
 
 
 def open_ends(link: LinkConfig) -> Ends:
-    """The ends that a link's configuration asks for. Raises NetworkError or OSError."""
+    """Open the ends of a link. Raises NetworkError or OSError."""
     if link.kind == "udp":
         return UdpEnds(link.left, link.right)
     if link.kind == "frames":

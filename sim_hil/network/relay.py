@@ -1,4 +1,4 @@
-"""Carries packets over impaired links: one loop over all of them, which sleeps until something arrives or is due."""
+"""Relay of packets over impaired links: one loop over all links, which sleeps until a packet arrives or is due."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_hil.network.impairment import Direction
 from sim_hil.network.ports import LEFT, Ends, Packet, open_ends
 
 _NS: Final = 1_000_000_000
-# Under way on all links; beyond either new packets are lost. The bytes are a gigabit a second for half a second.
+# Limits of the packets queued on all links; beyond either, new packets are lost. 64 MiB is 0.5 s at 1 Gbit/s.
 _MAX_WAITING: Final = 100_000
 _MAX_WAITING_BYTES: Final = 64 * 2**20
 _MAX_LINE_BYTES: Final = 4000
@@ -28,7 +28,7 @@ _LONGEST_SLEEP_S: Final = 0.1
 
 
 class Link:
-    """One link: its ends and what happens in either direction."""
+    """One link: its ends and the impairments of both directions."""
 
     def __init__(self, name: str, ends: Ends, directions: tuple[Direction, Direction]) -> None:
         self.name = name
@@ -37,10 +37,10 @@ class Link:
 
 
 class Relay:
-    """All links of a configuration. Raises NetworkError or OSError when one cannot be opened."""
+    """Relay for all links of a configuration. Raises NetworkError or OSError if a link cannot be opened."""
 
     def __init__(self, config: NetworkConfig, *, control: Path | None = None) -> None:
-        """`control`: take changes at this local datagram socket, one JSON object each (see `change`)."""
+        """Open the links; `control`: local datagram socket for changes, one JSON object each (see `change`)."""
         self.links: dict[str, Link] = {}
         self._waiting: list[tuple[int, int, Link, Packet]] = []
         self._waiting_bytes = 0
@@ -60,14 +60,14 @@ class Relay:
             raise
 
     def run(self, stopped: Callable[[], bool], duration_s: float | None = None) -> None:
-        """Carry packets until `stopped()`, looked at ten times a second, or for `duration_s`."""
+        """Relay packets until `stopped()`, checked ten times a second, or for `duration_s`."""
         begin_ns = self._begin_ns = time.monotonic_ns()
         end_ns = None if duration_s is None else begin_ns + round(duration_s * _NS)
         while not stopped() and (end_ns is None or time.monotonic_ns() < end_ns):
             self.turn(_LONGEST_SLEEP_S)
 
     def turn(self, longest_s: float) -> None:
-        """Sleep until something arrives or is due, at most `longest_s`, and deal with it."""
+        """Sleep until a packet arrives or is due, at most `longest_s`, and process it."""
         now_ns = time.monotonic_ns()
         sleep_s = longest_s
         if self._waiting:
@@ -81,7 +81,7 @@ class Relay:
             owners[self._control.fileno()] = None
         for descriptor in owners:
             poller.register(descriptor, select.POLLIN)
-        # Rounded up: poll counts in milliseconds, and to wake too early is to spin.
+        # Rounded up to whole milliseconds, because waking too early would spin.
         ready = poller.poll(-int(-sleep_s * 1000 // 1)) if sleep_s > 0 else poller.poll(0)
         for descriptor, _ in ready:
             owner = owners[descriptor]
@@ -119,14 +119,13 @@ class Relay:
             except NetworkError as error:
                 answer = {"error": str(error)}
             if sender:
-                with contextlib.suppress(OSError):  # whoever asked has gone
+                with contextlib.suppress(OSError):  # the sender has closed its socket
                     self._control.sendto(json.dumps(answer).encode(), sender)
 
     def change(self, line: bytes) -> dict[str, Any]:
-        """{"link": NAME, "cut": true|false} or {"link": NAME, "there": {...}, "back": {...}}; NAME * is all links.
+        """Apply {"link": NAME, "cut": true|false} or {"link": NAME, "there": {...}, "back": {...}}; NAME *: all links.
 
-        A direction that is named is as bad as is said from now on, and perfect where nothing is said. Raises
-        NetworkError.
+        A named direction gets the given impairment; omitted keys are reset to the perfect default. Raises NetworkError.
         """
         try:
             table = json.loads(line)
@@ -156,7 +155,7 @@ class Relay:
         return {"links": [link.name for link in links], "effect_ns": time.monotonic_ns()}
 
     def summary(self) -> dict[str, Any]:
-        """What has happened on every link, in either direction."""
+        """Return the packet counts of every link and direction."""
         return {
             "links": {
                 name: {"there": asdict(link.directions[0].tally), "back": asdict(link.directions[1].tally)}
@@ -165,7 +164,7 @@ class Relay:
         }
 
     def close(self) -> None:
-        """Let go of all ends."""
+        """Close all ends and the control socket."""
         for link in self.links.values():
             link.ends.close()
         if self._control is not None and self._path is not None:

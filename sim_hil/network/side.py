@@ -1,6 +1,6 @@
-"""One end of `between`: waits for its cable, gives it an address, becomes the command. Runs in its own namespace.
+"""One side of `between`, in its own namespace: wait for the cable, set its address, and execute the command.
 
-A line on standard input says that the cable is there; the command gets an empty standard input of its own.
+A line on standard input signals that the cable exists; the command gets an empty standard input.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ INTERFACE: Final = "eth0"
 
 
 def main(argv: list[str]) -> int:
-    """`ADDRESS COMMAND...`; does not return when the command could be started."""
+    """Run `ADDRESS COMMAND...`; returns only if the command cannot be started."""
     address, *command = argv
     if not sys.stdin.readline():
-        return 1  # whoever was to lay the cable has gone
+        return 1  # the parent ended
     for arguments in (
         ["link", "set", "lo", "up"],
         ["addr", "add", address, "dev", INTERFACE],

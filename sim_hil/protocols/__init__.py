@@ -1,1 +1,1 @@
-"""Front ends of `edge-hil`, one for each protocol, and what they share: interface, camera stream, fault socket."""
+"""Front ends of `edge-hil`, one per protocol, and their shared parts: interface, camera stream, fault socket."""

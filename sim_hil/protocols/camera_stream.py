@@ -1,10 +1,10 @@
-"""The camera of a robot whose protocol carries no pictures: MJPEG over HTTP, from a process of its own.
+"""Camera of a robot whose protocol carries no images: MJPEG over HTTP, from a separate process.
 
-Any browser, ffmpeg or OpenCV can look at it; it listens on the loopback only.
-  GET /stream.mjpg   multipart/x-mixed-replace, a JPEG a part, no faster than the camera's rate
-  GET /frame.jpg     the next picture
-Every picture comes with "X-Capture-Ns", time.monotonic_ns of the pose that it shows. Nothing is rendered while nobody
-looks. `CameraStream` is the parent's handle: the pose goes to the process through shared memory.
+A browser, ffmpeg or OpenCV can read it; the server listens on the loopback interface only.
+  GET /stream.mjpg   multipart/x-mixed-replace, one JPEG per part, at most at the camera's rate
+  GET /frame.jpg     the next image
+Every image has the header "X-Capture-Ns": time.monotonic_ns of the rendered pose. Without a client nothing is rendered.
+`CameraStream` is the parent's handle: it passes the pose to the process through shared memory.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ _END_S: Final = 3.0
 
 
 class CameraStreamError(RuntimeError):
-    """The camera process did not start, or has died."""
+    """The camera process did not start, or it died."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One JPEG, its running number, and time.monotonic_ns of the pose that it shows."""
+    """One JPEG, its sequence number, and time.monotonic_ns of the rendered pose."""
 
     number: int
     captured_ns: int
@@ -58,7 +58,7 @@ class Picture:
 
 
 class Shutter:
-    """Between those who look and the one thread that renders: it is asked for a picture only while somebody waits."""
+    """Exchange between HTTP clients and the rendering thread, which renders only while a client waits."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -66,7 +66,7 @@ class Shutter:
         self._picture: Picture | None = None
 
     def next_after(self, number: int, timeout_s: float) -> Picture | None:
-        """Wait for a picture newer than `number` (0: any that is made from now on); None after `timeout_s`."""
+        """Wait for an image newer than `number` and return it; None after `timeout_s`."""
         with self._changed:
             self._waiting += 1
             try:
@@ -78,17 +78,17 @@ class Shutter:
 
     @property
     def newest(self) -> int:
-        """Number of the newest picture, 0 before the first."""
+        """Number of the newest image, 0 before the first."""
         with self._changed:
             return 0 if self._picture is None else self._picture.number
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody waits."""
+        """Whether a client waits for an image."""
         return self._waiting > 0
 
     def show(self, captured_ns: int, jpeg: bytes) -> None:
-        """Hand everybody who waits a picture."""
+        """Pass a new image to all waiting clients."""
         with self._changed:
             number = 1 if self._picture is None else self._picture.number + 1
             self._picture = Picture(number, captured_ns, jpeg)
@@ -96,15 +96,15 @@ class Shutter:
 
 
 def listen(port: int) -> socket.socket:
-    """A listening socket on the loopback; `port` 0: any free one. Raises OSError with one clear line."""
+    """Open a listening socket on the loopback interface; `port` 0: any free port. Raises OSError with one line."""
     try:
         return socket.create_server(("127.0.0.1", port))
     except OSError as error:
-        raise OSError(f"camera: port {port}: expected a free one, {error.strerror}; choose another") from error
+        raise OSError(f"camera: port {port}: expected a free port, {error.strerror}; choose another") from error
 
 
 class CameraServer(ThreadingHTTPServer):
-    """HTTP on a socket that listens already, and is the server's from now on."""
+    """HTTP server on a listening socket, of which it takes ownership."""
 
     daemon_threads = True
 
@@ -117,15 +117,15 @@ class CameraServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: CameraServer
-    timeout = _SEND_TIMEOUT_S  # a client that stops reading is let go
+    timeout = _SEND_TIMEOUT_S  # a client that stops reading is disconnected
 
     def do_GET(self) -> None:
-        """One picture or a stream of them."""
+        """Send one image or a stream of images."""
         if self.path == "/frame.jpg":
             with contextlib.suppress(OSError):
                 self._frame()
         elif self.path == "/stream.mjpg":
-            with contextlib.suppress(OSError):  # the client has gone, or stopped reading
+            with contextlib.suppress(OSError):  # the client disconnected or stopped reading
                 self._stream()
         else:
             self.send_error(404, "expected /stream.mjpg or /frame.jpg")
@@ -134,7 +134,7 @@ class _Handler(BaseHTTPRequestHandler):
         shutter = self.server.shutter
         picture = shutter.next_after(shutter.newest, _FRAME_TIMEOUT_S)
         if picture is None:
-            self.send_error(503, "no picture")
+            self.send_error(503, "no image")
             return
         self.send_response(200)
         self._describe(picture)
@@ -162,11 +162,14 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(head.encode("ascii") + picture.jpeg + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are no news."""
+        """Do not log requests."""
 
 
 class CameraStream:
-    """Starts the camera process, hands it the pose, counts its pictures. It ends when this object or process does."""
+    """Handle of the camera process: starts it, passes the pose to it, counts its images.
+
+    The process ends with this object or with this process.
+    """
 
     def __init__(
         self,
@@ -179,10 +182,10 @@ class CameraStream:
         port: int,
         state_length: int,
     ) -> None:
-        """`scene`: what load_scene takes; `size`: (width, height), pixels; `port`: of the loopback, 0 for any free one;
-        `state_length`: of a render state. Raises OSError when the port is taken.
+        """Start the process. `scene`: name or file for load_scene; `size`: (width, height), px; `port`: 0 for any free
+        port; `state_length`: length of a render state. Raises OSError if the port is in use.
         """
-        # Listening here: whoever starts us learns at once that a port is taken, and which one it is.
+        # The parent opens the socket, so that a port in use is reported at once and a free port is known.
         with listen(port) as listening:
             self.port = int(listening.getsockname()[1])
             self._pose = SnapshotWriter(state_length)
@@ -202,15 +205,15 @@ class CameraStream:
 
     @property
     def url(self) -> str:
-        """Where it can be seen."""
+        """URL of the stream."""
         return f"http://127.0.0.1:{self.port}/stream.mjpg"
 
     def show(self, render_state: NDArray[np.float64]) -> None:
-        """Make this the state that the next picture shows; takes microseconds."""
+        """Set the state that the next image shows; takes microseconds."""
         self._pose.write(render_state)
 
     def wait_ready(self, stop: Sequence[int]) -> bool:
-        """Wait until it can be looked at; False when something appears in `stop` first. Raises CameraStreamError."""
+        """Wait until the stream is ready; return False if `stop` gets an element first. Raises CameraStreamError."""
         deadline_ns = time.monotonic_ns() + int(_START_TIMEOUT_S * 1e9)
         while not self.poll():
             if stop:
@@ -221,14 +224,14 @@ class CameraStream:
         return True
 
     def poll(self) -> bool:
-        """Take in what the process has said; whether that it is ready was among it. Raises CameraStreamError."""
+        """Read the process's events; return whether "ready" was among them. Raises CameraStreamError."""
         assert self._process.stdout is not None
         ready = False
         with contextlib.suppress(BlockingIOError):
             while True:
                 chunk = os.read(self._process.stdout.fileno(), 65536)
                 if not chunk:
-                    raise CameraStreamError("the camera process has died; see its output above")
+                    raise CameraStreamError("the camera process died; see its output above")
                 *lines, self._partial = (self._partial + chunk).split(b"\n")
                 for line in lines:
                     event = json.loads(line)
@@ -237,7 +240,7 @@ class CameraStream:
         return ready
 
     def close(self) -> None:
-        """End the process; killed if it does not end by itself. May be called twice."""
+        """End the process, by a kill if necessary; may be called twice."""
         assert self._process.stdin is not None and self._process.stdout is not None
         if self._process.stdout.closed:
             return
@@ -253,7 +256,7 @@ class CameraStream:
 
 
 def _event_pipe() -> TextIO:
-    """The pipe to the parent, for us alone: what a library prints to stdout goes to stderr from now on."""
+    """Return the pipe to the parent; from now on, prints of libraries to stdout go to stderr."""
     pipe = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return pipe
@@ -263,7 +266,7 @@ def _parent_lives() -> bool:
     return not select.select([sys.stdin], [], [], 0)[0]
 
 
-def _tell(pipe: TextIO, **event: object) -> None:
+def _send_event(pipe: TextIO, **event: object) -> None:
     pipe.write(json.dumps(event) + "\n")
     pipe.flush()
 
@@ -289,23 +292,23 @@ def _render_while_parent_lives(
         try:
             state = poses.read()
         except TornSnapshotError as error:
-            # The physics is held up or has gone; the next look finds out which.
-            sys.stderr.write(f"edge-hil camera: a picture was left out: {error}\n")
+            # The physics is blocked or ended; the loop's condition distinguishes the two.
+            sys.stderr.write(f"edge-hil camera: image skipped: {error}\n")
             continue
         if state is not None:
             shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
-            _tell(pipe, event="picture")
+            _send_event(pipe, event="picture")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point of the camera process; ends when stdin does."""
+    """Run the camera process until stdin closes."""
     parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--robot", required=True)
     for name in ("people", "seed", "width", "height", "listen-fd", "pose-fd"):
         parser.add_argument(f"--{name}", type=int, required=True)
     args = parser.parse_args(argv)
-    # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
+    # Ctrl-C reaches the whole process group, but the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pipe, shutter, size = _event_pipe(), Shutter(), (args.width, args.height)
@@ -314,9 +317,9 @@ def main(argv: list[str] | None = None) -> int:
     poses = SnapshotReader(args.pose_fd, world.state_size)
     noise = SensorNoise(args.width, args.height, args.seed)
     threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()
-    # BrokenPipeError: the parent died between two looks at stdin.
+    # BrokenPipeError: the parent died between two checks of stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
-        _tell(pipe, event="ready")
+        _send_event(pipe, event="ready")
         _render_while_parent_lives(world, poses, shutter, size, noise, pipe)
     return 0
 

@@ -1,4 +1,4 @@
-"""The asking end of a fault socket: `edge-hil --faults` and the fault rig's runner speak the same lines."""
+"""Client of a fault socket, for `edge-hil --faults` and for the runner of the fault rig."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _POLL_S = 0.01
 
 
 class FaultError(RuntimeError):
-    """A fault that could not be injected; one line that says which and why."""
+    """A fault that could not be injected; one line with its name and the cause."""
 
 
 TIMEOUT_S: Final = 5.0
-"""For a fault to take effect."""
+"""Default timeout until a fault takes effect, s."""
 
 
 class FaultClient:
-    """Asks for faults and waits until they have taken effect. A context manager, bound to a path of its own."""
+    """Client that requests faults and waits until they take effect; a context manager with its own socket path."""
 
     def __init__(self, server: Path, own: Path) -> None:
-        """`server`: where the faults are made; `own`: a free path to be answered at. Raises OSError."""
+        """Bind the client. `server`: path of the fault socket; `own`: free path for answers. Raises OSError."""
         self._server = server
         self._own = own
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -39,15 +39,15 @@ class FaultClient:
         self.close()
 
     def ask(self, fault: str, *, on: bool = True, **values: float | str) -> None:
-        """Ask without waiting for the effect. Raises FaultError when nobody listens."""
+        """Request a fault without waiting for its effect. Raises FaultError if the server does not listen."""
         line = json.dumps({"fault": fault, **({} if fault == "clear" else {"on": on}), **values}).encode()
         try:
             self._socket.sendto(line, str(self._server))
         except OSError as error:
-            raise FaultError(f"{fault}: nobody takes faults at {self._server.name}: {error.strerror}") from error
+            raise FaultError(f"{fault}: no process accepts faults at {self._server.name}: {error.strerror}") from error
 
     def effect_ns(self, fault: str, timeout_s: float = TIMEOUT_S) -> int:
-        """When what was asked for took effect, monotonic ns; waits for it. Raises FaultError."""
+        """Wait for the requested fault and return the time of its effect, monotonic ns. Raises FaultError."""
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         while True:
             left_s = (deadline_ns - time.monotonic_ns()) / 1e9
@@ -64,13 +64,13 @@ class FaultClient:
                 return int(answer["effect_ns"])
 
     def inject(self, fault: str, *, on: bool = True, timeout_s: float = TIMEOUT_S, **values: float | str) -> int:
-        """`ask` and `effect_ns` in one; older answers that nobody waited for are thrown away first."""
+        """Request a fault and return the time of its effect, monotonic ns; discards older answers first."""
         self.answers()
         self.ask(fault, on=on, **values)
         return self.effect_ns(fault, timeout_s)
 
     def wait_for_server(self, timeout_s: float) -> None:
-        """Wait until the socket is there. Raises FaultError."""
+        """Wait until the server's socket exists. Raises FaultError."""
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         while not self._server.exists():
             if time.monotonic_ns() > deadline_ns:
@@ -83,7 +83,7 @@ class FaultClient:
         self._own.unlink(missing_ok=True)
 
     def answers(self) -> list[dict[str, Any]]:
-        """What has been answered since the last call, without waiting."""
+        """Return the answers since the last call, without waiting."""
         found: list[dict[str, Any]] = []
         self._socket.setblocking(False)
         try:

@@ -1,4 +1,4 @@
-"""A datagram socket that faults of a running front end are switched by: one JSON object in, one out."""
+"""Datagram socket that switches faults of a running front end: one JSON object per request and answer."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import json
 import os
 import socket
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 CLEAR: Final = "clear"
-_MAX_BYTES: Final = 2000
+MAX_BYTES: Final = 2000
 _MAX_A_POLL: Final = 16
 
 
-class FaultSocket(ABC):
-    """Binds PATH for its user alone; `poll` takes in what has come. Raises OSError."""
+class FaultEndpoint:
+    """Datagram socket for fault requests at a path that only this user can access. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -31,24 +32,18 @@ class FaultSocket(ABC):
             os.umask(umask)
         self._socket.setblocking(False)
 
-    def poll(self) -> None:
-        """Take in the commands that have come; never waits."""
+    def _received(self) -> Iterator[tuple[bytes, str]]:
+        """Yield the requests that have arrived and their senders, a limited number per call."""
         for _ in range(_MAX_A_POLL):
             try:
-                data, sender = self._socket.recvfrom(_MAX_BYTES + 1)
+                yield self._socket.recvfrom(MAX_BYTES + 1)
             except BlockingIOError:
                 return
-            try:
-                answer = self._switch(_table(data))
-            except ValueError as error:
-                answer = {"error": str(error)}
-            if sender:  # an unbound socket has no address to answer to
-                with contextlib.suppress(OSError):  # it has gone or does not read
-                    self._socket.sendto(json.dumps(answer).encode(), sender)
 
-    @abstractmethod
-    def _switch(self, table: dict[str, object]) -> dict[str, object]:
-        """Do what one command says; the answer. Raises ValueError."""
+    def _answer(self, sender: str, answer: dict[str, object]) -> None:
+        if sender:  # an unbound socket has no address to answer to
+            with contextlib.suppress(OSError):  # the client ended or does not read
+                self._socket.sendto(json.dumps(answer).encode(), sender)
 
     def close(self) -> None:
         """Close and remove the socket."""
@@ -56,11 +51,28 @@ class FaultSocket(ABC):
         self._path.unlink(missing_ok=True)
 
 
+class FaultSocket(FaultEndpoint, ABC):
+    """Fault socket that answers every request at once; `poll` handles requests."""
+
+    def poll(self) -> None:
+        """Handle the requests that have arrived, without waiting."""
+        for data, sender in self._received():
+            try:
+                answer = self._switch(_table(data))
+            except ValueError as error:
+                answer = {"error": str(error)}
+            self._answer(sender, answer)
+
+    @abstractmethod
+    def _switch(self, table: dict[str, object]) -> dict[str, object]:
+        """Execute one request and return the answer. Raises ValueError."""
+
+
 def _table(data: bytes) -> dict[str, object]:
     try:
-        table = json.loads(data) if len(data) <= _MAX_BYTES else None
+        table = json.loads(data) if len(data) <= MAX_BYTES else None
     except (ValueError, RecursionError):
         table = None
     if not isinstance(table, dict):
-        raise ValueError(f"expected a JSON object of at most {_MAX_BYTES} bytes, found {data[:60]!r}")
+        raise ValueError(f"expected a JSON object of at most {MAX_BYTES} bytes, found {data[:60]!r}")
     return table

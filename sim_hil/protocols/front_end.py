@@ -1,8 +1,8 @@
-"""What `edge-hil`'s loop and a protocol's robot half agree on; `sim_hil.protocols.registry` lists the protocols.
+"""Interface between the loop of `edge-hil` and a front end; `sim_hil.protocols.registry` lists the protocols.
 
-The loop (`loop.py`) knows nothing else of a protocol. The robot half commands the robot and reads its truth through
-the simulation. It keeps all its timing (stale commands, heartbeats) in the robot's own clock, the `stamp_s` that
-`publish` is given, so that it can be tested without waiting; only `received_ns` is the real monotonic clock.
+A front end is the robot's half of one protocol. It commands the robot and reads its ground truth through the
+simulation. All its timing (stale commands, heartbeats) uses the robot's own clock, `stamp_s` of `publish`, so that
+tests need not wait. Only `received_ns` uses the real monotonic clock.
 """
 
 from __future__ import annotations
@@ -19,16 +19,15 @@ from sim_hil.scene.scene import Scene
 
 
 class FrontEndError(ValueError):
-    """A protocol cannot be spoken as asked; one line for the operator: what, expected, found."""
+    """A front end that cannot be opened as requested; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class FrontEndOptions:
-    """What a front end may need to know of the command line.
+    """Options of the command line for a front end.
 
-    `scene_source` is what `load_scene` takes (a name or a file) and `scene` what it made of that, with the start that
-    was asked for. `camera_size` is None for a robot without a camera. `link` is the protocol's address, in a form of
-    its own; `domain` and `interface` are DDS's.
+    `scene_source`: name or file for `load_scene`; `scene`: the loaded scene with the requested start. `camera_size`:
+    None for no camera. `link`: the protocol's address, in the protocol's own format. `domain`, `interface`: for DDS.
     """
 
     robot: str
@@ -45,11 +44,11 @@ class FrontEndOptions:
 
 
 @dataclass(frozen=True)
-class Heard:
-    """One command as it came off the wire, for the trace; `received_ns` is time.monotonic_ns.
+class ReceivedCommand:
+    """One command received on the wire, for the trace; `received_ns` is time.monotonic_ns.
 
-    `service` is the part of the protocol that it was sent to, `api_id` its number there, `name` what the protocol's
-    own page calls it, `parameter` its content in words. `request_id` is the sender's, 0 where there is none.
+    `service`: addressed part of the protocol; `api_id`: the command's number there; `name`: its name in the protocol's
+    documentation; `parameter`: its content as text; `request_id`: the sender's number, 0 if the protocol has none.
     """
 
     received_ns: int
@@ -61,43 +60,43 @@ class Heard:
 
 
 class FrontEnd(Protocol):
-    """The robot's half of one protocol. Methods are called by one thread; only `wait` may wait, only `start` long."""
+    """The robot's half of one protocol. One thread calls all methods; only `start` and `wait` may block."""
 
     def where(self) -> str:
-        """Where it can be reached, in words, for the line that says that it is ready."""
+        """Return the robot's address as text for the "ready" line."""
         ...
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait until it can serve, the world being as in `render_state`; False when `stop` gets an element first.
+        """Wait until the front end is ready, with the world in `render_state`; False if `stop` gets an element first.
 
-        Raises RuntimeError or OSError when it cannot.
+        Raises RuntimeError or OSError if it cannot start.
         """
         ...
 
     def wait(self, left_ns: int) -> None:
-        """Sleep until something arrives, at most `left_ns`."""
+        """Wait until data arrives, at most `left_ns`."""
         ...
 
-    def serve(self) -> list[Heard]:
-        """Obey and answer what has arrived; returns it. Malformed input is counted and changes nothing."""
+    def serve(self) -> list[ReceivedCommand]:
+        """Execute and answer the received commands and return them. Malformed input is counted and has no effect."""
         ...
 
     def publish(self, step: int, stamp_s: float) -> None:
-        """Called after physics step number `step`, at `stamp_s` of the robot's own clock: send what is due."""
+        """Send the messages due after physics step number `step`, at `stamp_s` of the robot's own clock."""
         ...
 
     def show(self, render_state: NDArray[np.float64]) -> None:
-        """The world as its cameras see it from now on; after every batch of steps."""
+        """Set the world that the cameras render; called after every batch of steps."""
         ...
 
     def close(self) -> None:
-        """Let go of everything; may be called twice."""
+        """Release all resources; may be called twice."""
         ...
 
     def summary(self) -> Mapping[str, object]:
-        """Its part of the result, after `close` too.
+        """Return the front end's part of the result; also works after `close`.
 
-        `wire`: {commands, last_move, last_command, last_command_zero, malformed}; `video_frames`: pictures sent;
+        `wire`: {commands, last_move, last_command, last_command_zero, malformed}; `video_frames`: images sent;
         `states`: odometry reports sent.
         """
         ...

@@ -1,7 +1,7 @@
-"""Which robot speaks which protocol, and how a protocol's robot half is opened.
+"""Registry of protocols: which robot uses which protocol, and how its front end is opened.
 
 A protocol is a package sim_hil/protocols/NAME whose module `front_end` has `open_front_end(simulation, options) ->
-FrontEnd`. It is imported by name when it is asked for: one protocol's library is not needed to speak another.
+FrontEnd`. It is imported on demand, so that using one protocol does not require the library of another.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ _SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 FLAGS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"--domain": ("unitree",), "--interface": ("unitree",), "--link": ("mavlink", "can")}
 )
-"""Options of the command line that only some protocols have."""
+"""Command-line options that only some protocols have."""
 
 
 def protocols() -> tuple[str, ...]:
-    """The protocols that are there."""
+    """Return the names of the installed protocols."""
     return tuple(name for name in _SPOKEN_BY if (_FOLDER / name / "front_end.py").is_file())
 
 
 def robots() -> tuple[str, ...]:
-    """The robots that speak one of them."""
+    """Return the robots with an installed protocol."""
     return tuple(dict.fromkeys(robot for name in protocols() for robot in _SPOKEN_BY[name]))
 
 
 def check_combination(robot: str, protocol: str) -> None:
-    """Raises FrontEndError unless `robot` speaks `protocol`."""
+    """Check that `robot` uses `protocol`. Raises FrontEndError."""
     if robot not in _SPOKEN_BY[protocol]:
         spoken = [name for name in protocols() if robot in _SPOKEN_BY[name]]
         raise FrontEndError(
-            f"--robot {robot} --protocol {protocol}: expected a protocol that this robot speaks, {' or '.join(spoken)}"
+            f"--robot {robot} --protocol {protocol}: expected a protocol of this robot, {' or '.join(spoken)}"
         )
 
 
 def check_flags(protocol: str, given: Sequence[str]) -> None:
-    """Raises FrontEndError for the first of the `given` FLAGS that `protocol` does not have."""
+    """Check that `protocol` has all the `given` FLAGS. Raises FrontEndError."""
     for flag in given:
         if protocol not in FLAGS[flag]:
             own = " and ".join(name for name, speakers in FLAGS.items() if protocol in speakers)
             others = " or ".join(FLAGS[flag])
-            raise FrontEndError(f"{flag}: is for --protocol {others}, {protocol} is reached by {own}; leave it out")
+            raise FrontEndError(f"{flag}: expected only with --protocol {others}; for {protocol} use {own} instead")
 
 
 def open_front_end(protocol: str, simulation: Simulation, options: FrontEndOptions) -> FrontEnd:
-    """Raises FrontEndError, or what the protocol's own library raises for an address that cannot be opened."""
+    """Open a protocol's front end. Raises FrontEndError, or the protocol library's error for a bad address."""
     opener: Opener = importlib.import_module(f"sim_hil.protocols.{protocol}.front_end").open_front_end
     return opener(simulation, options)

@@ -1,6 +1,6 @@
-"""One float64 array shared with another process: the newest value, never a torn one, and the writer never waits.
+"""One float64 array shared with another process: readers get the newest consistent value, and the writer never waits.
 
-The memory is an anonymous file passed down as a descriptor, so nothing is left behind by a process that is killed.
+The memory is an anonymous file passed as a descriptor, so a killed process leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 _HEADER: Final = struct.Struct("<QI")  # sequence number (0: nothing yet), CRC-32 of sequence and data
 _TRIES: Final = 100
-_PAUSE_S: Final = 0.001  # a writer that lost its core inside its copy is away for milliseconds
+_PAUSE_S: Final = 0.001  # a writer that is preempted during its copy resumes within milliseconds
 
 
 class TornSnapshotError(RuntimeError):
-    """The writer left a value half-written and did not come back."""
+    """The writer left a value half-written."""
 
 
 def _crc(sequence: int, data: bytes) -> int:
@@ -29,7 +29,7 @@ def _crc(sequence: int, data: bytes) -> int:
 
 
 class SnapshotWriter:
-    """The writing end; `fd` goes to the reader's process."""
+    """Writer of the snapshot; pass `fd` to the reader's process."""
 
     def __init__(self, length: int) -> None:
         self._length = length
@@ -40,9 +40,9 @@ class SnapshotWriter:
         self._memory = mmap.mmap(self.fd, size)
 
     def write(self, values: NDArray[np.float64]) -> None:
-        """Replace the value. Raises ValueError for another length."""
+        """Replace the value. Raises ValueError for a wrong length."""
         if values.shape != (self._length,):
-            raise ValueError(f"snapshot holds {self._length} numbers, got shape {values.shape}")
+            raise ValueError(f"snapshot: expected {self._length} numbers, found shape {values.shape}")
         data = values.astype("<f8").tobytes()
         self._sequence += 1
         self._memory[:] = _HEADER.pack(self._sequence, _crc(self._sequence, data)) + data
@@ -54,19 +54,19 @@ class SnapshotWriter:
 
 
 class SnapshotReader:
-    """The reading end, of the descriptor it was given."""
+    """Reader of the snapshot behind a descriptor."""
 
     def __init__(self, fd: int, length: int) -> None:
         size = _HEADER.size + 8 * length
         found = os.fstat(fd).st_size
         if found != size:
-            raise ValueError(f"shared memory has {found} bytes, {length} numbers need {size}")
+            raise ValueError(f"snapshot: expected {size} bytes for {length} numbers, found {found}")
         self._memory = mmap.mmap(fd, size, prot=mmap.PROT_READ)
 
     def read(self) -> NDArray[np.float64] | None:
-        """The newest whole value; None before the first. Raises TornSnapshotError after 0.1 s without one.
+        """Return the newest consistent value; None before the first. Raises TornSnapshotError after 0.1 s.
 
-        A copy caught half-written fails its CRC and is repeated.
+        A half-written copy fails its CRC and is read again.
         """
         for _ in range(_TRIES):
             content = bytes(self._memory[:])
@@ -77,7 +77,7 @@ class SnapshotReader:
             if _crc(sequence, data) == crc:
                 return np.frombuffer(data, dtype="<f8").astype(np.float64)
             time.sleep(_PAUSE_S)
-        raise TornSnapshotError(f"no consistent snapshot in {_TRIES} tries; is the writer alive?")
+        raise TornSnapshotError(f"no consistent snapshot in {_TRIES} tries; check that the writer is alive")
 
     def close(self) -> None:
         """Release the memory."""

@@ -1,1 +1,1 @@
-"""Robot, bridge and runner as real processes, started, watched and ended, and the ground truth of their run."""
+"""Robot, bridge and runner as real processes, and the ground truth of their run."""

@@ -1,4 +1,4 @@
-"""The robot's side, the bridge and the runner as real processes, started and ended as a user would do it."""
+"""The stack: simulated robot, bridge and runner as real processes, started and ended as by a user."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ COMMANDS: Mapping[str, Sequence[str]] = {
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0
 GRACE_S = 12.0
-"""The runner may take 7 s to end (edge.run.session.END_S)."""
+"""Time for a process to end, s; the runner may take 7 s (edge.run.session.END_S)."""
 
 
 @dataclass(frozen=True)
 class StackOptions:
-    """One robot in one world, and who drives it; `folder` takes results and logs and exists."""
+    """Options of a stack; `folder` exists and receives results and logs."""
 
     folder: Path
     artifacts: Path
@@ -53,14 +53,14 @@ class StackOptions:
     release_delay: str = "0"
     odometry_noise: str = "none"
     speed_limit_mps: float | None = None
-    """In place of the robot file's limit of the forward speed."""
+    """Forward speed limit, m/s; None: the robot file's."""
     faults: bool = False
     instructions: bool = False
-    """Whether the runner takes further instructions while it drives."""
+    """Whether the runner accepts further instructions while driving."""
     switches: SwitchOptions = field(default_factory=SwitchOptions)
-    """Decoding rules and recoveries that the runner is asked for."""
+    """Decoding rules and recoveries requested from the runner."""
     pose_hz: int | None = None
-    """Poses a second in the trace, in place of edge-hil's default."""
+    """Poses a second in the trace; None: edge-hil's default."""
 
     def __post_init__(self) -> None:
         if self.speed_limit_mps is not None and not 0.01 <= self.speed_limit_mps <= 1.5:
@@ -70,12 +70,12 @@ class StackOptions:
 
 
 class Stack:
-    """A context manager that ends exactly the processes that it has started, the runner first."""
+    """Running stack: a context manager that ends exactly the processes that it started, the runner first."""
 
     def __init__(self, options: StackOptions, commands: Mapping[str, Sequence[str]] = COMMANDS) -> None:
         self.options = options
         self.runs = 0
-        """How many runners have been started; files of the newest carry this number."""
+        """Number of started runners; also the number in the newest runner's file names."""
         self.robot: Child | None = None
         self.bridge: Child | None = None
         self.runner: Child | None = None
@@ -99,24 +99,24 @@ class Stack:
 
     @property
     def trace(self) -> Path:
-        """Ground truth, written by the robot's side."""
+        """Trace with the ground truth, written by edge-hil."""
         return self.options.folder / "trace.jsonl"
 
     @property
     def instructions(self) -> Path:
-        """Where the newest runner takes instructions."""
+        """Instruction socket of the newest runner."""
         return self._sockets / f"say{self.runs}"
 
     def flight_log(self, run: int) -> Path:
-        """Flight log of a runner, counted from 1."""
+        """Return the flight log of a runner; runners are numbered from 1."""
         return self.options.folder / f"flight-{run}.mcap"
 
     def result(self, name: str) -> Path:
-        """Result of a process: edge-hil, edge-bridge-N, edge-run-N."""
+        """Return the result file of a process: edge-hil, edge-bridge-N or edge-run-N."""
         return self.options.folder / f"{name}.json"
 
     def processes(self) -> dict[str, int]:
-        """Process ids by command name of what has been started and not ended."""
+        """Return the ids of the running processes by command name."""
         found = {"edge-hil": self.robot, "edge-bridge": self.bridge, "edge-run": self.runner}
         return {name: child.process.pid for name, child in found.items() if child is not None and child.running}
 
@@ -127,7 +127,7 @@ class Stack:
         command = [
             *self._commands["edge-hil"],
             *("--robot", "go2", "--protocol", "unitree", "--interface", "lo", "--scene", options.scene),
-            # One word: a place may begin with a minus.
+            # One argument, because the value may begin with a minus.
             f"--start={x_m!r},{y_m!r},{math.degrees(theta_rad)!r}",
             *("--people", str(options.people), "--seed", str(options.seed), "--domain", str(options.domain)),
             *("--odometry-noise", options.odometry_noise),
@@ -145,16 +145,19 @@ class Stack:
             self.faults = FaultClient(faults, self._sockets / "asked")
 
     def start_bridge(self, tick: Tick) -> None:
-        """Start the bridge, as urgent as its service is where that is allowed; wait for its socket; StepError."""
+        """Start the bridge, with its service's real-time priority if permitted, and wait for its socket.
+
+        Raises StepError.
+        """
         socket = self._sockets / "bridge"
-        socket.unlink(missing_ok=True)  # of a bridge that was killed
+        socket.unlink(missing_ok=True)  # left by a killed bridge
         name = f"edge-bridge-{self.runs + 1}"
         command = [*self._commands["edge-bridge"], *self._link(), "--json", str(self.result(name))]
         bridge = self.bridge = self._children.start(name, command, fifo_priority=BRIDGE_PRIORITY)
         self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
 
     def start_runner(self, instruction: str) -> Child:
-        """Start the runner; it arms and drives by itself (`armed`)."""
+        """Start the runner, which arms and drives by itself (see `armed`)."""
         options = self.options
         self.runs += 1
         name = f"edge-run-{self.runs}"
@@ -176,27 +179,27 @@ class Stack:
         return self.runner
 
     def armed(self) -> bool:
-        """Whether the newest runner drives, or has driven."""
+        """Return whether the newest runner drives or has driven."""
         return self.runner is not None and ARMED_LINE in _text(self.runner.log)
 
     def check(self) -> None:
-        """StepError when the robot's side or the bridge has ended by itself."""
+        """Check that robot and bridge still run. Raises StepError."""
         self._children.check_others(self.runner)
 
     def end_runner(self) -> int | None:
-        """End the runner if it still runs; its exit code, negative for a signal, None without one."""
+        """End the runner if it still runs; return its exit code, negative for a signal, None without a runner."""
         code = self._end(self.runner)
         self.runner = None
         return code
 
     def end_bridge(self) -> int | None:
-        """End the bridge likewise."""
+        """End the bridge; return its exit code as `end_runner` does."""
         code = self._end(self.bridge)
         self.bridge = None
         return code
 
     def end_robot(self) -> int | None:
-        """End the robot's side likewise; its trace is whole then."""
+        """End the simulated robot, which completes its trace; return its exit code as `end_runner` does."""
         code = self._end(self.robot)
         self.robot = None
         return code
@@ -221,7 +224,7 @@ def _robot_file(options: StackOptions) -> Path:
 
 
 def slow_robot(folder: Path, speed_limit_mps: float) -> Path:
-    """The simulated robot's file with another limit of the forward speed, in `folder`. Raises StepError."""
+    """Write the simulated robot's file with another forward speed limit into `folder`. Raises StepError."""
     line = f"vx_max_mps = {speed_limit_mps}"
     text, changed = re.subn(r"^vx_max_mps *=.*$", line, ROBOT_FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
     if changed != 1:
@@ -237,7 +240,7 @@ def _text(log: Path) -> str:
 
 @contextmanager
 def socket_dir() -> Iterator[Path]:
-    """A folder of its own with a short path: a Unix socket's path may have 107 bytes, a folder of results more."""
+    """Yield a temporary folder with a short path, because a Unix socket's path is limited to 107 bytes."""
     folder = Path(tempfile.mkdtemp(prefix="tic-"))
     try:
         yield folder
@@ -247,7 +250,7 @@ def socket_dir() -> Iterator[Path]:
 
 
 def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
-    """A DDS domain in 1..90 whose UDP ports nobody on this machine uses (RTPS: 250 ports from 7400 + 250 · domain)."""
+    """Return a DDS domain in 1..90 with unused UDP ports (RTPS: 250 ports from 7400 + 250 · domain)."""
     used: set[int] = set()
     for table in udp_tables:
         try:

@@ -1,1 +1,1 @@
-"""What every simulated robot has: the interface to the world, a battery, drifting odometry."""
+"""Simulated robots: common interface, batteries, drifting odometry."""

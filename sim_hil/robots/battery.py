@@ -1,4 +1,4 @@
-"""The simulated Go2's battery: a modelled pack that electronics and motors empty. Pure."""
+"""Battery of the simulated Go2: a modelled pack discharged by electronics and motors. Pure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOTOR_EFFICIENCY: Final = 0.7
 
 @dataclass(frozen=True)
 class BatteryReading:
-    """What the battery's own computer reports; `current_a` is above zero while it is being emptied."""
+    """Reading of the battery management; `current_a` is positive while discharging."""
 
     soc_percent: float
     voltage_v: float
@@ -29,7 +29,7 @@ class BatteryReading:
 
 
 def open_circuit_v(soc: float) -> float:
-    """Voltage of the pack without load at a charge of 0 to 1, V; linear."""
+    """Return the open-circuit voltage of the pack for a charge of 0..1, V; linear."""
     return CELLS * (CELL_EMPTY_V + soc * (CELL_FULL_V - CELL_EMPTY_V))
 
 
@@ -43,7 +43,7 @@ class Battery:
         self._charge_c = soc * CAPACITY_C
 
     def step(self, load_w: float, dt_s: float) -> BatteryReading:
-        """Take `load_w` for `dt_s`; an empty battery stays empty."""
+        """Discharge by `load_w` for `dt_s` and return the reading; an empty battery stays empty."""
         open_v = open_circuit_v(self._charge_c / CAPACITY_C)
         current_a = load_w / open_v
         self._charge_c = max(self._charge_c - current_a * dt_s, 0.0)
@@ -51,5 +51,5 @@ class Battery:
 
 
 def load_w(torque_nm: NDArray[np.float64], speed_radps: NDArray[np.float64]) -> float:
-    """What electronics and the joints' motors draw, W."""
+    """Return the power drawn by electronics and joint motors, W."""
     return ELECTRONICS_W + float(np.maximum(torque_nm * speed_radps, 0.0).sum()) / MOTOR_EFFICIENCY

@@ -1,1 +1,1 @@
-"""A scene as data: its parts, strict reading and writing, where a robot can go, and a map from above."""
+"""Scenes as data: parts, strict reading and writing, navigation grid, and a map from above."""

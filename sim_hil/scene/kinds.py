@@ -1,9 +1,8 @@
-"""What an object can be: its usual size and colour, its name in words, and the boxes that stop whoever walks into it.
+"""Kinds of scene objects: default size and colour, name for instructions, and collision boxes.
 
-A part is a box in fractions of the object's own size: depth and width run from -0.5 to 0.5 (front and left positive),
-height from 0 to 1; a turned part goes by the lesser of depth and width. What is above everybody's head (a parasol's
-cloth, a tree's crown) is no part of it. For planners and people a part counts as reaching down to the floor; the
-physics takes it as it is.
+A part is a box in fractions of the object's size: depth and width from -0.5 to 0.5 (front and left positive), height
+from 0 to 1; a rotated part uses the smaller of depth and width. Things above head height (a parasol's cloth, a tree's
+crown) have no part. Planners and people treat every part as reaching down to the floor; the physics does not.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Part:
-    """A box in fractions of an object's size (from, to, along depth, width and height), turned by `turn_rad`."""
+    """Box in fractions of an object's size: (from, to) along depth, width and height, rotated by `turn_rad`."""
 
     x: tuple[float, float] = (-0.5, 0.5)
     y: tuple[float, float] = (-0.5, 0.5)
@@ -30,22 +29,22 @@ WHOLE = (Part(),)
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of object: `size_m` and `colour` are what it gets when a scene file does not say; `words` names it."""
+    """Kind of object; `size_m` and `colour`: defaults for scene files, `words`: name for instructions."""
 
     name: str
     words: str
     size_m: Vec3  # depth, width, height
     colour: Vec3
-    parts: tuple[Part, ...] = WHOLE  # none: hangs on a wall or lies on the floor and stops nobody
+    parts: tuple[Part, ...] = WHOLE  # empty for objects on walls or flat on the floor, which are no obstacles
 
     @property
     def solid(self) -> bool:
-        """Whether it stops a robot or a person."""
+        """Whether the object is an obstacle for robots and people."""
         return bool(self.parts)
 
 
 def _round(share: float, z: tuple[float, float]) -> tuple[Part, ...]:
-    """An upright octagonal pillar of that share of the width: four boxes, each from one side to the opposite one."""
+    """Return an upright octagonal pillar, with a diameter as a share of the width, made of four boxes."""
     across, side = share / 2, share / 2 * 0.4142
     return tuple(Part((-across, across), (-side, side), z, turn) for turn in (0.0, pi / 4, pi / 2, 3 * pi / 4))
 

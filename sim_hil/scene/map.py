@@ -1,4 +1,4 @@
-"""A scene from above, as a picture: floors, walls, things, names; for reports, videos and for looking at layouts."""
+"""Map of a scene from above: floors, walls, objects, names; for reports, videos and inspection of layouts."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ _CROWNS = frozenset(("umbrella", "umbrella_table", "tree"))
 
 @dataclass(frozen=True)
 class MapView:
-    """Where the world lies in a map's picture: pixels = ((x - x0) * px_per_m, (y1 - y) * px_per_m)."""
+    """Transform from world to map pixels: ((x - x0) * px_per_m, (y1 - y) * px_per_m)."""
 
     x0_m: float
     y1_m: float
     px_per_m: float
 
     def pixel(self, point: Vec2) -> tuple[int, int]:
-        """Column and row of a point of the world, m."""
+        """Return column and row of a world point, m."""
         return (round((point[0] - self.x0_m) * self.px_per_m), round((self.y1_m - point[1]) * self.px_per_m))
 
 
 def map_view(scene: Scene, px_per_m: float) -> MapView:
-    """The view that draw_map draws; raises ValueError for a scale that is not positive."""
+    """Return the transform of `draw_map`. Raises ValueError for a scale that is not positive."""
     if not px_per_m > 0:
         raise ValueError(f"map: px_per_m must be positive, found {px_per_m}")
     return MapView(scene.floor_min_m[0] - 0.5, scene.floor_max_m[1] + 0.5, px_per_m)
 
 
 def draw_map(scene: Scene, px_per_m: float = 20.0, *, names: bool = False) -> Image:
-    """The scene from above, RGB uint8 [height, width, 3], x to the right, y up; `names` writes landmarks and areas."""
+    """Draw the scene from above, RGB uint8 [height, width, 3], x right, y up; `names`: label landmarks and areas."""
     view = map_view(scene, px_per_m)
     (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
     height, width = round((y1 - y0 + 1) * px_per_m), round((x1 - x0 + 1) * px_per_m)
@@ -91,13 +91,13 @@ def draw_map(scene: Scene, px_per_m: float = 20.0, *, names: bool = False) -> Im
 
 
 def draw_path(image: Image, view: MapView, points: Iterable[Vec2], colour: Colour, thickness: int = 2) -> None:
-    """Draw a line through points of the world into a map."""
+    """Draw a polyline of world points into a map."""
     pixels = np.array([view.pixel(point) for point in points], np.int32).reshape(-1, 1, 2)
     cv2.polylines(image, [pixels], False, colour, thickness, cv2.LINE_AA)
 
 
 def draw_mark(image: Image, view: MapView, point: Vec2, colour: Colour, radius_m: float, filled: bool = True) -> None:
-    """Draw a disc (or ring) of the world's size into a map."""
+    """Draw a disc or ring with a radius in m into a map."""
     radius = max(2, round(radius_m * view.px_per_m))
     cv2.circle(image, view.pixel(point), radius, colour, -1 if filled else 2, cv2.LINE_AA)
 
@@ -105,7 +105,7 @@ def draw_mark(image: Image, view: MapView, point: Vec2, colour: Colour, radius_m
 def draw_pose(
     image: Image, view: MapView, x: float, y: float, heading_rad: float, colour: Colour, size_m: float
 ) -> None:
-    """Draw an arrowhead for something that looks along a heading."""
+    """Draw an arrowhead at a pose into a map."""
     points = [(size_m, 0.0), (-0.6 * size_m, 0.55 * size_m), (-0.6 * size_m, -0.55 * size_m)]
     c, s = cos(heading_rad), sin(heading_rad)
     _fill(image, view, [(x + c * u - s * v, y + s * u + c * v) for u, v in points], colour)

@@ -1,7 +1,7 @@
-"""Where a robot of a given size can go in a scene: clearances, distance fields and shortest feasible paths.
+"""Navigation grid of a scene for a robot of a given size: clearances, distance fields and shortest feasible paths.
 
-Clearance is the exact distance to walls, things and the floor's edge, sampled on a grid. Distances run over the grid's
-free cells to 16 neighbours (off by at most 2.8 % before smoothing); a path is then pulled taut between them.
+Clearance is the exact distance to walls, objects and the floor's edge, sampled on a grid. Distances are computed over
+free cells with 16 neighbours (error at most 2.8 % before smoothing). A path is then shortened like a taut string.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from sim_hil.scene.terrain import Terrain
 
 Array = NDArray[np.float64]
 
-CLEARANCE_CAP_M = 2.0  # further away from everything than this makes no difference to anybody
-MAX_STEP_M = 0.06  # ground that rises by more than this within one cell is an edge: the Go2's bumps are 5 cm
-_SNAP_M = 1.0  # a start or goal inside the clearance belongs to the nearest free cell within this
-_HAIR_M = 1e-6  # so that what was itself placed at the limit is free
-# One of each pair of opposite steps to the 16 neighbours (columns, rows), and the cells that a step passes.
+CLEARANCE_CAP_M = 2.0  # largest stored clearance; larger ones are equivalent
+MAX_STEP_M = 0.06  # height difference between cells above which there is an edge; the scenes' bumps are 5 cm
+_SNAP_M = 1.0  # largest distance from a blocked start or goal to the free cell that replaces it
+_HAIR_M = 1e-6  # tolerance, so that a point placed exactly at the limit is free
+# One of each pair of opposite steps to the 16 neighbours (columns, rows), and the cells that it passes.
 _STEPS: tuple[tuple[int, int, tuple[Vec2, ...]], ...] = (
     (1, 0, ()),
     (0, 1, ()),
@@ -39,9 +39,10 @@ _STEPS: tuple[tuple[int, int, tuple[Vec2, ...]], ...] = (
 
 
 class NavGrid:
-    """The free space of a scene for something that needs `clearance_m` (its radius and a margin) around its centre.
+    """Free space of a scene for a robot that needs `clearance_m` (radius plus margin) around its centre.
 
-    `height_m`: what hangs higher does not stop it. `max_step_m`: higher steps of the ground do. Raises ValueError.
+    `height_m`: objects that begin above this height are no obstacles. `max_step_m`: higher steps of the ground are
+    obstacles. Raises ValueError.
     """
 
     def __init__(
@@ -74,12 +75,12 @@ class NavGrid:
 
     @property
     def clearances(self) -> Array:
-        """[rows, columns]: distance from each cell's centre to the nearest obstacle, m, capped; negative inside one."""
+        """Distance from each cell's centre to the nearest obstacle [rows, columns], m, capped; negative inside one."""
         return self._clearances
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """[rows, columns]: whether the robot's centre may be there."""
+        """Whether the robot's centre may be in each cell [rows, columns]."""
         return self._free
 
     def _centres(self, rows: slice, columns: slice) -> tuple[Array, Array]:
@@ -88,7 +89,7 @@ class NavGrid:
         return x[None, :], y[:, None]
 
     def _window(self, low: Vec2, high: Vec2) -> tuple[slice, slice]:
-        """Rows and columns whose cells lie between two corners."""
+        """Return the rows and columns between two corners."""
         spans = []
         for axis, limit in ((1, self.shape[0]), (0, self.shape[1])):
             first = floor((low[axis] - self.origin_m[axis]) / self.resolution_m)
@@ -112,7 +113,7 @@ class NavGrid:
         return gaps
 
     def _keep_off_edges(self, terrain: tuple[Terrain, ...], max_step_m: float) -> None:
-        """Lower the clearances around where the ground rises or drops by more than a step."""
+        """Reduce the clearances near edges, where the ground changes by more than a step."""
         if not terrain:
             return
         ground = np.zeros(self.shape)
@@ -136,56 +137,56 @@ class NavGrid:
             edge[tuple(before)] |= steep
             edge[tuple(after)] |= steep
         if edge.any():
-            # An edge lies between two cells, both of which are marked: half a cell from either centre.
+            # An edge lies between two marked cells: half a cell from either centre.
             gaps = distance_transform_edt(~edge) * self.resolution_m + 0.5 * self.resolution_m
             gaps[edge] = 0.5 * self.resolution_m
             self._clearances = np.minimum(self._clearances, gaps)
 
     def _snaps(self) -> NDArray[np.int32]:
-        """[2, rows, columns]: row and column of the free cell nearest to each."""
+        """Return row and column of the nearest free cell of each cell [2, rows, columns]."""
         nearest = distance_transform_edt(~self._free, return_distances=False, return_indices=True)
         return np.asarray(nearest, dtype=np.int32)
 
     @cached_property
     def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int64], csr_matrix]:
-        """Numbers of the free cells [rows, columns], their places [n, 2], and the steps between them [n, n]."""
+        """Ids of the free cells [rows, columns], their rows and columns [n, 2], and the graph of steps [n, n]."""
         ids, source, target, length = links(self._free, self.resolution_m)
         cells = np.argwhere(self._free)
         return ids, cells, csr_matrix((length, (source, target)), shape=(len(cells), len(cells)))
 
     def cell(self, x_m: float, y_m: float) -> tuple[int, int]:
-        """Row and column of the cell that holds a point (the nearest one for a point off the floor)."""
+        """Return row and column of the cell that contains a point (the nearest cell for a point off the floor)."""
         column = floor((x_m - self.origin_m[0]) / self.resolution_m)
         row = floor((y_m - self.origin_m[1]) / self.resolution_m)
         return min(max(row, 0), self.shape[0] - 1), min(max(column, 0), self.shape[1] - 1)
 
     def centre(self, row: int, column: int) -> Vec2:
-        """Centre of a cell, m."""
+        """Return the centre of a cell, m."""
         x = self.origin_m[0] + (column + 0.5) * self.resolution_m
         return (x, self.origin_m[1] + (row + 0.5) * self.resolution_m)
 
     def free_cell(self, x_m: float, y_m: float) -> tuple[int, int]:
-        """Row and column of the free cell nearest to a point."""
+        """Return row and column of the free cell nearest to a point."""
         row, column = self.cell(x_m, y_m)
         return int(self._nearest[0, row, column]), int(self._nearest[1, row, column])
 
     def nearest_free(self, x_m: float, y_m: float) -> Vec2 | None:
-        """The point itself when it is free, else the nearest free cell's centre within 1 m, else None."""
+        """Return the point if it is free, else the nearest free cell's centre within 1 m, else None."""
         if self.is_free(x_m, y_m):
             return (x_m, y_m)
         point = self.centre(*self.free_cell(x_m, y_m))
         return point if hypot(point[0] - x_m, point[1] - y_m) <= _SNAP_M else None
 
     def is_free(self, x_m: float, y_m: float) -> bool:
-        """Whether the robot's centre may be at a point."""
+        """Return whether the robot's centre may be at a point."""
         return self.clearance_m(x_m, y_m) >= self.required_m - _HAIR_M
 
     def clearance_m(self, x_m: float, y_m: float) -> float:
-        """Distance from a point to the nearest obstacle or floor edge, m, capped at 2 m; negative inside one."""
+        """Return the distance from a point to the nearest obstacle or floor edge, m, at most 2; negative inside."""
         return float(self.clearances_at(np.array(((x_m, y_m),)))[0])
 
     def clearances_at(self, points_m: Array) -> Array:
-        """[n, 2] -> [n]: `clearance_m` of many points."""
+        """Return `clearance_m` of many points: [n, 2] -> [n]."""
         return self._interpolate(self._clearances, points_m)
 
     def _interpolate(self, grid: Array, points_m: Array) -> Array:
@@ -200,7 +201,7 @@ class NavGrid:
         return np.asarray(np.where(outside, -1.0, low * (1 - b) + high * b))
 
     def _tree(self, goal: Vec2) -> tuple[Array, NDArray[np.int32]] | None:
-        """Distances of all free cells to the goal's, and each one's next cell; None where there is no room."""
+        """Return the distance of every free cell to the goal and its next cell; None if the goal is not free."""
         point = self.nearest_free(*goal)
         if point is None:
             return None
@@ -215,7 +216,7 @@ class NavGrid:
         return self._trees[row, column]
 
     def distance_field(self, goal: Vec2) -> Array:
-        """[rows, columns]: length of the way over free cells to the goal, m; inf where there is none."""
+        """Return the path length over free cells to the goal [rows, columns], m; inf where there is no path."""
         field = np.full(self.shape, np.inf)
         tree = self._tree(goal)
         if tree is not None:
@@ -223,7 +224,7 @@ class NavGrid:
         return field
 
     def field_at(self, field: Array, x_m: float, y_m: float) -> float:
-        """A field's value at a point, from the free cells around it; inf where there is none within 1 m."""
+        """Return a field's value at the nearest free cell of a point; inf if there is none within 1 m."""
         row, column = self.free_cell(x_m, y_m)
         cx, cy = self.centre(row, column)
         if hypot(cx - x_m, cy - y_m) > _SNAP_M:
@@ -231,7 +232,7 @@ class NavGrid:
         return float(field[row, column])
 
     def blended_at(self, field: Array, x_m: float, y_m: float) -> float:
-        """`field_at`, blended from the cells around the point that have a value, so that it changes without steps."""
+        """Return a field's value at a point, interpolated between the surrounding free cells (continuous)."""
         u = (x_m - self.origin_m[0]) / self.resolution_m - 0.5
         v = (y_m - self.origin_m[1]) / self.resolution_m - 0.5
         total = weights = 0.0
@@ -242,7 +243,7 @@ class NavGrid:
         return total / weights if weights > 0 else self.field_at(field, x_m, y_m)
 
     def path(self, start: Vec2, goal: Vec2) -> list[Vec2] | None:
-        """Points of a shortest feasible path from start to goal, both included, any angle; None where there is none."""
+        """Return the points of a shortest feasible path from start to goal, both included; None if there is none."""
         first, last, tree = self.nearest_free(*start), self.nearest_free(*goal), self._tree(goal)
         if first is None or last is None or tree is None:
             return None
@@ -260,12 +261,12 @@ class NavGrid:
         return [*([start] if first != start else []), *taut, *([goal] if last != goal else [])]
 
     def distance_m(self, start: Vec2, goal: Vec2) -> float:
-        """Length of the shortest feasible path, m; inf where there is none."""
+        """Return the length of the shortest feasible path, m; inf if there is none."""
         points = self.path(start, goal)
         return float("inf") if points is None else length_m(points)
 
     def sees(self, a: Vec2, b: Vec2) -> bool:
-        """Whether the straight way between two points is free."""
+        """Return whether the straight line between two points is free."""
         count = max(2, ceil(hypot(b[0] - a[0], b[1] - a[1]) / (0.5 * self.resolution_m)) + 1)
         share = np.linspace(0.0, 1.0, count)[:, None]
         points = np.array(a) * (1 - share) + np.array(b) * share
@@ -273,7 +274,7 @@ class NavGrid:
         return bool(np.all(self.clearances_at(points) >= self.required_m - _HAIR_M))
 
     def _pulled(self, points: list[Vec2]) -> list[Vec2]:
-        """A chain of neighbouring cells as a taut string: shortcuts, then every corner drawn in as far as it goes."""
+        """Shorten a chain of cells like a taut string: skip points, then move every corner inwards."""
         taut = self._shortened(points)
         for _ in range(6):
             before = length_m(taut)
@@ -285,11 +286,11 @@ class NavGrid:
         return taut
 
     def _shortened(self, points: list[Vec2]) -> list[Vec2]:
-        """The same way without the points that can be skipped in a straight line."""
+        """Return the path without the points that a straight free line can skip."""
         kept, at = [points[0]], 0
         while at < len(points) - 1:
             step, good = 1, 1
-            # Doubling, then halving: a way that is blocked stays blocked further on, but for odd corners.
+            # Doubling, then bisection: a blocked line usually stays blocked further on.
             while at + step < len(points) and self.sees(points[at], points[at + step]):
                 good, step = step, step * 2
             low, high = good, min(step, len(points) - at)
@@ -304,7 +305,7 @@ class NavGrid:
         return kept
 
     def _drawn(self, before: Vec2, corner: Vec2, after: Vec2) -> Vec2:
-        """The corner, moved towards the straight line between its neighbours as far as both legs stay free."""
+        """Return a corner moved towards the line between its neighbours as far as both segments stay free."""
         dx, dy = after[0] - before[0], after[1] - before[1]
         square = dx * dx + dy * dy
         if square == 0:
@@ -326,9 +327,9 @@ class NavGrid:
 def links(
     free: NDArray[np.bool_], resolution_m: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], Array]:
-    """Number the free cells and join each to its 16 neighbours: ids [rows, columns] (-1: not free), from, to, length m.
+    """Link free cells with their 16 neighbours: return ids [rows, columns] (-1: not free), from, to, length (m).
 
-    Each pair of cells is there once.
+    Each pair of cells occurs once.
     """
     ids = np.full(free.shape, -1, dtype=np.int32)
     ids[free] = np.arange(int(free.sum()), dtype=np.int32)
@@ -345,12 +346,12 @@ def links(
 
 
 def length_m(points: list[Vec2]) -> float:
-    """Length of a polyline, m."""
+    """Return the length of a polyline, m."""
     return sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(points))
 
 
 def _shifted(ids: NDArray[np.int32], rows: int, columns: int) -> NDArray[np.int32]:
-    """For each cell the id of the one so many rows and columns on; -1 off the grid."""
+    """Return for each cell the id of the cell at an offset of rows and columns; -1 off the grid."""
     out = np.full_like(ids, -1)
     height, width = ids.shape
     to_rows = slice(max(-rows, 0), height - max(rows, 0))
@@ -362,7 +363,7 @@ def _shifted(ids: NDArray[np.int32], rows: int, columns: int) -> NDArray[np.int3
 
 
 def _box_gaps(box: Box, x: Array, y: Array) -> Array:
-    """Signed distance from points to a box's outline on the floor, m; negative inside."""
+    """Return the signed distance from points to a box's outline on the floor, m; negative inside."""
     dx, dy = x - box.centre_m[0], y - box.centre_m[1]
     c, s = box.axis
     along = np.abs(dx * c + dy * s) - box.size_m[0] / 2

@@ -1,4 +1,4 @@
-"""What a scene is made of: walls, objects, floor patches, people's routes and places, named areas."""
+"""Parts of a scene: walls, objects, floor patches, routes and places of people, named areas."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ class Wall:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A thing: `position_m` is the middle of its underside, its front looks along `heading_rad`.
+    """An object; `position_m`: centre of its underside, `heading_rad`: direction of its front.
 
-    `size_m` is depth (front to back), width and height; `text` is printed on it; `landmark` is its name in words for
-    instructions ("vending machine"), empty for what no instruction speaks of.
+    `size_m`: depth (front to back), width and height; `text`: printed on it; `landmark`: its name for instructions
+    ("vending machine"), empty if no instruction may name it.
     """
 
     label: str
@@ -111,18 +111,18 @@ class SceneObject:
 
     @property
     def solid(self) -> bool:
-        """Whether it stops a robot or a person."""
+        """Whether the object is an obstacle for robots and people."""
         return self.kind in SOLID_KINDS
 
     @property
     def box(self) -> Box:
-        """Bounding box of what is seen."""
+        """Bounding box of the visible object."""
         x, y, z = self.position_m
         return Box((x, y, z + self.size_m[2] / 2), (cos(self.heading_rad), sin(self.heading_rad)), self.size_m)
 
     @property
     def boxes(self) -> tuple[Box, ...]:
-        """What stops a robot or a person: the boxes of the kind's parts, none for a flat kind."""
+        """Collision boxes from the kind's parts; none for a flat kind."""
         (x, y, z), height = self.position_m, self.size_m[2]
         made = []
         for part in KINDS[self.kind].parts:
@@ -137,9 +137,9 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Floor:
-    """A patch of floor that looks different: a convex `polygon`, m; its texture runs along `heading_rad`.
+    """Floor patch with its own texture: a convex `polygon`, m; the texture runs along `heading_rad`.
 
-    Level with the floor: it changes looks, not physics. A later patch lies over an earlier one.
+    It changes only the appearance, not the physics. Later patches cover earlier ones.
     """
 
     polygon: tuple[Vec2, ...]
@@ -154,7 +154,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class Area:
-    """A named part of the floor: `polygon` m, `name` in words ("aisle 3", "waiting room")."""
+    """A named part of the floor: `polygon`, m; `name` for instructions ("aisle 3", "waiting room")."""
 
     label: str
     kind: str
@@ -167,7 +167,7 @@ class Area:
             raise SceneError(f"area {self.label}: expected a polygon of at least three corners, found {self.polygon}")
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether the point (m) lies inside, by the even-odd rule."""
+        """Return whether a point (m) lies inside, by the even-odd rule."""
         inside = False
         for (ax, ay), (bx, by) in _edges(self.polygon):
             if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
@@ -177,10 +177,10 @@ class Area:
 
 @dataclass(frozen=True)
 class Place:
-    """Where people go: `position_m` (x, y) and the way they face there; up to `capacity` at once.
+    """Destination of people: `position_m` (x, y), heading while there, and maximum number of people (`capacity`).
 
-    stand: dwell and look; sit: on a chair or bench; queue: the first one's spot, the others behind it (against the
-    heading); door: where people enter and leave.
+    Kinds: stand; sit (chair or bench); queue (place of the first person, the others stand behind it); door (people
+    enter and leave).
     """
 
     label: str
@@ -197,7 +197,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Route:
-    """Way points, m, that a person walks to and fro."""
+    """Points, m, between which a person walks back and forth."""
 
     points_m: tuple[Vec2, ...]
 
@@ -207,18 +207,18 @@ class Route:
 
 
 def check_choice(what: str, key: str, value: str, known: Iterable[str]) -> None:
-    """Raises SceneError unless the value is one of the known ones."""
+    """Check that a value is one of the known ones. Raises SceneError."""
     if value not in known:
         raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(known))}")
 
 
 def area_m2(polygon: tuple[Vec2, ...]) -> float:
-    """Area of a polygon, whichever way round."""
+    """Return the area of a polygon in either orientation, m2."""
     return abs(sum(ax * by - bx * ay for (ax, ay), (bx, by) in _edges(polygon))) / 2
 
 
 def is_convex(polygon: tuple[Vec2, ...]) -> bool:
-    """Whether a polygon of at least three corners turns one way all round, once."""
+    """Return whether a polygon has at least three corners and is convex."""
     turned, signs = 0.0, set()
     edges = _edges(polygon)
     for (a, b), (_, c) in zip(edges, edges[1:] + edges[:1], strict=True):

@@ -1,4 +1,4 @@
-"""From the tables of a scene file to the scene's parts."""
+"""Readers from the tables of a scene file to the scene's parts; all raise SceneError."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sim_hil.scene.terrain import Terrain
 
 
 def read_wall(table: Table) -> Wall:
-    """A wall; raises SceneError."""
+    """Read a wall."""
     wall = Wall(
         label=table.text("label"),
         start_m=table.vector("start_m", 2),
@@ -23,7 +23,7 @@ def read_wall(table: Table) -> Wall:
 
 
 def read_object(table: Table) -> SceneObject:
-    """An object; size and colour default to its kind's. Raises SceneError."""
+    """Read an object; size and colour default to those of its kind."""
     label, name = table.text("label"), table.text("kind")
     check_choice(f"{table.what}: {label}", "kind", name, KINDS)
     thing = SceneObject(
@@ -41,7 +41,7 @@ def read_object(table: Table) -> SceneObject:
 
 
 def read_floor(table: Table) -> Floor:
-    """A floor patch, given by `polygon` or by the corners `min_m` and `max_m`; raises SceneError."""
+    """Read a floor patch, given by `polygon` or by the corners `min_m` and `max_m`."""
     polygon: tuple[Vec2, ...]
     if "polygon" in table:
         polygon = table.points("polygon")
@@ -56,7 +56,7 @@ def read_floor(table: Table) -> Floor:
 
 
 def read_terrain(table: Table) -> Terrain:
-    """A piece of raised ground; raises SceneError."""
+    """Read a piece of terrain."""
     terrain = Terrain(
         label=table.text("label"),
         kind=table.text("kind"),
@@ -71,14 +71,14 @@ def read_terrain(table: Table) -> Terrain:
 
 
 def read_area(table: Table) -> Area:
-    """A named area; raises SceneError."""
+    """Read a named area."""
     area = Area(table.text("label"), table.text("kind"), table.points("polygon"), table.text("name"))
     table.done()
     return area
 
 
 def read_place(table: Table) -> Place:
-    """A place where people go; raises SceneError."""
+    """Read a destination of people."""
     place = Place(
         label=table.text("label"),
         position_m=table.vector("position_m", 2),
@@ -91,7 +91,7 @@ def read_place(table: Table) -> Place:
 
 
 def read_route(table: Table) -> Route:
-    """A route; raises SceneError."""
+    """Read a route."""
     route = Route(table.points("points_m"))
     table.done()
     return route

@@ -1,4 +1,4 @@
-"""A scene as data: floor, walls, objects, terrain and where people go, read from a TOML file and checked."""
+"""A scene as data: floor, walls, objects, terrain, routes and places of people; read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SKY: Vec3 = (0.60, 0.76, 0.92)
 
 @dataclass(frozen=True)
 class Scene:
-    """A world: the robot starts at `start` (x m, y m, theta rad) and is done at `goal_xy`, m."""
+    """A static world; the robot starts at `start` (x m, y m, theta rad), its goal is `goal_xy`, m."""
 
     name: str
     start: Vec3
@@ -86,37 +86,37 @@ class Scene:
         check_choice("scene", "ceiling_texture", self.ceiling_texture, CEILING_TEXTURES)
 
     def footprints(self) -> list[Footprint]:
-        """Outlines of all walls and objects, for a top-down picture."""
+        """Return the outlines of all walls and objects, for a map."""
         outlines = [Footprint(wall.label, "wall", wall.box.corners()) for wall in self.walls]
         return outlines + [Footprint(thing.label, thing.kind, thing.box.corners()) for thing in self.objects]
 
     def obstacles(self) -> list[tuple[str, Box]]:
-        """Label and box of everything that stops a robot or a person; an object of several boxes comes several times.
+        """Return label and box of every obstacle; an object with several boxes occurs several times.
 
-        Terrain is not among them: it is walked on.
+        Terrain is not included, because robots and people walk on it.
         """
         walls = [(wall.label, wall.box) for wall in self.walls]
         return walls + [(thing.label, box) for thing in self.objects for box in thing.boxes]
 
     def terrain_pieces(self) -> list[ConvexPiece]:
-        """The terrain as convex solids for a physics engine."""
+        """Return the terrain as convex solids for a physics engine."""
         return [terrain.piece() for terrain in self.terrain]
 
     def ground_height_m(self, x: float, y: float) -> float:
-        """Height of what one stands on there, m: the highest terrain, or 0."""
+        """Return the height of the ground at a point, m: the highest terrain, or 0."""
         heights = (terrain.height_m(x, y) for terrain in self.terrain)
         return max((height for height in heights if height is not None), default=0.0)
 
     def area_at(self, x: float, y: float) -> Area | None:
-        """The first named area around a point, m; None outside all."""
+        """Return the first named area that contains a point, m; None outside all areas."""
         return next((area for area in self.areas if area.contains(x, y)), None)
 
     def landmarks(self) -> list[SceneObject]:
-        """The objects that instructions may speak of."""
+        """Return the objects that instructions may name."""
         return [thing for thing in self.objects if thing.landmark]
 
     def without(self, label: str) -> Scene:
-        """The same scene lacking one object; raises KeyError when there is none of that label."""
+        """Return the scene without one object. Raises KeyError for an unknown label."""
         rest = tuple(thing for thing in self.objects if thing.label != label)
         if len(rest) == len(self.objects):
             raise KeyError(label)
@@ -158,12 +158,12 @@ def parse_scene(text: str, source: str) -> Scene:
 
 
 def scene_names() -> list[str]:
-    """Names that load_scene knows."""
+    """Return the names of the shipped scenes."""
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
-    """Load a scene of ours by its name, or any scene by the path of its TOML file; raises SceneError."""
+    """Load a shipped scene by name, or any scene by the path of its TOML file. Raises SceneError."""
     path = SCENES / f"{name_or_path}.toml"
     if str(name_or_path) not in scene_names():
         path = Path(name_or_path)

@@ -1,4 +1,4 @@
-"""Ground that is not level: ramps, bumps, kerbs and platforms, as exact convex solids that feet and wheels go over."""
+"""Terrain: ramps, bumps, kerbs and platforms as exact convex solids."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BUMP_SEGMENTS = 12
 
 @dataclass(frozen=True)
 class ConvexPiece:
-    """A convex solid: its corners, m, in the world; what a physics engine makes a hull of."""
+    """Convex solid given by its vertices in the world, m, for a physics engine."""
 
     label: str
     vertices_m: tuple[Vec3, ...]
@@ -23,10 +23,10 @@ class ConvexPiece:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Solid ground raised by up to `rise_m` over `position_m` (middle of its underside), m.
+    """Solid ground, up to `rise_m` above `position_m` (centre of its underside), m.
 
-    `size_m` is its length along `heading_rad` and its width. A ramp rises from its back to its front, where it drops
-    off; a bump swells and falls like half a sine wave along its length; kerbs and platforms are level on top.
+    `size_m`: length along `heading_rad`, and width. A ramp rises from its back to its front, where it drops off; a bump
+    follows half a sine wave along its length; kerbs and platforms are flat.
     """
 
     label: str

@@ -1,1 +1,1 @@
-"""The simulated world: a robot and people under physics, and the pictures of the robot's camera."""
+"""Simulated world: a robot and people under physics, and the images of the robot's camera."""

@@ -1,4 +1,4 @@
-"""The robot's forward camera: the scene and its people in a renderer of their own, posed from a render state."""
+"""Forward camera of the robot: renders the scene and its people from a render state."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from sim_hil.world.wall_visibility import Sight, Visibility
 
 Array = NDArray[np.float64]
 
-# Where the Go2's front camera sits on the base, and how it looks (the real one: wide, nearly level, at the nose).
+# Pose and field of view of the Go2's front camera on the base (the real one: wide, nearly level, at the nose).
 CAMERA_POSITION_M = (0.327, 0.0, 0.043)
 CAMERA_PITCH_RAD = radians(2.0)  # downwards
 CAMERA_HFOV_RAD = radians(100.0)
 
-_PERSON_M: Final = 0.9  # anything of a person is within this of the point between the feet
-_FAR_PERSON_M: Final = 45.0  # a pixel or two high at 128 x 128: left out
-_NEAR_PERSON_M: Final = 6.0  # with all details up to here, simpler from there on
+_PERSON_M: Final = 0.9  # radius of a person's body around the point between the feet
+_FAR_PERSON_M: Final = 45.0  # people beyond this are not rendered (1 to 2 px at 128 x 128)
+_NEAR_PERSON_M: Final = 6.0  # people beyond this are rendered with less detail
 _UPRIGHT: Final = 0.9
 
 
 @dataclass(frozen=True)
 class Mount:
-    """A robot's camera: its place on the base, m, its pitch (downwards) and field of view across, rad.
+    """Camera of a robot: position on the base, m; pitch (downwards) and horizontal field of view, rad.
 
-    `fields` is how many numbers of a render state are the robot's.
+    `fields`: length of the robot's part of a render state.
     """
 
     position_m: tuple[float, float, float]
@@ -55,9 +55,9 @@ MOUNTS: Final = {
 
 
 class CameraWorld:
-    """Renders what the robot's camera sees. Build it in a process of its own for real time.
+    """Renderer of the robot's camera; for real time, use it in a separate process.
 
-    `looks` are the people's appearances; without them those of the seed. Raises ValueError on an unknown robot.
+    `looks`: the people's appearances; default: those of the seed. Raises ValueError for an unknown robot.
     """
 
     def __init__(
@@ -84,13 +84,13 @@ class CameraWorld:
 
     @property
     def state_size(self) -> int:
-        """Length of the render state this world takes."""
+        """Length of this world's render state."""
         return self._mount.fields + RENDER_FIELDS * len(self._looks)
 
     def render(self, render_state: Array, width: int, height: int, aspect: float | None = None) -> Picture:
-        """The forward camera's picture, uint8 RGB [height, width, 3]. Raises ValueError on a state of another world.
+        """Render the forward camera's image, uint8 RGB [height, width, 3]. Raises ValueError for a bad state.
 
-        `aspect` squeezes the field of view of a picture of that shape into this one's; without it pixels are square.
+        `aspect`: aspect ratio of the field of view, which is scaled to the image's size; None: square pixels.
         """
         self._check(render_state)
         mount = self._mount
@@ -110,7 +110,7 @@ class CameraWorld:
         self, render_state: Array, eye_m: tuple[float, float, float], target_m: tuple[float, float, float],
         width: int, height: int, hfov_rad: float = radians(70.0),
     ) -> Picture:  # fmt: skip
-        """The world, robot included, from anywhere: for reports and for looking at the simulation itself."""
+        """Render the world and the robot from any viewpoint, for reports and inspection."""
         self._check(render_state)
         if self._robot is None:
             self._robot = RobotBody(self._renderer, self._robot_name)
@@ -120,7 +120,7 @@ class CameraWorld:
         forward /= np.linalg.norm(forward)
         self._renderer.arrange(self._fixed, self._fixed)
         self._show_people(render_state, eye, None)
-        # Straight down there is no up to hold on to but north.
+        # When looking straight down, north is up.
         up = np.array((0.0, 0.0, 1.0) if abs(forward[2]) < 0.999 else (0.0, 1.0, 0.0))
         return self._renderer.picture(eye, forward, up, hfov_rad, width, height, width / height)
 
@@ -129,15 +129,15 @@ class CameraWorld:
             raise ValueError(f"render state has shape {state.shape}, this world takes ({self.state_size},)")
 
     def _sight(self, eye: Array, forward: Array, up: Array, hfov_rad: float) -> Sight | None:
-        """What the robot has in view; None when it lies on its side or looks steeply up or down."""
+        """Return the robot's view cone; None if it lies on its side or looks steeply up or down."""
         flat = float(np.hypot(forward[0], forward[1]))
         if up[2] < _UPRIGHT or flat < _UPRIGHT:
             return None
-        # A camera that is tilted sees a little further to the sides than its angle says.
+        # A tilted camera's view is slightly wider on the floor than its field of view.
         return self._visibility.look(eye[:2], forward[:2] / flat, tan(hfov_rad / 2) / (flat * float(up[2])))
 
     def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
-        """Pose those who may be in the picture and take all others out of it."""
+        """Pose the people who may be visible and hide all others."""
         rows = state[self._mount.fields :].reshape(len(self._looks), RENDER_FIELDS)
         before, self._shown = self._shown, {}
         if len(rows):

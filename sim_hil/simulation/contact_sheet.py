@@ -1,4 +1,4 @@
-"""Contact sheets: what every kind of object looks like from a robot's height, or what a robot sees around a scene."""
+"""Contact sheets: every kind of object from a robot's height, or a robot's views in a scene."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _HUNG_M = {"window": 1.0, "notice_board": 1.0, "whiteboard": 0.9, "screen": 1.2,
 
 @dataclass(frozen=True)
 class View:
-    """One picture of a sheet: a name, where from, and the heading."""
+    """One image of a sheet: name, viewpoint and heading."""
 
     name: str
     eye_m: tuple[float, float, float]
@@ -39,7 +39,7 @@ class View:
 
 
 def showroom(kind: Kind) -> Scene:
-    """A scene with one object of that kind at the origin; what hangs has a wall behind it."""
+    """Return a scene with one object of a kind at the origin, with a wall behind flat objects."""
     z = _HUNG_M.get(kind.name, 0.0)
     thing = SceneObject(
         "it", kind.name, (0.0, 0.0, z), 0.0, kind.size_m, kind.colour, _TEXTS.get(kind.name, ""), kind.words
@@ -55,17 +55,17 @@ def showroom(kind: Kind) -> Scene:
 
 
 def view_of(kind: Kind) -> View:
-    """From a robot's height, so far away that the object fills most of a 16:9 picture of 100 degrees."""
+    """Return a viewpoint at a robot's height from which the object fills most of a 16:9 image of 100 degrees."""
     depth, width, height = kind.size_m
     top = _HUNG_M.get(kind.name, 0.0) + height
-    # From the front and a little aside, so that its sides show too.
+    # From the front and slightly aside, so that the sides are visible.
     gap = max(0.62 * width, 1.7 * (top - EYE_M), 0.6 * depth, 0.7) + depth / 2
     turn = radians(28.0 if kind.solid else 15.0)
     return View(kind.name, (gap * cos(turn), gap * sin(turn), EYE_M), turn + pi)
 
 
 def kinds_sheet(names: Sequence[str], columns: int, width: int, height: int) -> Image:
-    """One tile a kind, named."""
+    """Render one named tile per kind."""
     tiles = []
     for name in names:
         with _shown(showroom(KINDS[name])) as renderer:
@@ -74,7 +74,7 @@ def kinds_sheet(names: Sequence[str], columns: int, width: int, height: int) -> 
 
 
 def scene_views(scene: Scene, count: int) -> Iterator[View]:
-    """From the start, then towards each landmark from where it is seen well, then from the middle of named areas."""
+    """Return viewpoints: the start, then well-visible views of each landmark, then the centres of named areas."""
     yield View("start", (*scene.start[:2], EYE_M + scene.ground_height_m(*scene.start[:2])), scene.start[2])
     picked: list[View] = []
     for thing in scene.landmarks():
@@ -102,7 +102,7 @@ def scene_views(scene: Scene, count: int) -> Iterator[View]:
 
 
 def scene_sheet(scene: Scene, count: int, columns: int, width: int, height: int) -> Image:
-    """Views of a scene as a robot has them; square pictures are squeezed, as a policy's input is."""
+    """Render a robot's views of a scene; square images are scaled like a policy's input."""
     with _shown(scene) as renderer:
         tiles = [_tile(renderer, view, width, height, 16 / 9) for view in scene_views(scene, count)]
     return _tiled(tiles, columns)
@@ -152,7 +152,7 @@ def _tiled(tiles: list[Image], columns: int) -> Image:
 
 @command_line("world_sheet")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m sim_hil.simulation.contact_sheet",
         description="Picture of every kind of object, or of a scene, as a robot sees it (0.36 m high, 100 degrees).",

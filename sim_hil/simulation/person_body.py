@@ -1,4 +1,4 @@
-"""One person on a stage: the meshes of a look, put into the posture of a render row."""
+"""Body of one person on a stage: meshes for an appearance, posed from a render row."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SIDES = (-1.0, 1.0)  # right, left
 
 
 class PersonBody:
-    """One person's meshes on a stage, put in place by `pose`.
+    """Meshes of one person on a stage, placed by `pose`.
 
-    `detail` below 1 is for people seen from afar: fewer faces, and of the limbs only the legs move.
+    `detail` below 1 is for distant people: fewer faces, and only the legs move.
     """
 
     def __init__(self, stage: Stage, look: Appearance, detail: float = 1.0) -> None:
@@ -94,7 +94,7 @@ class PersonBody:
             put(self._tail, 0.0, 0.0, hips, 0.5 * (body.thighs[0] + body.thighs[1]))
 
     def hide(self) -> None:
-        """Take the body out of every picture until the next `pose`."""
+        """Hide the body until the next `pose`."""
         moving = (*self._thighs, *self._shins, *self._upper_arms, *self._forearms, self._trunk, self._head, self._tail)
         for part in moving:
             if part >= 0:

@@ -1,4 +1,4 @@
-"""How a person's limbs are held: walking, standing, sitting, talking, on the phone; angles from a render row.
+"""Posture of a person's limbs from a render row: walking, standing, sitting, talking, on the phone.
 
 Angles are pitches about the body's left axis, rad: positive tips what hangs down backwards and what stands up forwards.
 """
@@ -31,7 +31,7 @@ class Limbs:
 
 
 def limbs(phase: float, swing: float, sitting: float, gesture: int) -> Limbs:
-    """The posture for a gait phase 0..1, a swing (step length by that of a brisk walk), sitting 0..1 and a gesture."""
+    """Return the posture for a gait phase 0..1, a swing (relative step length), sitting 0..1 and a gesture."""
     right, left = _leg(phase, swing), _leg((phase + 0.5) % 1.0, swing)
     thighs = tuple(hip + (_SEATED_THIGH_RAD - hip) * sitting for hip, _ in (right, left))
     shins = tuple((hip + knee) * (1.0 - sitting) for hip, knee in (right, left))
@@ -50,8 +50,8 @@ def limbs(phase: float, swing: float, sitting: float, gesture: int) -> Limbs:
 
 
 def _leg(phase: float, swing: float) -> tuple[float, float]:
-    """Hip pitch and knee bend of one leg whose foot touches down at phase 0."""
-    # On the ground the foot goes back as fast as the body goes on: it does not slide.
+    """Return hip pitch and knee bend of a leg whose foot touches down at phase 0."""
+    # During stance the foot moves backwards at the body's speed, so it does not slide.
     most = asin(min(_STANCE * _FULL_STEP_M * swing / (THIGH_M + SHIN_M), 0.9))
     if phase < _STANCE:
         share = phase / _STANCE

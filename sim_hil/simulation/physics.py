@@ -1,4 +1,4 @@
-"""The simulated world: a robot under physics, ground, static things, people. No clock, protocol or thread inside."""
+"""Simulated world: a robot under physics, ground, static objects, people. No clock, protocol or thread inside."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ from sim_hil.world.scene_meshes import build_scene
 __all__ = ["PERSON_COLLISION_M", "ROBOTS", "RobotTruth", "Simulation", "SimulationClosedError", "SportAction"]
 
 PERSON_COLLISION_M = 0.5  # DynaNav: a person within 0.5 m of the robot counts as a collision
-_CONTACT_S = 0.01  # how often contacts are looked at: they last longer than this
-_NEAR_M = 2.5  # people this close have a body that can be walked into; the others only a place
-_MAX_BODIES = 24  # more people do not fit into that circle
-_TOUCHING_S = 0.1
-_SHARED = 16  # boxes in one body: as many as the engine takes
-_BLOCK_M = 8.0  # boxes this close to each other count as neighbours
-_SETTLE_S = 6.0  # what a robot may take to get ready before it counts as broken
-_FOOTING: Final = 0.9  # friction of what is walked on
+_CONTACT_S = 0.01  # period of the contact check; contacts last longer
+_NEAR_M = 2.5  # people within this distance of the robot have a physical body
+_MAX_BODIES = 24  # maximum number of people within that distance
+_TOUCHING_S = 0.1  # time for which a contact counts as current
+_SHARED = 16  # boxes per body, the engine's maximum
+_BLOCK_M = 8.0  # distance within which boxes share a body
+_SETTLE_S = 6.0  # timeout for a robot to get ready
+_FOOTING: Final = 0.9  # friction of the ground
 # Slippery sides: with friction, a foot that brushes a wall climbs it and the robot topples over its own leg.
 _SIDES: Final = 0.1
 
 ROBOTS: Final[Mapping[str, str]] = MappingProxyType(
     {"go2": "sim_hil.robots.go2.body:Go2", "carter": "sim_hil.robots.carter.body:Carter"}
 )
-"""Robots that a simulation can hold: name -> module and class."""
+"""Available robots: name -> module and class."""
 
 
 class SimulationClosedError(RuntimeError):
-    """The physics is gone: somebody closed its window, or the simulation was closed."""
+    """The physics client no longer exists: its window or the simulation was closed."""
 
 
 class Simulation:
-    """One deterministic world: the same scene, people, seed, rate and calls give the same motion, step for step.
+    """Deterministic world: the same scene, people, seed, rate and calls give the same motion, step for step.
 
-    `start` (x m, y m, heading rad) takes the place of the scene's. With `gui` the physics shows in a window (needs a
-    display). Raises ValueError for an unknown robot, or when the scene has no room or no routes for that many people.
+    `start` (x m, y m, heading rad) replaces the scene's. `gui` shows the physics in a window (needs a display). Raises
+    ValueError for an unknown robot, or if the scene has no room or no routes for that many people.
     """
 
     DT_S = 0.002  # of the default rate, which real time runs at
@@ -89,9 +89,9 @@ class Simulation:
         self._contacts: dict[str, int] = {}  # the same without those who were only near
         self._fell = False
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        """pybullet's number of this world, its `physicsClientId`."""
+        """PyBullet's `physicsClientId` of this world."""
         try:
-            # The engine reads its files while building: afterwards even a killed run leaves none behind.
+            # The engine reads its files while building; they are removed at once, so a killed run leaves none.
             with TemporaryDirectory(prefix="edge-sim-") as folder:
                 self._build(self.scene, Path(folder), robot)
         except BaseException:
@@ -153,7 +153,7 @@ class Simulation:
         return self._immovable(shape, box.centre_m, turn, friction)
 
     def _obstacles(self, boxes: list[tuple[str, Box]]) -> dict[int, list[tuple[str, Box]]]:
-        """Make bodies of the boxes, neighbours sharing one: every body costs time in every step."""
+        """Create bodies from boxes; neighbouring boxes share a body, because every body costs time in every step."""
         ordered = sorted(boxes, key=lambda item: (item[1].centre_m[0] // _BLOCK_M, item[1].centre_m[1] // _BLOCK_M))
         solids = {}
         for first in range(0, len(ordered), _SHARED):
@@ -205,7 +205,7 @@ class Simulation:
         return (self._aside[0] + slot, self._aside[1], PERSON_HEIGHT_M / 2)
 
     def _place_people(self) -> None:
-        """Show everybody in the window, and give those near the robot a body."""
+        """Show all people in the window, and give those near the robot a physical body."""
         if self._looks:
             for look, row in zip(self._looks, self._walkers.render_rows(), strict=False):
                 look.pose(row)
@@ -227,9 +227,9 @@ class Simulation:
         return (x, y, PERSON_HEIGHT_M / 2 + self.scene.ground_height_m(x, y))
 
     def settle(self) -> None:
-        """Let the robot get ready to move, while nobody else moves. Raises RuntimeError when it does not.
+        """Let the robot get ready to move while people stand still. Raises RuntimeError on a timeout.
 
-        Takes simulated time, which `time_s` shows; what it touches meanwhile does not count.
+        It advances `time_s`; contacts meanwhile do not count.
         """
         self._robot.stand()
         for _ in range(round(_SETTLE_S * self.rate_hz)):
@@ -241,7 +241,7 @@ class Simulation:
         raise RuntimeError(f"simulation: the robot was not ready to move within {_SETTLE_S} s of its start")
 
     def step(self) -> None:
-        """Advance the world by dt_s. Raises SimulationClosedError when the physics is gone."""
+        """Advance the world by dt_s. Raises SimulationClosedError if the physics client no longer exists."""
         try:
             if self._walkers_due() and len(self._walkers):
                 (x, y, _), heading = self._robot.pose()
@@ -253,7 +253,7 @@ class Simulation:
             raise self._explained(error) from error
 
     def _walkers_due(self) -> bool:
-        """Whether people's own rate, which need not divide this one, has a step here."""
+        """Return whether people move in this step; their rate need not divide the physics rate."""
         return self._steps * UPDATE_HZ // self.rate_hz != (self._steps - 1) * UPDATE_HZ // self.rate_hz
 
     def _physics(self) -> None:
@@ -275,7 +275,7 @@ class Simulation:
     def _watch(self) -> None:
         labels = set()
         for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self.client):
-            # The engine also lists what is about to touch, up to 2 cm away.
+            # The engine also lists objects that are up to 2 cm away.
             if contact[9] > 0.0 or contact[8] < 0.0:
                 if contact[2] in self._is_person:
                     labels.add("person")
@@ -292,34 +292,34 @@ class Simulation:
 
     @property
     def robot(self) -> Robot:
-        """The robot, for what only its own protocol asks of it."""
+        """The robot, for functions that only its own protocol needs."""
         return self._robot
 
     @property
     def time_s(self) -> float:
-        """Simulated time since the world was made."""
+        """Simulated time since the world was created, s."""
         return self._steps * self.dt_s
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Command a body-frame velocity, in force for 1 s of simulation time; ignored unless the robot is ready."""
+        """Command a body-frame velocity, valid for 1 s of simulation time; ignored unless the robot is ready."""
         self._robot.command(vx_mps, vy_mps, wz_radps)
 
     def sport(self, action: SportAction) -> int:
-        """Ask a Go2's sport controller for an action; 0, or a Unitree error code when the posture does not allow it.
+        """Request an action of a Go2's sport controller; return 0 or a Unitree error code.
 
-        Raises ValueError for a robot that has none.
+        Raises ValueError for a robot without sport controller.
         """
         if not isinstance(self._robot, Go2):
             raise ValueError(f"simulation: sport actions are the Go2's, this robot is a {type(self._robot).__name__}")
         return self._robot.sport.request(action)
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """`command` by the name that the Go2's sport service gives it."""
+        """Alias of `command` with the name of the Go2's sport service."""
         self.command(vx_mps, vy_mps, wz_radps)
 
     @property
     def commanded(self) -> tuple[float, float, float]:
-        """The velocity command in force in the robot: zero when it may not move, or its last command has expired."""
+        """Velocity command in force; zero if the robot may not move or the last command has expired."""
         if isinstance(self._robot, Go2):
             return self._robot.sport.commanded
         return self._robot.truth(self.time_s).commanded
@@ -332,33 +332,33 @@ class Simulation:
             raise self._explained(error) from error
 
     def pose(self) -> tuple[tuple[float, float, float], float]:
-        """Base position, m, and heading, rad: the part of `truth` that costs nothing."""
+        """Return base position, m, and heading, rad; cheaper than `truth`."""
         return self._robot.pose()
 
     def people(self) -> NDArray[np.float64]:
-        """[n, 3]: x m, y m, heading rad of every person."""
+        """Return the pose of every person [n, 3]: x m, y m, heading rad."""
         return self._people.copy()
 
     def people_velocities(self) -> NDArray[np.float64]:
-        """[n, 2]: velocity of every person in the world frame, m/s."""
+        """Return the velocity of every person [n, 2] in the world frame, m/s."""
         return self._walkers.velocities()
 
     def collided_with(self) -> set[str]:
-        """Labels of what the robot has touched so far; "person" also for one within 0.5 m, centre to centre."""
+        """Return the labels touched so far; "person" also counts one within 0.5 m, centre to centre."""
         return set(self._touched)
 
     @property
     def touching(self) -> frozenset[str]:
-        """The same for the last 0.1 s: legs that push against something touch it on and off."""
+        """Labels touched within the last 0.1 s, because legs make intermittent contact."""
         return self._lately(self._touched)
 
     def contacts(self) -> set[str]:
-        """Labels of what the robot has had contact with so far: what it could feel; nobody for being near."""
+        """Return the labels of physical contacts so far, without people who were only near."""
         return set(self._contacts)
 
     @property
     def in_contact(self) -> frozenset[str]:
-        """The same for the last 0.1 s."""
+        """Labels of physical contacts within the last 0.1 s."""
         return self._lately(self._contacts)
 
     def _lately(self, steps: dict[str, int]) -> frozenset[str]:
@@ -371,7 +371,7 @@ class Simulation:
         return self._fell
 
     def render_state(self) -> NDArray[np.float64]:
-        """[fields of the robot + RENDER_FIELDS n]: the robot's render_state, then every person's row."""
+        """Return the render state [robot fields + RENDER_FIELDS n]: the robot's, then every person's row."""
         robot = np.array(self._robot.render_state())
         return np.concatenate((robot, self._walkers.render_rows().reshape(len(self._walkers) * RENDER_FIELDS)))
 
@@ -384,7 +384,7 @@ class Simulation:
 
 
 def _nearest_label(boxes: list[tuple[str, Box]], point: tuple[float, float, float]) -> str:
-    """Label of the box whose surface is nearest to a point, or that holds it."""
+    """Return the label of the box that contains a point or whose surface is nearest to it."""
 
     def gap_m(box: Box) -> float:
         dx, dy, dz = (p - c for p, c in zip(point, box.centre_m, strict=True))

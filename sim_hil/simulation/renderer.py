@@ -1,7 +1,7 @@
-"""The camera's renderer: Panda3D's software rasteriser, which needs no display and no graphics card.
+"""Renderer of the camera: Panda3D's software rasteriser, which needs no display and no graphics card.
 
-Light does not move: it is worked into the vertices' colours when a mesh is added, and drawing is only transforming and
-filling. What lies outside the field of view is left out mesh by mesh, so add a large scene in pieces.
+Light is static and computed into the vertex colours when a mesh is added. Meshes outside the field of view are skipped,
+so a large scene should be added in pieces.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from sim_hil.world.drawing.textures import Image
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-NEAR_M: Final = 0.03  # the nose may touch a wall, which must still be seen
+NEAR_M: Final = 0.03  # near plane; small, because the robot's nose may touch a wall
 # Far away: the rasteriser interpolates textures by depth-buffer values, which bends them where the far plane is near.
 FAR_M: Final = 10_000.0
-_SUN: Final = np.array((-3.0, 2.0, 6.0)) / 7.0  # where light comes from
+_SUN: Final = np.array((-3.0, 2.0, 6.0)) / 7.0  # direction of the light source
 _AMBIENT, _DIFFUSE = 0.72, 0.36
 _MAX_TEXTURE_PX: Final = 512
 _SAMPLES: Final = 2  # each way: smooth edges keep far things recognisable
-_SAMPLED_PX: Final = 640 * 360  # larger pictures are drawn as they are
+_SAMPLED_PX: Final = 640 * 360  # larger images are drawn without supersampling
 
 core.load_prc_file_data(
     "sim_hil",
     "load-display p3tinydisplay\nwindow-type offscreen\naudio-library-name null\nnotify-level error\n"
-    # Poses change every frame: caching what follows from them costs more than working it out.
+    # Poses change in every frame, so caching values derived from them costs more than recomputing.
     "transform-cache 0\ngarbage-collect-states 0\n",
 )
 
@@ -44,9 +44,9 @@ class RendererError(RuntimeError):
 
 
 class Renderer:
-    """A stage that takes pictures of itself; `sky` is the background, RGB 0..1. Not to be shared between threads.
+    """Stage that renders images; `sky`: background, RGB 0..1. Not thread-safe.
 
-    `smooth` edges mix the colours on both sides; without it every pixel has the colour of one thing.
+    `smooth`: antialiased edges; without it every pixel has the colour of one object.
     """
 
     def __init__(self, sky: Vec3, *, smooth: bool = True) -> None:
@@ -81,7 +81,7 @@ class Renderer:
         return len(self._nodes) - 1
 
     def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
-        """Put a mesh's origin there, turned so; shows it again when it was hidden."""
+        """Set a mesh's pose; shows it again if it was hidden."""
         node = self._nodes[handle]
         x, y, z, w = quaternion_xyzw
         node.set_pos_quat(core.LPoint3(*position_m), core.LQuaternion(w, x, y, z))
@@ -89,11 +89,11 @@ class Renderer:
             node.unstash()
 
     def hide(self, handle: int) -> None:
-        """Take a mesh out of every picture until it is placed."""
+        """Hide a mesh until it is placed again."""
         self._nodes[handle].stash()
 
     def arrange(self, fixed: Sequence[int], shown: Sequence[int]) -> None:
-        """Of the meshes `fixed`, show these alone and draw them in this order: nearest first fills pixels once."""
+        """Show only these of the meshes `fixed`, drawn in this order; nearest first avoids overdraw."""
         if list(shown) == self._arranged:
             return
         for handle in self._arranged or fixed:
@@ -105,9 +105,9 @@ class Renderer:
     def picture(
         self, eye_m: Array, forward: Array, up: Array, hfov_rad: float, width: int, height: int, aspect: float
     ) -> Picture:
-        """What is seen from `eye_m` along `forward`, uint8 RGB [height, width, 3].
+        """Render the view from `eye_m` along `forward`, uint8 RGB [height, width, 3].
 
-        `hfov_rad` is the angle across; `aspect` is the width of what is seen by its height, whatever the picture's.
+        `hfov_rad`: horizontal field of view; `aspect`: aspect ratio of the view, which may differ from the image's.
         """
         right = np.cross(forward, up)
         right /= np.linalg.norm(right)
@@ -132,7 +132,7 @@ class Renderer:
         self._root.remove_node()
 
     def _draw(self, width: int, height: int) -> Picture:
-        """BGRA, bottom row first, in memory that the next picture overwrites."""
+        """Return the image as BGRA, bottom row first, in memory that the next image overwrites."""
         view = self._views.get((width, height))
         if view is None:
             view = self._views[width, height] = self._view(width, height)
@@ -176,7 +176,7 @@ class Renderer:
 
 
 def _power_of_two(size: int) -> int:
-    """The size that the rasteriser takes, nearest to one."""
+    """Return the nearest size that the rasteriser supports."""
     return int(min(2 ** max(round(log2(size)), 3), _MAX_TEXTURE_PX))
 
 

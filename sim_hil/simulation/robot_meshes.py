@@ -1,4 +1,4 @@
-"""A robot on a stage, for views from outside: the shapes of its own description, moved as its joints move."""
+"""Robot on a stage for outside views: the visual shapes of its URDF, moved with its joints."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Shape:
 
 
 class RobotBody:
-    """The robot's visual shapes as meshes. The kinematics is PyBullet's, in a client of its own without a world."""
+    """Visual shapes of the robot as meshes; a separate PyBullet client without a world computes the kinematics."""
 
     def __init__(self, stage: Stage, robot: str) -> None:
         self._stage = stage
@@ -62,7 +62,7 @@ class RobotBody:
         return _Shape(link, offset, turn, self._stage.add(mesh))
 
     def pose(self, state: Array) -> None:
-        """Show it as a render state says."""
+        """Show the robot in a render state."""
         self._place(self._client, self._body, self._joints, state)
         # The base's pose is that of its centre of mass; shapes are given in the links' frames.
         centre = pybullet.getDynamicsInfo(self._body, -1, physicsClientId=self._client)[3:5]
@@ -76,7 +76,7 @@ class RobotBody:
             self._stage.place(shape.handle, position, turn)
 
     def hide(self) -> None:
-        """Take it out of every picture."""
+        """Hide the robot."""
         for shape in self._shapes:
             self._stage.hide(shape.handle)
 

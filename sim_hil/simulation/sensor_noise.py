@@ -1,4 +1,4 @@
-"""Noise of a camera's sensor: no two pictures of a real camera are alike, and a renderer's are."""
+"""Noise of a camera sensor: consecutive images of a real camera always differ, rendered ones do not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SIGMA_LEVELS: Final = 1.5  # our choice, of 256 grey levels: a well-lit picture
 
 
 class SensorNoise:
-    """Adds Gaussian noise to pictures of one size, drawn once and then shifted: drawing costs milliseconds."""
+    """Gaussian noise for images of one size; drawn once and then shifted, because drawing takes milliseconds."""
 
     def __init__(self, width: int, height: int, seed: int) -> None:
         """`width`, `height` of the pictures, pixels."""
@@ -20,7 +20,7 @@ class SensorNoise:
         self._noise = np.rint(drawn).astype(np.int16)
 
     def add(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture [h, w, 3] with noise of its own."""
+        """Return the image [h, w, 3] with new noise."""
         height, width = rgb.shape[:2]
         y, x = self._rng.integers(0, (height, width))
         noise = self._noise[y : y + height, x : x + width]

@@ -1,1 +1,1 @@
-"""`edge-soak`: drives for hours in real time with random faults, and judges what it has measured."""
+"""`edge-soak`: drive for hours in real time with random faults, and judge the measurements against a budget."""

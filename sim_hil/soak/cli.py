@@ -1,4 +1,4 @@
-"""`edge-soak`: drives for hours in real time, task after task with random faults, and judges what it has measured."""
+"""`edge-soak`: drive task after task for hours in real time with random faults, and judge the measurements."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
-from sim_hil.hil.command import stop_signals
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
@@ -40,8 +40,8 @@ from sim_hil.soak.verdict.moments import keep_moments
 MODES: Final = ("async", "sync", "no-reasoning")
 PLAIN_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
-"""Untrained weights drive into walls. Below 0.2 m/s (edge.odometry.gate) that does not end the run for good, so that
-the runner lives long enough to show whether it grows."""
+"""Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
+not end the run, so that the growth of the runner can be measured."""
 _UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 EXAMPLES = """examples:
@@ -50,45 +50,62 @@ EXAMPLES = """examples:
   edge-soak --artifacts out/nano --duration 8h --out out/night --resume      # with the same options, after a kill
   edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
 
-A leg is one stack (edge-hil, edge-bridge, edge-run) in one scene; within it the runner goes on from task to task.
-The default budget and faults: sim_hil/soak/verdict/budget.toml and faults.toml; copy and change them.
-exit codes: 0 the budget is kept, 1 it is not, a line of it is undecided or nothing could be run, 2 bad arguments or
-            input, 3 refused (artifacts), 130 interrupted (the report of what there is is written)
+A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
+Default budget and faults: sim_hil/soak/verdict/budget.toml and sim_hil/soak/drive/faults.toml; copy and change them.
+exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
+            3 refused (artifacts), 130 interrupted (a report of the finished part is written)
 """
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "edge-soak", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
-    p.add_argument("--duration", type=parse_seconds, required=True, metavar="T", help="such as 90s, 10m, 1h or 1d")
-    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="samples, legs, result.json, report.html")
-    p.add_argument("--faults", default="default", metavar="FILE|none", help="what may happen (default: the package's)")
-    p.add_argument("--budget", type=Path, metavar="FILE", help="what it is judged by (default: the package's)")
-    p.add_argument("--scene", action="append", metavar="NAME|FILE", help="default hospital; repeated: leg by leg")
+    p.add_argument(
+        "--duration", type=parse_seconds, required=True, metavar="T", help="total time, such as 90s, 10m, 1h or 1d"
+    )
+    p.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="directory for samples, legs, result.json and report.html",
+    )
+    p.add_argument("--faults", default="default", metavar="FILE|none", help="fault menu (default: the package's)")
+    p.add_argument("--budget", type=Path, metavar="FILE", help="budget file (default: the package's)")
+    p.add_argument(
+        "--scene",
+        action="append",
+        metavar="NAME|FILE",
+        help="scene (default hospital); if repeated, one per leg in turn",
+    )
     p.add_argument("--people", type=int, default=6, metavar="N", help="walking people (default 6)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="of tasks, people and faults (default 0)")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="random seed of tasks, people and faults (default 0)"
+    )
     p.add_argument("--leg", type=parse_seconds, default=1200.0, metavar="T", help="length of a leg (default 20m)")
-    p.add_argument("--mode", choices=MODES, default="async", help="of edge-run (default async)")
-    p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="of edge-run (default 0)")
-    p.add_argument("--odometry-noise", choices=tuple(LEVELS), default="none", help="of edge-hil (default none)")
+    p.add_argument("--mode", choices=MODES, default="async", help="reasoning mode of edge-run (default async)")
+    p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="release delay of edge-run (default 0)")
+    p.add_argument(
+        "--odometry-noise", choices=tuple(LEVELS), default="none", help="odometry drift in edge-hil (default none)"
+    )
     p.add_argument(
         "--speed-limit",
         type=float,
         metavar="MPS",
-        help=f"forward (default: the robot file's; untrained: {UNTRAINED_MPS})",
+        help=f"forward speed limit (default: the robot file's; untrained weights: {UNTRAINED_MPS})",
     )
-    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: one that is free)")
+    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
     p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
-    p.add_argument("--resume", action="store_true", help="continue the soak in --out with the time that is left")
+    p.add_argument("--resume", action="store_true", help="continue the soak in --out for the remaining time")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds of a text such as 90s, 10m, 1.5h, 1d or 90; raises argparse.ArgumentTypeError."""
+    """Parse a time such as 90s, 10m, 1.5h, 1d or 90 to seconds. Raises argparse.ArgumentTypeError."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text, re.ASCII)
     if match is None:
         raise argparse.ArgumentTypeError(f"expected a time such as 90s, 10m or 1h, found {text!r}")
@@ -97,7 +114,7 @@ def parse_seconds(text: str) -> float:
 
 @command_line("edge-soak")
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
-    """Command line; see EXAMPLES for the exit codes."""
+    """Run the command and return its exit code (see EXAMPLES)."""
     args = parser().parse_args(argv)
     try:
         check_result_target(args.json)
@@ -105,22 +122,22 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         menu = _menu(args.faults)
         budget = budgets.load_budget(args.budget or budgets.DEFAULT)
         budgets.check_names(budget, names())
-        budget = budgets.that_apply(budget, faults=menu is not None)
+        budget = budgets.applicable(budget, faults=menu is not None)
         soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
     except ArtifactError as error:
-        return _complain(error, EXIT_REFUSED)
+        return _report_error(error, EXIT_REFUSED)
     except (SoakInputError, SceneError, ValueError, OSError) as error:
-        return _complain(error, EXIT_BAD_INPUT)
+        return _report_error(error, EXIT_BAD_INPUT)
     if not options.trained:
-        _say(
-            "the weights of these artifacts are untrained: the robot will move, it will not navigate; "
+        _print(
+            "the weights of these artifacts are untrained: the robot will move but not navigate; "
             f"speed limit {options.speed_mps:g} m/s"
         )
     with stop_signals() as stop:
         progress, failure = _Progress(), ""
         try:
             finished = run_legs(
-                soak, options, menu, stopped=lambda: bool(stop), tell=progress.tell, say=progress.say,
+                soak, options, menu, stopped=lambda: bool(stop), show_status=progress.status, log=progress.log,
                 keep_logs=args.keep_logs, commands=commands, after_leg=keep_moments,
             )  # fmt: skip
         except (StepError, ValueError) as error:
@@ -129,24 +146,24 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         result = soak_result(soak, options, budget, finished=finished)
         _write(args, soak, options, result, budget)
     if failure:
-        return _complain(failure, EXIT_CHECK_FAILED)
+        return _report_error(failure, EXIT_CHECK_FAILED)
     if not finished:
-        return _complain(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
+        return _report_error(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
     return exit_code(result)
 
 
 def exit_code(result: Mapping[str, Any]) -> int:
-    """Of a finished soak; says which lines of the budget could not be judged. Undecided is not passed."""
+    """Return the exit code of a finished soak and print the undecided budget lines; undecided counts as failed."""
     undecided = [line for line in result["budget"] if line["verdict"] == UNDECIDED]
     if without := [line["measure"] for line in undecided if line["found"]["value"] is None]:
-        _say(f"no data: {', '.join(without)}")
+        _print(f"no data: {', '.join(without)}")
     if near := [line["measure"] for line in undecided if line["found"]["value"] is not None]:
-        _say(f"too little data: {', '.join(near)}")
+        _print(f"too little data: {', '.join(near)}")
     return EXIT_DONE if result["verdict"] == PASS else EXIT_CHECK_FAILED
 
 
 def options_of(args: argparse.Namespace) -> SoakOptions:
-    """What the arguments ask for; raises ArtifactError, SoakInputError, SceneError or ValueError."""
+    """Build the options from the arguments. Raises ArtifactError, SoakInputError, SceneError or ValueError."""
     artifacts = load_artifacts(args.artifacts.absolute())
     scenes = tuple(args.scene or ("hospital",))
     for scene in scenes:
@@ -190,13 +207,13 @@ def _write(
 ) -> None:
     write_result(str(soak.path / "result.json"), result)
     write_result(args.json, result)
-    _say(str(write_report(soak, result)))
+    _print(str(write_report(soak, result)))
     if args.json != "-":
         sys.stdout.write(summary_lines(result))
 
 
 def summary_lines(result: Mapping[str, Any]) -> str:
-    """The verdict and the budget's lines for a terminal."""
+    """Format the verdict and the budget's lines for the terminal."""
     rows = []
     for line in result["budget"]:
         limit = f"<= {line['max']:g}" if "max" in line else f">= {line['min']:g}"
@@ -217,37 +234,37 @@ def _why(line: Mapping[str, object]) -> str:
 
 
 class _Progress:
-    """One line on stderr: redrawn on a terminal, otherwise now and then."""
+    """Status line on stderr: redrawn on a terminal, otherwise printed every PLAIN_S seconds."""
 
     def __init__(self) -> None:
-        self._told_ns = 0
+        self._printed_ns = 0
         self._terminal = sys.stderr.isatty()
 
-    def tell(self, line: str) -> None:
+    def status(self, line: str) -> None:
         now_ns = time.monotonic_ns()
         if self._terminal:
             sys.stderr.write(f"\r\x1b[Kedge-soak: {line}")
             sys.stderr.flush()
-        elif now_ns - self._told_ns >= PLAIN_S * 1e9:
-            self._told_ns = now_ns
-            _say(line)
+        elif now_ns - self._printed_ns >= PLAIN_S * 1e9:
+            self._printed_ns = now_ns
+            _print(line)
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         self.end()
-        _say(line)
+        _print(line)
 
     def end(self) -> None:
         if self._terminal:
             sys.stderr.write("\r\x1b[K")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stderr.write(f"edge-soak: {line}\n")
     sys.stderr.flush()
 
 
-def _complain(what: object, code: int) -> int:
-    _say(str(what))
+def _report_error(message: object, code: int) -> int:
+    _print(str(message))
     return code
 
 

@@ -1,4 +1,4 @@
-"""Console script of `edge-soak`, which an install without pybullet has too."""
+"""Console script of `edge-soak`; it also exists in an installation without pybullet."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from edge.core.cli import run_with_extra
 
 
 def main() -> int:
-    """Entry point; returns the exit code."""
+    """Run `edge-soak` and return its exit code; without the extra `sim`, print how to install it."""
     return run_with_extra("edge-soak", "sim_hil.soak.cli", "sim")

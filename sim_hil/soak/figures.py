@@ -1,4 +1,4 @@
-"""The soak report's pictures: analyses and samples in, PNG bytes out. Time is the soak's, leg after leg."""
+"""Figures of the soak report as PNG bytes; the time axis is the soak's, over all legs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PATH, _GOAL, _REACHED, _STOP, _FAULT = (31, 111, 139), (107, 119, 133), (44, 14
 
 
 def offsets_s(legs: Sequence[Analysis]) -> list[float]:
-    """When each leg began, s of the soak."""
+    """Return each leg's start time, s since the soak began."""
     return [float(sum(leg["elapsed_s"] for leg in legs[:index])) for index in range(len(legs))]
 
 
@@ -36,7 +36,7 @@ def _minutes(leg: Analysis, offset_s: float, stamps_ns: Sequence[int]) -> Array:
 
 
 def timing(legs: Sequence[Analysis]) -> bytes:
-    """Ticks, semantic delay, generations and the bridge's jitter over time; orange: a fault was in force."""
+    """Plot ticks, semantic delay, generations and the bridge's jitter over time; orange: a fault was active."""
     figure = new_figure(11.0, 8.4)
     axes = figure.subplots(4, 1, sharex=True)
     columns: list[list[tuple[Array, Array]]] = [[], [], [], []]
@@ -61,7 +61,7 @@ def timing(legs: Sequence[Analysis]) -> bytes:
 
 
 def _over_time(axes: Axes, data: Sequence[tuple[Array, Array]]) -> None:
-    """Median and worst of windows, all lives together."""
+    """Plot median and maximum per time window, over all runner lives."""
     at = np.concatenate([times for times, _ in data]) if data else np.array([])
     values = np.concatenate([each for _, each in data]) if data else np.array([])
     good = np.isfinite(values)
@@ -88,7 +88,7 @@ def _mark(axes: Axes, legs: Sequence[Analysis]) -> None:
 
 
 def processes(legs: Sequence[Analysis], samples: Sequence[Samples]) -> bytes:
-    """Memory, descriptors and CPU of each process over time."""
+    """Plot memory, descriptors and CPU of each process over time."""
     figure = new_figure(11.0, 6.4)
     axes = figure.subplots(3, 1, sharex=True)
     panels = (
@@ -125,7 +125,7 @@ def _lives(
 
 
 def histograms(legs: Sequence[Analysis]) -> bytes:
-    """Ticks and the bridge's jitter: how often, on a scale on which one of a hundred thousand still shows."""
+    """Plot histograms of ticks and of the bridge's jitter on a logarithmic scale, so that rare values show."""
     figure = new_figure(5.4, 4.2)
     ticks = [v for leg in legs for life in leg["lives"] for v in life["tick_ms"]]
     gaps = [abs(v - BRIDGE_PERIOD_MS) for leg in legs for v in leg["command_gap_ms"]]
@@ -134,13 +134,13 @@ def histograms(legs: Sequence[Analysis]) -> bytes:
         if values:
             axes.hist(values, bins=80, color=colour, log=True)
         axes.set_xlabel(label, fontsize=9)
-        axes.set_ylabel("times", fontsize=9)
+        axes.set_ylabel("count", fontsize=9)
         tidy(axes)
     return png(figure)
 
 
 def drift_and_battery(legs: Sequence[Analysis]) -> bytes:
-    """Odometry's error over ten seconds against the path in them, and the battery as the robot reports it."""
+    """Plot the odometry error over the path of 10 s segments, and the battery charge that the robot reports."""
     figure = new_figure(11.0, 3.1)
     left, right = figure.subplots(1, 2)
     segments = [segment for leg in legs for segment in leg["drift"]]
@@ -162,7 +162,7 @@ def drift_and_battery(legs: Sequence[Analysis]) -> bytes:
 
 
 def leg_map(scene: Scene, leg: Analysis) -> bytes:
-    """The leg's true path: green rings reached goals, grey rings others, orange dots faults, red dots stops."""
+    """Draw a leg's true path; rings: goals (green: reached), orange dots: faults, red dots: stops."""
     span_m = max(scene.floor_max_m[0] - scene.floor_min_m[0], 1.0)
     px_per_m = min(40.0, _MAP_PX / (span_m + 1))
     image, view = draw_map(scene, px_per_m, names=True), map_view(scene, px_per_m)

@@ -1,4 +1,4 @@
-"""`report.html` of a soak: one self-contained page from the soak's own files, moving pictures included."""
+"""`report.html` of a soak: one self-contained page built from the soak's files, with animations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHOWN_STOPS: Final = 40
 
 
 def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
-    """Write the page into the soak's folder; raises OSError."""
+    """Write the page into the soak's folder and return its path. Raises OSError."""
     path = soak.path / REPORT
     samples = soak.samples()
     parts = [
@@ -42,8 +42,8 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
             page.figure(
                 figures.timing(soak.legs),
                 "Ticks, delay, generations and jitter over time",
-                "Median and worst of each window (measured). Orange: a fault was in force; red lines: the run was "
-                "stopped for good; dotted: a new leg.",
+                "Median and maximum of each window (measured). Orange: a fault was active; red lines: the runner "
+                "stopped permanently; dotted: a new leg.",
                 wide=True,
             ),
             '<div class="pair">',
@@ -57,7 +57,7 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
             page.figure(
                 figures.processes(soak.legs, samples),
                 "Memory, descriptors and CPU",
-                "Sampled once a second; every line is one process from its start to its end.",
+                "Sampled once a second; each line is one process from start to end.",
                 wide=True,
             ),
         ]
@@ -66,7 +66,7 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
             page.figure(
                 figures.drift_and_battery(soak.legs),
                 "Drift and battery",
-                "Drift: the runner's own estimate against the simulator's truth, without what injected faults spoiled. "
+                "Drift: the runner's estimate against ground truth, without segments disturbed by injected faults. "
                 "The battery is the simulated robot's.",
             )
         )
@@ -87,14 +87,14 @@ def _verdict(result: Mapping[str, Any]) -> str:
     lines = result["budget"]
     undecided = sum(line["verdict"] not in (PASS, FAIL) for line in lines)
     count = f"{undecided} of {len(lines)} budget lines are undecided"
-    word = {FAIL: "the budget is not kept", PASS: "the budget is kept", UNDECIDED: f"no verdict: {count}"}
-    text = word[result["verdict"]]
+    texts = {FAIL: "the budget is exceeded", PASS: "the budget is met", UNDECIDED: f"no verdict: {count}"}
+    text = texts[result["verdict"]]
     more = f"; {count}" if undecided and result["verdict"] == FAIL else ""
-    cut = "" if result["finished"] else f" It was ended after {result['elapsed_s']:.0f} of {result['asked_s']:.0f} s."
+    cut = "" if result["finished"] else f" It ended after {result['elapsed_s']:.0f} of {result['asked_s']:.0f} s."
     return (
         f'<p><span class="verdict {kind}">{result["verdict"]}</span> {text}{more}.{cut}</p>'
-        "<p class=\"quiet\">Positions, contacts and success are the simulator's own, not the robot's odometry. "
-        "All figures are measured on this machine unless they say modelled.</p>"
+        '<p class="quiet">Positions, contacts and success are ground truth, not the robot\'s odometry. '
+        "All numbers are measured on this machine unless tagged as modelled.</p>"
     )
 
 
@@ -102,8 +102,8 @@ def _untrained(result: Mapping[str, Any]) -> str:
     if result["options"]["trained"]:
         return ""
     return (
-        '<p class="notice"><b>The weights are untrained</b>: the robot moves, it does not navigate. Success and '
-        "collisions below say nothing about the method; timing, memory, faults and stops do.</p>"
+        '<p class="notice"><b>The weights are untrained</b>: the robot moves but does not navigate. Success and '
+        "collisions below are meaningless; timing, memory, faults and stops are valid.</p>"
     )
 
 
@@ -119,14 +119,14 @@ def _headline(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (f"{result['elapsed_s'] / 60:.1f} min", f"in {len(legs)} legs"),
         (f"{reached} of {tasks}", "tasks reached"),
-        (shown("collision_percent", 0), "of the tasks with a contact"),
+        (shown("collision_percent", 0), "of tasks with a contact"),
         (shown("tick_ms.p999"), f"tick p99.9 of {measures['tick_ms.p999']['count']}"),
         (shown("missed_percent", 3), "ticks missed"),
         (shown("delay_s.p50", 2), "Δt, median"),
         (shown("bridge_jitter_ms.p999", 2), "bridge jitter p99.9"),
         (shown("memory_slope_mib_per_h.edge-run", 2), "runner's memory slope"),
         (f"{measures['faults_injected']['value']}", "faults injected"),
-        (f"{measures['stops']['value']}", "stops for good"),
+        (f"{measures['stops']['value']}", "permanent stops"),
     ]
 
 
@@ -183,10 +183,10 @@ def _faults(legs: Sequence[Mapping[str, Any]]) -> str:
                 "–" if points["max"] is None else f"{points['max']:.0f}",
             )
         )
-    head = ("fault", "n", "should", "raises", "raised", "p50 ms", "max ms")
+    head = ("fault", "n", "expected action", "raises", "raised", "p50 ms", "max ms")
     return (
-        "<h2>Faults</h2><p>Times are from the fault's effect on the robot's side to the runner's own record of it; how "
-        "soon the robot stands is measured by <code>make faults</code>.</p>"
+        "<h2>Faults</h2><p>Times are from the fault's effect on the robot's side to the runner's own record of it; "
+        "<code>make faults</code> measures how soon the robot stands.</p>"
         + page.table(head, rows, numeric=frozenset({1, 4, 5, 6}))
     )
 
@@ -204,7 +204,7 @@ def _moments(soak: SoakFolder) -> str:
         try:
             uri = page.image_uri(path.read_bytes(), "gif")
         except OSError:
-            continue  # somebody has tidied up
+            continue  # the file was deleted
         cards.append(
             f'<figure><img src="{uri}" alt="{page.text_html(moment.kind)}"><div class="meta"><b>'
             f"{page.text_html(moment.kind)}</b>, leg {number}: {page.text_html(moment.what, limit=200)}</div></figure>"
@@ -212,8 +212,7 @@ def _moments(soak: SoakFolder) -> str:
     if not cards:
         return ""
     return (
-        "<h2>Worst moments</h2><p>What the robot saw in the five seconds before.</p>"
-        f'<div class="sheet">{"".join(cards)}</div>'
+        f'<h2>Worst moments</h2><p>The robot\'s camera in the 5 s before.</p><div class="sheet">{"".join(cards)}</div>'
     )
 
 
@@ -229,7 +228,7 @@ def _maps(legs: Sequence[Mapping[str, Any]]) -> list[str]:
             continue
         caption = (
             f"Leg {number}, {name}, {leg['elapsed_s']:.0f} s, ended by: {leg['why']}. Blue: true path from its disc; "
-            "green ring: goal reached; grey ring: goal not reached; orange: a fault; red: a stop for good."
+            "green ring: goal reached; grey ring: goal not reached; orange: a fault; red: a permanent stop."
         )
         parts.append(page.figure(picture, f"Map of leg {number}", caption, wide=True))
     return parts
@@ -243,14 +242,14 @@ def _stops(legs: Sequence[Mapping[str, Any]]) -> str:
                 continue
             at_s = (end["t_ns"] - leg["begin_ns"]) / 1e9
             why = end["cause"] or f"ended with code {end['code']}"
-            explained = end["explained"] or '<span class="fail">nothing known</span>'
+            explained = end["explained"] or '<span class="fail">unexplained</span>'
             cause = page.text_html(end["explained"]) if end["explained"] else explained
             rows.append((str(leg["leg"]["number"]), f"{at_s:.0f}", cause, page.text_html(why, limit=300)))
     if not rows:
         return ""
-    head = ("leg", "s", "put down to", "the runner's own words")
+    head = ("leg", "s", "attributed to", "the runner's message")
     more = f"<p>The first {SHOWN_STOPS} of {len(rows)}.</p>" if len(rows) > SHOWN_STOPS else ""
-    return "<h2>Stops for good</h2>" + more + page.table(head, rows[:SHOWN_STOPS], numeric=frozenset({0, 1}))
+    return "<h2>Permanent stops</h2>" + more + page.table(head, rows[:SHOWN_STOPS], numeric=frozenset({0, 1}))
 
 
 def _legs(result: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""A soak as the command asks for it: legs until its time is over, a folder that survives a kill, a verdict."""
+"""A whole soak: legs until the time is over, a folder that survives a kill, and a verdict."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ CONFIG: Final = "config.json"
 LEGS: Final = "legs"
 SHORTEST_LEG_S: Final = 15.0
 FAILED_LEGS: Final = 3
-"""So many legs in a row that fail end the soak: something is wrong that another try does not mend."""
+"""Number of consecutive failed legs that ends the soak, because retrying does not help."""
 
-Tell = Callable[[str], None]
+PrintLine = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class SoakOptions:
-    """What a soak was asked for; a resumed one must match all but its duration."""
+    """Options of a soak; a resumed soak must have the same ones except for the duration."""
 
     artifacts: Path
     manifest_sha256: str
@@ -54,7 +54,7 @@ class SoakOptions:
     odometry_noise: str
     domain: int
     faults: str
-    """The menu's name, as it was given."""
+    """Value of --faults: default, none, or the path of a fault menu."""
 
     def __post_init__(self) -> None:
         if not SHORTEST_LEG_S <= self.duration_s <= 30 * 86_400:
@@ -65,7 +65,7 @@ class SoakOptions:
             raise SoakInputError("--people and --seed: expected 0 or more, and one scene or more")
 
     def config(self) -> dict[str, Any]:
-        """What a resumed run must have in common with this one."""
+        """Return the options that a resumed soak must share."""
         left_out = ("duration_s", "artifacts", "domain")
         kept = {key: value for key, value in self.__dict__.items() if key not in left_out}
         return {**kept, "scenes": list(self.scenes)}
@@ -73,41 +73,41 @@ class SoakOptions:
 
 @dataclass
 class SoakFolder:
-    """The folder of a soak and what its legs have come to."""
+    """Folder of a soak with the analyses of its finished legs."""
 
     path: Path
     legs: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def elapsed_s(self) -> float:
-        """Time that the legs have taken so far."""
+        """Total duration of the legs so far, s."""
         return float(sum(leg["elapsed_s"] for leg in self.legs))
 
     def folder(self, number: int) -> Path:
-        """Of a leg, counted from 1."""
+        """Return the folder of a leg; legs are numbered from 1."""
         return self.path / LEGS / f"{number:03d}"
 
     def samples(self) -> list[list[dict[str, Any]]]:
-        """Of every leg."""
+        """Return the process samples of every leg."""
         return [list(read_lines(self.folder(leg["leg"]["number"]) / SAMPLES)) for leg in self.legs]
 
     @staticmethod
     def create(path: Path, options: SoakOptions) -> SoakFolder:
-        """A new one; raises SoakInputError where there is one already, or no room to record to."""
+        """Create a folder. Raises SoakInputError if it already contains a soak, or if the disk is too full."""
         if (path / CONFIG).exists():
-            raise SoakInputError(f"--out {path}: holds a soak; continue it with --resume or name another folder")
-        _need_room(path)
+            raise SoakInputError(f"--out {path}: contains a soak; continue it with --resume or name another folder")
+        _check_disk_space(path)
         (path / LEGS).mkdir(parents=True, exist_ok=True)
         write_whole(path / CONFIG, json.dumps(options.config(), indent=1) + "\n")
         return SoakFolder(path)
 
     @staticmethod
     def resume(path: Path, options: SoakOptions) -> SoakFolder:
-        """One that was begun with the same options; legs without an analysis get it now. Raises SoakInputError."""
+        """Open the folder of a soak with the same options; analyse unfinished legs. Raises SoakInputError."""
         try:
             before = json.loads((path / CONFIG).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise SoakInputError(f"--resume: {path} holds no soak to continue ({error})") from error
+            raise SoakInputError(f"--resume: {path} contains no soak to continue ({error})") from error
         now = options.config()
         differ = [key for key in now if before.get(key) != now[key]]
         if differ:
@@ -115,27 +115,27 @@ class SoakFolder:
             raise SoakInputError(f"--resume: {path} was begun with {key} {before.get(key)!r}, found {now[key]!r}")
         found = SoakFolder.open(path)
         if options.duration_s - found.elapsed_s >= SHORTEST_LEG_S:
-            _need_room(path)
+            _check_disk_space(path)
         return found
 
     @staticmethod
     def open(path: Path) -> SoakFolder:
-        """All legs of a folder; raises OSError."""
+        """Open a folder and analyse unfinished legs. Raises OSError."""
         found = SoakFolder(path)
         for folder in sorted((path / LEGS).iterdir()):
             if (folder / ANALYSIS).exists():
                 found.legs.append(json.loads((folder / ANALYSIS).read_text(encoding="utf-8")))
             elif (folder / LEG).exists() and (folder / SAMPLES).exists():
-                found.legs.append(analyse(folder))  # its soak was killed
+                found.legs.append(analyse(folder))  # the soak was killed during this leg
             else:
-                shutil.rmtree(folder)  # killed before its first second
+                shutil.rmtree(folder)  # killed before the first sample
         return found
 
 
-def _need_room(path: Path) -> None:
-    """Raises SoakInputError where no runner would be armed with its flight logs under `path`, there already or not."""
-    there = next(folder for folder in (path, *path.parents) if folder.exists())
-    refusal = space_refusal(there / "flight.mcap")
+def _check_disk_space(path: Path) -> None:
+    """Check that a runner could record flight logs under `path`, which may not exist yet. Raises SoakInputError."""
+    existing = next(folder for folder in (path, *path.parents) if folder.exists())
+    refusal = space_refusal(existing / "flight.mcap")
     if refusal is not None:
         raise SoakInputError(f"--out {path}: {refusal}")
 
@@ -146,13 +146,16 @@ def run_legs(
     menu: FaultMenu | None,
     *,
     stopped: Callable[[], bool],
-    tell: Tell,
-    say: Tell,
+    show_status: PrintLine,
+    log: PrintLine,
     keep_logs: bool = False,
     commands: Mapping[str, Sequence[str]] = COMMANDS,
     after_leg: Callable[[Path, dict[str, Any]], None] = lambda folder, analysis: None,
 ) -> bool:
-    """Legs until the time is over; False when somebody stopped it. Raises StepError when nothing runs at all."""
+    """Run legs until the time is over; return False if `stopped` ended it.
+
+    `show_status` gets a status line a few times a second, `log` a line per leg. Raises StepError after FAILED_LEGS.
+    """
     failed = 0
     while not stopped():
         left_s = options.duration_s - soak.elapsed_s
@@ -161,7 +164,7 @@ def run_legs(
         number = 1 + max((leg["leg"]["number"] for leg in soak.legs), default=0)
         folder = soak.folder(number)
         folder.mkdir(parents=True, exist_ok=True)
-        leg = _leg(options, number, folder, min(options.leg_s, left_s), menu, stopped, tell, commands)
+        leg = _leg(options, number, folder, min(options.leg_s, left_s), menu, stopped, show_status, commands)
         try:
             why = leg.run()
             failed = 0
@@ -169,14 +172,14 @@ def run_legs(
             failed += 1
             why = f"failed: {error}"
             if failed == FAILED_LEGS:
-                raise StepError(f"{FAILED_LEGS} legs in a row have failed, the last one: {error}") from error
-        say(f"leg {number} has ended: {why}; {leg.reached} of {leg.tasks} tasks reached, {leg.stops} stops")
+                raise StepError(f"{FAILED_LEGS} legs in a row failed, the last one: {error}") from error
+        log(f"leg {number} ended: {why}; {leg.reached} of {leg.tasks} tasks reached, {leg.stops} stops")
         analysis = analyse(folder)
         after_leg(folder, analysis)
         soak.legs.append(analysis)
         if not keep_logs:
-            for log in folder.glob("flight-*.mcap"):
-                log.unlink()
+            for flight_log in folder.glob("flight-*.mcap"):
+                flight_log.unlink()
     return False
 
 
@@ -187,7 +190,7 @@ def _leg(
     duration_s: float,
     menu: FaultMenu | None,
     stopped: Callable[[], bool],
-    tell: Tell,
+    show_status: PrintLine,
     commands: Mapping[str, Sequence[str]],
 ) -> Leg:
     scene = options.scenes[(number - 1) % len(options.scenes)]
@@ -212,13 +215,13 @@ def _leg(
         journey,
         menu,
         stopped=stopped,
-        tell=tell,
+        show_status=show_status,
         commands=commands,
     )
 
 
 def verdict(judgements: Sequence[Judgement]) -> str:
-    """FAIL where a line fails, else UNDECIDED where one could not be judged or there is none, else PASS."""
+    """Return FAIL if a line fails, UNDECIDED if a line is undecided or there is none, else PASS."""
     found = {judgement.verdict for judgement in judgements}
     return FAIL if FAIL in found else PASS if found == {PASS} else UNDECIDED
 
@@ -226,7 +229,7 @@ def verdict(judgements: Sequence[Judgement]) -> str:
 def soak_result(
     soak: SoakFolder, options: SoakOptions, budget: Sequence[BudgetLine], *, finished: bool
 ) -> dict[str, Any]:
-    """What `--json` writes (design section 9). Raises SoakInputError for a budget of something unknown."""
+    """Return the result for `--json`. Raises SoakInputError for a budget line about an unknown measure."""
     found = measures(soak.legs, soak.samples())
     judgements = judge(budget, found)
     lives = [life for leg in soak.legs for life in leg["lives"]]

@@ -1,1 +1,1 @@
-"""Textured meshes of a scene: shell, objects by kind, and what walls hide."""
+"""Textured meshes of a scene: shell, objects by kind, and visibility behind walls."""

@@ -1,4 +1,4 @@
-"""How a hospital's and a warehouse's things look. One function a kind."""
+"""Meshes of hospital and warehouse objects, one function per kind."""
 
 from __future__ import annotations
 

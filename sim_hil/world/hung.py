@@ -1,4 +1,4 @@
-"""How things on walls, ceilings and floors look, that stop nobody. One function a kind, and what is printed on it."""
+"""Meshes and prints of objects on walls, ceilings and floors, one function per kind; they are no obstacles."""
 
 from __future__ import annotations
 
@@ -145,13 +145,13 @@ def _carpet_top(thing: SceneObject) -> Image:
 
 
 def _slab(drawing: Drawing) -> Callable[[Kit], None]:
-    """A plate with a picture on its front."""
+    """Build a plate with a print on its front."""
     return lambda kit: kit.whole(kit.paint(0.6), kit.picture(drawing))
 
 
 def _sign(kit: Kit) -> None:
     plate = kit.picture(textures.sign)
-    # What hangs from the ceiling is read from both sides.
+    # Signs on the ceiling are readable from both sides.
     kit.whole(kit.paint(0.6), plate, back=plate)
 
 

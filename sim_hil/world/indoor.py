@@ -1,4 +1,4 @@
-"""How indoor things look: a corridor's, a lounge's, an office's. One function a kind."""
+"""Meshes of indoor objects in corridors, lounges and offices, one function per kind."""
 
 from __future__ import annotations
 

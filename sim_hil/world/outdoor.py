@@ -1,4 +1,4 @@
-"""How a street's and a square's things look. One function a kind."""
+"""Meshes of outdoor objects in streets and squares, one function per kind."""
 
 from __future__ import annotations
 

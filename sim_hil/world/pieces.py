@@ -1,4 +1,4 @@
-"""A scene's meshes by place: one mesh a square of floor, so that a renderer can leave out what it does not see."""
+"""Meshes of a scene divided into squares of floor, so that a renderer can skip invisible ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Vec2 = tuple[float, float]
 
 
 class Pieces:
-    """Meshes by the square that their point lies in, each begun by `make`; `around` is for what is far outside."""
+    """Meshes by square of floor, created by `make`; `around` contains faces far outside the scene."""
 
     def __init__(self, square_m: float, make: Callable[[], MeshBuilder] = MeshBuilder) -> None:
         self._square_m, self._make = square_m, make
@@ -20,27 +20,27 @@ class Pieces:
         self.around = make()
 
     def at(self, x: float, y: float) -> MeshBuilder:
-        """The mesh of the square around a point, m."""
+        """Return the mesh of the square that contains a point, m."""
         square = (floor(x / self._square_m), floor(y / self._square_m))
         if square not in self._meshes:
             self._meshes[square] = self._make()
         return self._meshes[square]
 
     def all(self) -> list[MeshBuilder]:
-        """All meshes, in an order that depends on the places alone."""
+        """Return all meshes, ordered by position."""
         meshes = [self._meshes[square] for square in sorted(self._meshes)]
         return [mesh for mesh in (*meshes, self.around) if not mesh.empty()]
 
 
 def surface(mesh: MeshBuilder, texture: str) -> str:
-    """Make a repeating texture known to a mesh; its name again."""
+    """Register a repeating texture with a mesh and return its name."""
     if not mesh.has_picture(texture):
         mesh.picture(texture, surface_picture(texture))
     return texture
 
 
 def clip(polygon: list[Vec2], a: Vec2, b: Vec2, keep_left: bool) -> list[Vec2]:
-    """The part of a convex polygon on one side of the line from `a` to `b`."""
+    """Return the part of a convex polygon on one side of the line from `a` to `b`."""
     sign = 1.0 if keep_left else -1.0
     side = [sign * ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) for x, y in polygon]
     kept: list[Vec2] = []
@@ -55,7 +55,7 @@ def clip(polygon: list[Vec2], a: Vec2, b: Vec2, keep_left: bool) -> list[Vec2]:
 
 
 def split(polygon: list[Vec2], cutter: list[Vec2]) -> tuple[list[Vec2], list[list[Vec2]]]:
-    """A convex polygon cut by another that is counter-clockwise: what lies within it, and the pieces outside."""
+    """Cut a convex polygon by a counter-clockwise one; return the part inside and the pieces outside."""
     inside, outside = polygon, []
     for a, b in zip(cutter, cutter[1:] + cutter[:1], strict=True):
         beyond = clip(inside, a, b, keep_left=False)
@@ -68,7 +68,7 @@ def split(polygon: list[Vec2], cutter: list[Vec2]) -> tuple[list[Vec2], list[lis
 
 
 def counter_clockwise(polygon: list[Vec2]) -> list[Vec2]:
-    """The same polygon, turning left."""
+    """Return the polygon in counter-clockwise order."""
     return polygon if _area(polygon) > 0 else polygon[::-1]
 
 

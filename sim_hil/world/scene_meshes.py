@@ -1,4 +1,4 @@
-"""The scene's looks: floor, raised ground, walls, ceiling and every object as textured meshes; no physics."""
+"""Appearance of a scene: floor, terrain, walls, ceiling and all objects as textured meshes; no physics."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ BUILDERS: dict[str, Callable[[Kit], None]] = {
 
 
 def add_object(mesh: MeshBuilder, thing: SceneObject) -> None:
-    """Add one object to a mesh, where the scene has it."""
+    """Add one object to a mesh, at its place in the scene."""
     BUILDERS[thing.kind](Kit(mesh, thing))
 
 
 def build_scene(stage: Stage, scene: Scene) -> list[tuple[int, Bounds]]:
-    """Show everything of the scene that does not move; the handle and the extent on the floor of each piece."""
-    # Rooms hide each other, and small pieces follow that closely; in the open more pieces are only more work.
+    """Show the static parts of a scene; return each piece's handle and its extent on the floor."""
+    # Indoors, small pieces permit skipping hidden rooms; outdoors, more pieces only cost time.
     pieces = Pieces(8.0 if scene.ceiling_height_m > 0 else 16.0)
     add_floor(pieces, scene)
     add_ceiling(pieces, scene)

@@ -1,4 +1,4 @@
-"""Floor, raised ground, walls and ceiling of a scene as meshes."""
+"""Floor, terrain, walls and ceiling of a scene as meshes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sim_hil.world.drawing.surfaces import SURFACES, surface_picture
 from sim_hil.world.drawing.textures import Colour
 from sim_hil.world.pieces import Pieces, Vec2, counter_clockwise, split, surface
 
-_CELL_M = 4.0  # large surfaces are cut up: by where they are, and so that textures need not repeat very often
-_OVERLAP_M = 0.04  # a wall reaches this far below the floor and above the ceiling: no light shines through the seam
-_BEYOND_M = 60.0  # open ground goes on for so far beyond the scene
+_CELL_M = 4.0  # size of the cells into which large surfaces are cut, which limits texture repetitions
+_OVERLAP_M = 0.04  # extension of walls below the floor and above the ceiling, against visible seams
+_BEYOND_M = 60.0  # extension of open ground beyond the scene
 
 
 def add_floor(pieces: Pieces, scene: Scene) -> None:
-    """The floor with its patches, and open ground beyond it where there is no ceiling."""
+    """Build the floor with its patches, and open ground beyond it if there is no ceiling."""
     (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
     patches = [(counter_clockwise(list(patch.polygon)), patch, _extent(patch.polygon)) for patch in scene.floors]
     base = Floor(((x0, y0), (x1, y0), (x1, y1), (x0, y1)), scene.floor_texture)
@@ -30,7 +30,7 @@ def add_floor(pieces: Pieces, scene: Scene) -> None:
                     continue
                 inside, _ = split(cell, polygon)
                 if inside:
-                    # A later patch lies over an earlier one: what it covers is cut away, so that nothing coincides.
+                    # A later patch covers earlier ones: the covered part is cut away, so that faces do not coincide.
                     parts = [(rest, other) for part, other in parts for rest in split(part, polygon)[1]]
                     parts.append((inside, patch))
             for part, patch in parts:
@@ -51,7 +51,7 @@ def _beyond(pieces: Pieces, scene: Scene) -> None:
 
 
 def add_ceiling(pieces: Pieces, scene: Scene) -> None:
-    """The ceiling, seen from below, where the scene has one."""
+    """Build the ceiling, visible from below, if the scene has one."""
     if scene.ceiling_height_m <= 0:
         return
     (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
@@ -62,11 +62,11 @@ def add_ceiling(pieces: Pieces, scene: Scene) -> None:
 
 
 def _level(pieces: Pieces, polygon: list[Vec2], texture: str, heading_rad: float, origin: Vec2, z: float) -> None:
-    """A level convex face with a repeating texture that runs along the heading, from `origin` on."""
+    """Add a horizontal convex face with a repeating texture along the heading, starting at `origin`."""
     tiling, c, s = SURFACES[texture], cos(heading_rad), sin(heading_rad)
     along = [((x - origin[0]) * c + (y - origin[1]) * s, (y - origin[1]) * c - (x - origin[0]) * s) for x, y in polygon]
     uvs = [(u / tiling.width_m, v / tiling.height_m) for u, v in along]
-    # Whole repetitions are taken off: the rasteriser's coordinates are short.
+    # Whole repetitions are subtracted, because the rasteriser's texture coordinates have low precision.
     u0, v0 = floor(min(u for u, _ in uvs)), floor(min(v for _, v in uvs))
     x, y = (sum(point[axis] for point in polygon) / len(polygon) for axis in (0, 1))
     mesh = pieces.at(x, y)
@@ -75,7 +75,7 @@ def _level(pieces: Pieces, polygon: list[Vec2], texture: str, heading_rad: float
 
 
 def add_wall(pieces: Pieces, wall: Wall) -> None:
-    """Both long faces, the ends and the top."""
+    """Build a wall: both long faces, the ends and the top."""
     box = wall.box
     length, thickness, height = box.size_m
     frame = Frame((box.centre_m[0], box.centre_m[1], 0.0), atan2(box.axis[1], box.axis[0]))
@@ -84,7 +84,7 @@ def add_wall(pieces: Pieces, wall: Wall) -> None:
     rise = 1.0 if tiling.height_m == 0 else height / tiling.height_m
     low, high = -_OVERLAP_M / height * rise, tall / height * rise
     if tiling.height_m == 0:
-        low, high = 0.0, 1.0  # repeated, the skirting board's row would show above the wall
+        low, high = 0.0, 1.0  # not repeated, else the skirting board would appear at the top
     for a, b in _cells(-length / 2, length / 2):
         mesh = pieces.at(*frame.point(((a + b) / 2, 0, 0))[:2])
         name = surface(mesh, wall.texture)
@@ -103,7 +103,7 @@ def add_wall(pieces: Pieces, wall: Wall) -> None:
 
 
 def add_terrain(pieces: Pieces, terrain: Terrain) -> None:
-    """Its top in its texture, its sides in the texture's own colour, darker."""
+    """Build terrain: the top in its texture, the sides in a darker mean colour of it."""
     tiling = SURFACES[terrain.texture]
     colour = _mean(terrain.texture, 0.85)
     half, line = terrain.size_m[1] / 2, terrain.profile()
@@ -141,7 +141,7 @@ def _middle(corners: list[Vec3]) -> Vec2:
 
 
 def _cells(start: float, end: float, cell_m: float = _CELL_M) -> list[tuple[float, float]]:
-    """A length cut into equal parts of at most a cell's length."""
+    """Divide a length into equal parts of at most a cell's length."""
     count = max(ceil((end - start) / cell_m - 1e-9), 1)
     edges = [start + (end - start) * k / count for k in range(count + 1)]
     return list(itertools.pairwise(edges))

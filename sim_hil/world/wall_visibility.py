@@ -1,7 +1,7 @@
-"""What walls hide: rays across the floor from the eye, about one for every column of a small picture.
+"""Visibility behind walls: rays over the floor from the camera, about one per column of a small image.
 
-Only walls from floor to ceiling hide things, so there is nothing to know about heights. What no ray reaches is narrower
-than the gap between two of them.
+Only walls from floor to ceiling occlude, so heights do not matter. Gaps that no ray hits are narrower than the distance
+between two rays.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ Bounds = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 RAYS: Final = 160
 _REACH_M: Final = 1e3
-_MARGIN: Final = 1.12  # rays reach beyond the picture's edges
-_AROUND_M: Final = 2.0  # what is so near is seen, whatever the rays say
-_THICK_M: Final = 0.3  # a wall is drawn this far beyond its middle at most
+_MARGIN: Final = 1.12  # rays reach beyond the image's edges
+_AROUND_M: Final = 2.0  # distance within which everything counts as visible
+_THICK_M: Final = 0.3  # largest distance of a wall's faces from its centre line
 _AHEAD_M: Final = 0.05
 _SIDEWAYS: Final = 1e6
 
 
 class Sight:
-    """How far one sees in each direction: `ahead` is a unit vector, `reach_m` [RAYS] runs from right to left."""
+    """View distance in each direction; `ahead`: unit vector, `reach_m` [RAYS]: from right to left."""
 
     def __init__(self, eye: Array, ahead: Array, half_width: float, reach_m: Array) -> None:
         self.eye = eye
@@ -41,14 +41,14 @@ class Sight:
         self._furthest = np.stack(rows)
 
     def sees(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Of boxes on the floor, corners [n, 2] and [n, 2]: whether they may be seen, and how far away they are, m."""
+        """Return for boxes on the floor (corners [n, 2], [n, 2]) whether they may be visible, and their distance, m."""
         beside = np.maximum(np.maximum(low - self.eye, self.eye - high), 0.0)
         gap = np.hypot(beside[:, 0], beside[:, 1])
         xs, ys = np.stack((low[:, 0], high[:, 0]), 1), np.stack((low[:, 1], high[:, 1]), 1)
         corners = np.stack((xs[:, (0, 0, 1, 1)], ys[:, (0, 1, 0, 1)]), axis=2) - self.eye
         turned = corners @ self._axes
         depth, aside = turned[..., 0], turned[..., 1]
-        # A corner behind the eye: the box reaches past the picture's edge on that side.
+        # A corner behind the camera: the box extends beyond the image's edge on that side.
         tangent = np.where(depth > _AHEAD_M, aside / np.maximum(depth, _AHEAD_M), np.sign(aside) * _SIDEWAYS)
         columns = (tangent / self._half * 0.5 + 0.5) * (RAYS - 1)
         first, last = np.floor(columns.min(axis=1)), np.ceil(columns.max(axis=1))
@@ -60,7 +60,7 @@ class Sight:
 
 
 class Visibility:
-    """Which pieces of a scene may be seen from where. `bounds` are the pieces' extents on the floor, m."""
+    """Visibility of a scene's pieces; `bounds`: the pieces' extents on the floor, m."""
 
     def __init__(self, scene: Scene, bounds: Sequence[Bounds]) -> None:
         high = scene.ceiling_height_m
@@ -71,7 +71,7 @@ class Visibility:
         self._low, self._high = boxes[:, :2], boxes[:, 2:]
 
     def look(self, eye_xy: Array, ahead_xy: Array, half_width: float) -> Sight:
-        """Cast the rays: from the eye, about the unit vector, to `half_width` (a tangent) on each side."""
+        """Cast the rays from the camera around a unit vector, up to `half_width` (a tangent) on each side."""
         half = half_width * _MARGIN
         rays = ahead_xy + np.linspace(-half, half, RAYS)[:, None] * np.array((-ahead_xy[1], ahead_xy[0]))
         rays /= np.hypot(rays[:, 0], rays[:, 1])[:, None]
@@ -86,7 +86,7 @@ class Visibility:
         return Sight(eye_xy, ahead_xy, half, reach)
 
     def pieces(self, sight: Sight) -> NDArray[np.int64]:
-        """Pieces that may be seen, nearest first."""
+        """Return the pieces that may be visible, nearest first."""
         seen, gap = sight.sees(self._low, self._high)
         shown = np.flatnonzero(seen)
         order: NDArray[np.int64] = shown[np.argsort(gap[shown], kind="stable")]

@@ -301,3 +301,66 @@ class TestRelease:
         bench.written.clear()
         bench.wait(100)
         assert bench.status.rejected == 1 and len(bench.moves()) >= 4
+
+
+class TestPressOutsideADrive:
+    """A press stops a robot that moves although this bridge does not drive it."""
+
+    @pytest.mark.parametrize("press", [_operator, _remote_estop, _local_estop])
+    def test_after_an_arming_that_was_broken_off(self, press: Callable[[Bench], None]) -> None:
+        bench = _arming()
+        bench.step(Stop())
+        bench.mode, bench.robot = ids.MODE_BALANCE_STAND, {"vx_mps": 0.5}
+        bench.step()
+        bench.written.clear()
+        press(bench)
+        assert [request for _, request in bench.written] == [ZERO, Call(ids.STOP_MOVE)]
+
+    @pytest.mark.parametrize("press", [_operator, _remote_estop, _local_estop])
+    @pytest.mark.parametrize("state", [_disarmed, _released])
+    def test_while_disarmed_or_released(self, state: Callable[[], Bench], press: Callable[[Bench], None]) -> None:
+        bench = state()
+        bench.wait(1500)
+        bench.robot = {"vx_mps": 0.5}
+        bench.step()
+        bench.written.clear()
+        press(bench)
+        bench.wait(100)
+        assert ZERO in bench.moves() and ids.STOP_MOVE in bench.calls()
+
+
+class TestStandstill:
+    """What counts as the robot's own confirmation."""
+
+    def test_one_slow_report_of_a_moving_robot_confirms_nothing(self) -> None:
+        bench = Bench().arm()
+        bench.robot = {"vx_mps": 0.8}
+        _operator(bench)
+        bench.wait(300)
+        bench.robot = {"vx_mps": 0.04}
+        bench.step()
+        assert bench.status.motion == "moving"
+        bench.wait(220)
+        assert bench.status.motion == "still"
+
+    def test_a_report_from_before_a_later_press_confirms_nothing(self) -> None:
+        bench = Bench().arm()
+        bench.step(Stop())
+        bench.wait(2000)
+        bench.mode = None
+        bench.now_ns += 50_000_000
+        _operator(bench)
+        assert bench.status.motion == "unknown"
+
+
+def test_a_permission_expires_before_the_first_request_of_its_arming() -> None:
+    bench = Bench(safety=replace(SAFETY, operator_arm=True)).permit()
+    bench.wait(9_900)
+    bench.mode = ids.MODE_LIE_DOWN
+    bench.battery = None
+    bench.wait(200)
+    bench.ask_to_arm()
+    bench.wait(3000)
+    bench.battery = 80
+    bench.wait(3000)
+    assert ids.STAND_UP not in bench.calls()

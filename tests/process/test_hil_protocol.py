@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,7 +28,16 @@ from sim_hil.protocols.snapshot import TornSnapshotError
 from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
 from sim_hil.protocols.unitree.services.service import Received
 from sim_hil.protocols.unitree.video_service import ERROR_NO_IMAGE, VideoHub
-from tests.support.processes import GO2_SIM, REPOSITORY, Running, hil_arguments, read_trace, running, wait_for
+from tests.support.processes import (
+    GO2_SIM,
+    REPOSITORY,
+    Running,
+    claimed_dds_domain,
+    hil_arguments,
+    read_trace,
+    running,
+    wait_for,
+)
 
 pytestmark = pytest.mark.process
 
@@ -96,7 +106,7 @@ class TestCameraProcess:
     @pytest.mark.slow
     def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., CameraProcess]) -> None:
         camera = started("", then="exec cat >/dev/null")
-        with pytest.raises(CameraProcessError, match="still running"):
+        with pytest.raises(CameraProcessError, match="still runs"):
             camera.wait_ready([])
         camera.close()
 
@@ -142,9 +152,8 @@ def reader(bus: Bus, hil: tuple[Running, Path]) -> Iterator[Go2Reader]:
 
 
 class TestRealProcess:
-    """In this order: one edge-hil is used up from the robot's start to its end."""
+    """In this order, and all in one tier: one edge-hil is used up from the robot's start to its end."""
 
-    @pytest.mark.slow
     def test_it_starts_lying_down_at_the_odometry_origin(self, reader: Go2Reader) -> None:
         state = reader.state()
         assert state is not None and state.mode == ids.MODE_LIE_DOWN
@@ -178,7 +187,6 @@ class TestRealProcess:
         client.call(ids.STOP_MOVE, timeout_s=20)
         wait_for(lambda: reader.state().mode == ids.MODE_BALANCE_STAND, 20, "standing again")
 
-    @pytest.mark.slow
     def test_pictures_are_pictures_and_change_as_it_walks(self, bus: Bus, reader: Go2Reader) -> None:
         client = RpcClient(bus, ids.SPORT_SERVICE)
         theta_rad = reader.state().T_odom_base[2]
@@ -240,7 +248,7 @@ def test_a_dead_camera_process_ends_the_robot_and_says_so(dds_domain: int, tmp_p
     with running("sim_hil.hil.command", *hil_arguments(dds_domain), folder=tmp_path) as started:
         os.kill(_camera_pid(started.pid), signal.SIGKILL)
         assert started.process.wait(20) == 1
-        assert "the camera process has died" in started.stderr()
+        assert "the camera process died" in started.stderr()
 
 
 def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_path: Path) -> None:
@@ -249,6 +257,13 @@ def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_pat
         started.process.kill()
         started.process.wait()
         wait_for(lambda: not _alive(camera), 20, "the end of the camera process")
+
+
+@pytest.fixture(scope="module")
+def own_domain() -> Iterator[int]:
+    """DDS domain for an `edge-hil` in this process, which can open a domain only once."""
+    with claimed_dds_domain() as domain:
+        yield domain
 
 
 def exit_status(command: list[str]) -> int:
@@ -264,7 +279,7 @@ def exit_status(command: list[str]) -> int:
     [
         (["--scene", "moon"], "moon"),
         (["--scene", "nowhere/moon.toml"], "moon.toml"),
-        (["--protocol", "can"], "speaks, unitree"),
+        (["--protocol", "can"], "protocol of this robot, unitree"),
         (["--robot", "carter"], "--robot carter --protocol unitree"),
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
@@ -282,29 +297,29 @@ def exit_status(command: list[str]) -> int:
     ],
 )
 def test_bad_arguments_are_one_line_and_exit_status_2(
-    dds_domain: int,
+    own_domain: int,
     arguments: list[str],
     complaint: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    defaults = {"--robot": "go2", "--scene": "corridor", "--protocol": "unitree", "--domain": str(dds_domain)}
+    defaults = {"--robot": "go2", "--scene": "corridor", "--protocol": "unitree", "--domain": str(own_domain)}
     given_flags = set(arguments[::2])
     command = [word for flag, value in defaults.items() if flag not in given_flags for word in (flag, value)]
     monkeypatch.delenv("DISPLAY", raising=False)
     assert exit_status([*command, *arguments]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert complaint in lines[-1]
-    assert not any("ready" in line for line in lines)
+    assert not any(re.search(r"\bready\b", line) for line in lines)
 
 
 @pytest.mark.parametrize("arguments", [("--people", 100000), ("--seed", -1), ("--interface", "nosuch0")])
 def test_bad_arguments_leave_an_earlier_trace_alone(
-    dds_domain: int, tmp_path: Path, arguments: tuple[object, ...]
+    own_domain: int, tmp_path: Path, arguments: tuple[object, ...]
 ) -> None:
     trace = tmp_path / "t.jsonl"
     trace.write_text("precious\n")
-    assert exit_status([str(word) for word in hil_arguments(dds_domain, "--trace", trace, *arguments)]) == 2
+    assert exit_status([str(word) for word in hil_arguments(own_domain, "--trace", trace, *arguments)]) == 2
     assert trace.read_text() == "precious\n"
 
 

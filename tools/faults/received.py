@@ -17,7 +17,7 @@ KEEP_NS = 120_000_000_000
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedCommand:
     """One request of the sport service; `velocity` of a Move."""
 
     t_ns: int
@@ -56,18 +56,18 @@ class Hearing:
 
     def __init__(self, path: Path) -> None:
         self._tail = Tail(path)
-        self._heard: deque[Heard] = deque()
+        self._heard: deque[ReceivedCommand] = deque()
 
     def update(self) -> None:
         """Read what has been added."""
         for line in self._tail.lines():
             found = line["velocity"]
             velocity = (float(found[0]), float(found[1]), float(found[2])) if isinstance(found, list) else None
-            self._heard.append(Heard(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity))
+            self._heard.append(ReceivedCommand(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity))
         while self._heard and self._heard[-1].t_ns - self._heard[0].t_ns > KEEP_NS:
             self._heard.popleft()
 
-    def since(self, t_ns: int, *, but: frozenset[int] = frozenset()) -> list[Heard]:
+    def since(self, t_ns: int, *, but: frozenset[int] = frozenset()) -> list[ReceivedCommand]:
         """Requests from `t_ns` on, without those of the sources in `but`."""
         self.update()
         return [heard for heard in self._heard if heard.t_ns >= t_ns and heard.source not in but]
@@ -77,14 +77,14 @@ class Hearing:
         self.update()
         return frozenset(heard.source for heard in self._heard)
 
-    def last_moves(self, count: int) -> list[Heard]:
+    def last_moves(self, count: int) -> list[ReceivedCommand]:
         """The newest Moves, oldest first."""
         self.update()
         moves = [heard for heard in self._heard if heard.velocity is not None]
         return moves[-count:]
 
 
-def moves(heard: Iterable[Heard]) -> list[tuple[int, Velocity]]:
+def moves(heard: Iterable[ReceivedCommand]) -> list[tuple[int, Velocity]]:
     """(ns, velocity) of every Move."""
     return [(one.t_ns, one.velocity) for one in heard if one.api_id == ids.MOVE and one.velocity is not None]
 

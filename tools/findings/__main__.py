@@ -20,10 +20,10 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    stop_signals,
     write_result,
 )
 from reporting.build_progress import duration
-from sim_hil.benchmark.cli import stop_flag
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.language.instructions import is_held_out
@@ -122,7 +122,7 @@ def _main(args: argparse.Namespace) -> int:
     broken: list[RunsError] = []
     unfit: dict[str, str] = {}
     try:
-        with stop_flag() as stop:
+        with stop_signals() as stop:
             for name in dict.fromkeys(plan.folders.values()):
                 try:
                     _run(args, name, plan.conditions[name], episodes, stop)

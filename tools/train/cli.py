@@ -1,4 +1,4 @@
-"""`edge-train`: from nothing to weights that navigate, stage by stage or all at once."""
+"""`edge-train`: train navigation weights from scratch, one stage at a time or all stages in order."""
 
 from __future__ import annotations
 
@@ -50,34 +50,35 @@ from tools.train.run.run_dir import RunDir
 COMMAND: Final = "edge-train"
 COMMANDS: Final = (*chain.ALL, "all", "card")
 BORROWED: Final = ("collect", "encoder", "sft")
-"""What --from takes of another run: everything that does not depend on the action expert."""
+"""Stages that --from takes from another run: those that do not depend on the action expert."""
 PACKAGES: Final = ("calib.", "edge.", "export.", "sim_hil.", "tools.")
+"""Packages whose errors carry a one-line message for the user."""
 
 EXAMPLES: Final = """examples:
-  edge-train all --preset nano --out out/nano-run --dry-run        what it would do, and how long that takes
-  edge-train all --preset nano --out out/nano-run                  everything; Ctrl-C ends it, --resume goes on
-  edge-train collect --preset nano --out out/run                   one stage after the other
+  edge-train all --preset nano --out out/nano-run --dry-run        print the steps and their estimated duration
+  edge-train all --preset nano --out out/nano-run                  all stages; Ctrl-C interrupts, --resume continues
+  edge-train collect --preset nano --out out/run                   a single stage
   edge-train sft --out out/run --set sft.epochs=12
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run           also: encoder, imitate, dagger, all
   edge-train imitate --out out/run --delay-profile orin.latency.json
   edge-train imitate --from out/run --variant no-latency --out out/no-latency
   edge-train dagger --preset nano --checkpoint out/run/model.safetensors --after imitate --out out/more
-  edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to give away
+  edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to publish
 
-stages: collect (the expert drives), encoder (labels of the simulator), sft (reasoning and waypoints), imitate (actions
-under delay), dagger (the policy drives, the expert relabels, imitation again), rl (PPO), evaluate (in scenes like
-training's that no stage has seen)
+stages: collect (the expert drives), encoder (vision encoder on simulator labels), sft (reasoning text and waypoints),
+imitate (actions under delay), dagger (the policy drives, the expert relabels, imitation continues), rl (PPO),
+evaluate (episodes in layouts that no stage has used)
 exit codes: 0 done, 1 an export, a drive or an episode failed, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
 
 
 class UsageError(ValueError):
-    """Arguments that do not go together."""
+    """Arguments that are missing or contradict each other; one line."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line of `edge-train`."""
+    """Build the command line of `edge-train`."""
     p = argparse.ArgumentParser(
         COMMAND, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -86,10 +87,10 @@ def parser() -> argparse.ArgumentParser:
     which.add_argument(
         "--preset", metavar="NAME", help=f"recipe: {', '.join(recipe_names())} (default: the run's, or nano)"
     )
-    which.add_argument("--recipe", type=Path, metavar="FILE.toml", help="a recipe of your own")
+    which.add_argument("--recipe", type=Path, metavar="FILE.toml", help="recipe file")
     p.add_argument(
         "--set", dest="settings", metavar="KEY=VALUE", action="append", default=[],
-        help="change a number: seed, STAGE.field or model.SECTION.field; repeatable",
+        help="change a value of the recipe: seed, STAGE.field or model.SECTION.field; repeatable",
     )  # fmt: skip
     p.add_argument(
         "--variant",
@@ -97,33 +98,38 @@ def parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help=f"an ablation or baseline of the paper: {', '.join(VARIANTS)}",
     )
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder of the run")
-    p.add_argument("--resume", action="store_true", help="go on with a stage that was begun; skip what is done")
+    p.add_argument("--out", type=Path, metavar="DIR", help="run folder")
+    p.add_argument("--resume", action="store_true", help="continue an interrupted stage; finished stages are skipped")
     p.add_argument(
-        "--drives", type=Path, metavar="DIR", help="learn from this data set (tools.train.importers), collect nothing"
+        "--drives",
+        type=Path,
+        metavar="DIR",
+        help="train on this data set (tools.train.importers) instead of collecting",
     )
-    p.add_argument("--from", dest="base", type=Path, metavar="DIR", help=f"use {', '.join(BORROWED)} of another run")
+    p.add_argument("--from", dest="base", type=Path, metavar="DIR", help=f"reuse {', '.join(BORROWED)} of another run")
     p.add_argument(
         "--checkpoint", type=Path, metavar="PATH", action="append", default=[],
-        help="begin with these weights, such as a backbone's (as edge-export reads them); repeatable",
+        help="initial weights, such as a backbone's (in a format that edge-export reads); repeatable",
     )  # fmt: skip
     p.add_argument(
-        "--after", metavar="STEP", help="the weights of --checkpoint are what this step has left: go on after it"
+        "--after",
+        metavar="STEP",
+        help="treat the weights of --checkpoint as the result of this step; continue after it",
     )
-    p.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where networks are trained (default: cpu)")
-    p.add_argument("--delay-profile", type=Path, metavar="FILE", help="learn under these delays (edge-calib latency)")
+    p.add_argument("--device", default="cpu", metavar="cpu|cuda", help="device that trains the networks (default: cpu)")
+    p.add_argument("--delay-profile", type=Path, metavar="FILE", help="train with these delays (edge-calib latency)")
     p.add_argument(
         "--scores", type=Path, metavar="FILE", action="append", default=[], help="card: edge-bench's result.json"
     )
-    p.add_argument("--ship", type=Path, metavar="DIR", help="card: also write the weights there as they are given away")
-    p.add_argument("--dry-run", action="store_true", help="print the plan with its budget and do nothing")
+    p.add_argument("--ship", type=Path, metavar="DIR", help="card: also write the weights for publication there")
+    p.add_argument("--dry-run", action="store_true", help="print the steps and their estimated duration, then exit")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
 @command_line("edge-train")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command and return its exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
     try:
@@ -133,15 +139,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if int(os.environ.get("RANK", "0")) == 0:
             write_result(args.json, result)
     except KeyboardInterrupt:
-        again = "; go on with --resume" if args.out is not None else ""
-        return _fail(EXIT_INTERRUPTED, f"interrupted, what is finished stays{again}")
+        again = "; continue with --resume" if args.out is not None else ""
+        return _fail(EXIT_INTERRUPTED, f"interrupted, finished work is kept{again}")
     except (ExportError, OutputError, RunsError, StageFailedError) as error:
         return _fail(EXIT_CHECK_FAILED, str(error))
     except ArtifactError as error:
         return _fail(EXIT_REFUSED, str(error))
     except OSError as error:
         return _fail(EXIT_BAD_INPUT, str(error))
-    except Exception as error:  # every stage has errors of its own; those of others are raised again
+    except Exception as error:  # each stage has its own errors; errors of other libraries are raised again
         if not is_ours(error):
             raise
         return _fail(EXIT_BAD_INPUT, str(error))
@@ -149,7 +155,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def is_ours(error: Exception) -> bool:
-    """Whether it is one of this repository's errors, whose text is the one line to show."""
+    """Return whether an error is one of this repository's, whose text is a one-line message."""
     return type(error).__module__.startswith(PACKAGES)
 
 
@@ -174,13 +180,13 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     if args.scores or args.ship:
         raise UsageError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
-        raise UsageError("--from and --checkpoint: expected one of them, both say where weights come from")
+        raise UsageError("--from and --checkpoint: expected one of them, both name the initial weights")
     if args.base is not None and args.drives is not None:
-        raise UsageError("--from and --drives: expected one of them, both say where drives come from")
+        raise UsageError("--from and --drives: expected one of them, both name the drives")
     if args.after is not None and args.drives is not None:
-        raise UsageError("--after and --drives: expected one of them, --after goes on without drives")
+        raise UsageError("--after and --drives: expected one of them, --after continues without earlier drives")
     if args.after is not None and not args.checkpoint:
-        raise UsageError("--after: expected --checkpoint with it, the weights that the step has left")
+        raise UsageError("--after: expected --checkpoint with it, the weights that the step wrote")
     before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
@@ -188,13 +194,13 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _recipe(args: argparse.Namespace) -> Recipe:
-    """The recipe that was named, else that of the run in --out or of the run it is taken from, else nano."""
-    # First what is implied, so that a --set has the last word. Drives of another run are not added to.
+    """Load the named recipe, else the recipe of the run in --out or --from, else nano."""
+    # Implied settings come first, so that --set overrides them. No drives are added to another run's.
     implied = ["dagger.rounds=0"] if args.base is not None else []
     settings = [*implied, *VARIANTS[args.variant or "full"], *args.settings]
     if args.delay_profile is not None:
         path, _ = _own_profile(args)
-        # What imitation was begun with stays where only reinforcement learning is asked for, and the other way round.
+        # Started stages keep their profile: `rl` alone does not change imitation's, nor the other way round.
         settings += [f"imitate.delays.profile={path}"] if args.command != "rl" else []
         settings += [f"rl.delay_profile={path}"] if args.command != "imitate" else []
     there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
@@ -209,9 +215,9 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
 
 def _own_profile(args: argparse.Namespace) -> tuple[Path, str]:
-    """(path, content) of the run's own copy of --delay-profile, named by what is in it.
+    """Return (path, content) of the run's own copy of --delay-profile; its name contains the hash of its content.
 
-    A run that goes on after the file was measured again would otherwise learn under other delays without a word.
+    Without a copy, a resumed run would silently train with other delays after the file was measured again.
     """
     content = json.dumps(load_profile(args.delay_profile).as_json()) + "\n"
     if args.out is None:
@@ -226,19 +232,19 @@ def _check_device(device: str) -> None:
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()) or (kind == "cpu" and number):
         raise UsageError(f"--device {device}: expected cpu, cuda or cuda:N")
     if kind == "cuda" and not torch.cuda.is_available():
-        raise UsageError(f"--device {device}: there is no such device here, or torch is built without it")
+        raise UsageError(f"--device {device}: not found on this machine, or torch was built without CUDA")
 
 
 @contextmanager
 def deterministic(device: str) -> Iterator[None]:
-    """On the CPU only what gives the same bits every time; an operation that cannot raises RuntimeError."""
+    """Enable deterministic operations on the CPU; operations without one raise RuntimeError."""
     import torch
 
-    deterministic: Any = torch.utils.deterministic  # torch sets its attributes up at run time
+    deterministic: Any = torch.utils.deterministic  # torch defines its attributes at run time
     before = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
     if device == "cpu":
         torch.use_deterministic_algorithms(True)
-        # Nobody reads what was never written; filling it only costs time.
+        # No code reads memory before writing it; filling it only costs time.
         deterministic.fill_uninitialized_memory = False
     try:
         yield
@@ -260,7 +266,7 @@ def _train(
     results: dict[str, Any] = {}
     with stop_flag() as stop:
         for step in steps:
-            # All ranks see what the first one has written, and agree on whether to go on.
+            # All ranks see the files of the first rank and agree on whether to stop.
             if ranks.any(stop.asked):
                 raise KeyboardInterrupt
             if is_done(run_dir, step):
@@ -268,7 +274,7 @@ def _train(
                 results[step.name] = run_dir.result(step.name if step.stage == "dagger" else step.stage)
                 continue
             may_begin(run_dir, step, args.resume)
-            ranks.barrier()  # all have looked before any begins
+            ranks.barrier()  # all ranks have checked before any starts
             results[step.name] = _step(args, recipe, run_dir, step, ranks, stop)
     if ranks.first and run_dir.model_path.is_file():
         write_card(run_dir, recipe)
@@ -276,7 +282,7 @@ def _train(
 
 
 def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
-    """What a run has before its first step: its recipe, and the drives and weights that it is given."""
+    """Write what a run needs before its first step: recipe, delay profile, given drives and given weights."""
     run_dir = RunDir.open(args.out, recipe)
     if args.delay_profile is not None:
         write_whole(*_own_profile(args))
@@ -307,7 +313,7 @@ def _step(
                 stop=stop,
             )
             if asks_bf16(recipe, step) and not computes_bf16(args.device):
-                progress.say("computes in float32: this processor has no instructions for bfloat16")
+                progress.say("using float32: this processor has no bfloat16 instructions")
             result = run_step(job, step) if step.stage in chain.DISTRIBUTED else _alone(job, step)
     finally:
         took_s = (time.monotonic_ns() - started_ns) / 1e9
@@ -320,7 +326,7 @@ def _step(
 
 
 def _alone(job: StageJob, step: Step) -> dict[str, Any]:
-    """A step that the first rank does, with the threads of all on this machine; the others wait."""
+    """Run a step in the first rank alone, with the threads of all ranks on this machine; the others wait."""
     import torch
 
     if job.ranks.world == 1:
@@ -337,21 +343,21 @@ def _alone(job: StageJob, step: Step) -> dict[str, Any]:
 
 
 def asks_bf16(recipe: Recipe, step: Step) -> bool:
-    """Whether a stage's numbers ask for bfloat16."""
+    """Return whether a stage's configuration requests bfloat16."""
     optim = getattr(getattr(recipe, step.stage, None), "optim", None)
     return bool(getattr(optim, "bf16", False))
 
 
 @contextmanager
 def stop_flag() -> Iterator[StopFlag]:
-    """Set by the first Ctrl-C or SIGTERM, for a stage to end with a checkpoint; the second ends it at once."""
+    """Yield a flag that the first Ctrl-C or SIGTERM sets: the stage ends with a checkpoint. The second interrupts."""
     flag = StopFlag()
 
     def note(_number: int, _frame: FrameType | None) -> None:
         if flag.asked:
             raise KeyboardInterrupt
         flag.ask()
-        sys.stderr.write(f"{COMMAND}: ending at the next step, with a checkpoint; once more ends it at once\n")
+        sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; press again to stop immediately\n")
 
     before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {
         number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)
@@ -374,7 +380,7 @@ def _fail(code: int, line: str) -> int:
 
 
 if __name__ == "__main__":
-    # By its name: here, the errors of this module would be those of `__main__`, which are not known as ours.
+    # Imported by name: `is_ours` would not recognise errors of the module `__main__`.
     from tools.train.cli import main as run
 
     if "WORLD_SIZE" in os.environ:

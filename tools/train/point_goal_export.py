@@ -1,7 +1,7 @@
-"""A trained point-goal network as one ONNX file: `python -m tools.train.point_goal_export FILE --out bc.onnx`.
+"""Export a trained point-goal network as one ONNX file: `python -m tools.train.point_goal_export FILE --out bc.onnx`.
 
-FILE is a run's `imitate/point_goal.safetensors`, or `rl/`'s. What `edge-bench --policy point-goal-net:` drives: frame,
-velocity and goal in, plan out; the encoder is inside.
+FILE is a run's `imitate/point_goal.safetensors` or `rl/point_goal.safetensors`. The ONNX file contains the encoder; it
+maps frame, velocity and goal to a trajectory and is driven by `edge-bench --policy point-goal-net:`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,11 @@ from tools.train.run.network_file import NetworkFileError, read_network, weights
 OPSET: Final = 20
 
 
-class Whole(nn.Module):
-    """Frame uint8 [1, px, px, 3], state [1, 3], goal [1, 2] m in the robot frame → trajectory [1, steps, 3]."""
+class PointGoalModel(nn.Module):
+    """Encoder and point-goal network in one module.
+
+    Maps a frame uint8 [1, px, px, 3], state [1, 3] and goal [1, 2] m in the robot frame to a trajectory [1, steps, 3].
+    """
 
     def __init__(self, vision: VisionEncoder, net: PointGoalNet) -> None:
         super().__init__()
@@ -42,16 +45,16 @@ class Whole(nn.Module):
 
 
 def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path: Path, origin: str) -> None:
-    """Write the file in one rename."""
+    """Write the ONNX file atomically. Raises OSError."""
     px = config.vision.image_px
     frame = torch.zeros(1, px, px, 3, dtype=torch.uint8)
     inputs = (frame, torch.zeros(1, 3), torch.tensor([[1.0, 0.0]]))
     program = torch.onnx.export(
-        Whole(vision, net).eval(), inputs, dynamo=True, verbose=False, opset_version=OPSET,
+        PointGoalModel(vision, net).eval(), inputs, dynamo=True, verbose=False, opset_version=OPSET,
         input_names=["frame", "state", "goal"], output_names=["trajectory"],
     )  # fmt: skip
     if program is None:
-        raise RuntimeError("torch's exporter gave no program")
+        raise RuntimeError("torch.onnx.export returned no program")
     model = program.model_proto
     about = {"format": FORMAT, "image_px": px, "step_s": config.action.step_s, "origin": origin}
     onnx.helper.set_model_props(model, {KEY: json.dumps(about, sort_keys=True)})
@@ -62,16 +65,16 @@ def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path:
 
 @command_line("point_goal_export")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command and return its exit code."""
     p = argparse.ArgumentParser("point_goal_export", description=__doc__.split("\n")[0])
     p.add_argument("weights", type=Path, metavar="FILE", help="point_goal.safetensors of a run's imitate or rl stage")
-    p.add_argument("--out", type=Path, required=True, metavar="FILE.onnx")
+    p.add_argument("--out", type=Path, required=True, metavar="FILE.onnx", help="ONNX file to write")
     args = p.parse_args(argv)
     try:
         run = args.weights.resolve().parent.parent
         before = weights_before(run, "imitate")
         if before is None:
-            raise NetworkFileError(f"{run}: the encoder's weights are not there; expected FILE in a run of edge-train")
+            raise NetworkFileError(f"{run}: no encoder weights found; expected FILE inside a run folder of edge-train")
         with safe_open(str(before), framework="pt") as file:
             config = config_from_dict(json.loads((file.metadata() or {})["config"]))
         network = read_network(before, config, 0)

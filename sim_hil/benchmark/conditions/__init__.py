@@ -1,1 +1,1 @@
-"""What a run was asked for, apart from its episodes: mode, latency, drift, variant, wording."""
+"""Conditions of a run, apart from its episodes: mode, latency, drift, variant, wording."""

@@ -1,6 +1,7 @@
-"""What a benchmark run was asked for, apart from its episodes: policy, clock, mode, latency, drift, variant.
+"""Conditions of a benchmark run: policy, clock, mode, latency, drift, variant.
 
-It travels as JSON: to workers, to a cluster's nodes, and into the run's `config.json`, which a resumed run must match.
+They are sent as JSON to workers and cluster nodes, and stored in the run's `config.json`. A resumed run must have the
+same conditions.
 """
 
 from __future__ import annotations
@@ -17,17 +18,16 @@ from sim_hil.robots.odometry_noise import LEVELS
 
 BASELINES = ("expert", "point-goal", "random", "still")
 PLACED = ("artifacts", "external", "point-goal-net")
-"""Policies that are somewhere: a directory, an address, a file."""
+"""Policy kinds that need a location: a directory, an address or a file."""
 POLICIES = (*PLACED, *BASELINES)
 CLOCKS = ("lockstep", "realtime")
 MODES = ("async", "sync", "no-reasoning")
 DRIFTS = tuple(LEVELS)
 WORDINGS = ("benchmark", "training")
-"""Whose sentence patterns: the benchmark's own, which training never has, or training's, of the same ways."""
+"""Sentence patterns of the instructions: the benchmark's own, which training never sees, or those of training."""
 DEFAULT_LATENCY_S = {"async": 2.0, "sync": 2.0, "no-reasoning": 0.25}
-"""Of a policy from artifacts: about 2 s (paper, appendix D), and without reasoning 4 Hz (section 4.4).
-
-Releases are at ticks of 10 Hz, so that 0.25 s becomes 0.3 s in lockstep: 3.3 Hz.
+"""Default latency of an artifact policy by mode, s: about 2 s (paper, appendix D); no reasoning: 4 Hz (section 4.4).
+Results are released at ticks of 10 Hz, so 0.25 s becomes 0.3 s (3.3 Hz) in lockstep.
 """
 MAX_EXTERNAL_TIMEOUT_S = 3600.0
 _VARIANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", re.ASCII)
@@ -35,19 +35,19 @@ _CAMERA = re.compile(r"(\d{2,4})x(\d{2,4})", re.ASCII)
 
 
 class ConditionsError(ValueError):
-    """Conditions that contradict each other or do not exist; one line: what, expected, found."""
+    """Unknown or contradictory conditions; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """Who drives: a kind, and where it is (artifact directory, address of a server; empty for a baseline)."""
+    """A policy by kind and location: artifact directory, server address or file; empty for a baseline."""
 
     kind: str
     where: str = ""
 
     def __post_init__(self) -> None:
-        wants_place = self.kind in PLACED
-        if self.kind not in POLICIES or wants_place != bool(self.where):
+        needs_location = self.kind in PLACED
+        if self.kind not in POLICIES or needs_location != bool(self.where):
             found = f"{self.kind}:{self.where}" if self.where else self.kind
             raise ConditionsError(
                 f"policy {found!r}: expected artifacts:DIR, external:ADDR, point-goal-net:FILE, or one of "
@@ -56,7 +56,7 @@ class PolicySpec:
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """`expert`, `artifacts:DIR` …; a directory becomes an absolute path. Raises ConditionsError."""
+        """Parse `expert`, `artifacts:DIR` and so on; paths become absolute. Raises ConditionsError."""
         kind, _, where = text.partition(":")
         spec = PolicySpec(kind, where)
         return PolicySpec(kind, str(Path(where).absolute())) if kind in ("artifacts", "point-goal-net") else spec
@@ -67,7 +67,7 @@ class PolicySpec:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of all episodes of a run; `mode`, `latency` and `variant` are None where the policy has none."""
+    """Conditions shared by all episodes of a run; `mode`, `latency` and `variant` are None if the policy has none."""
 
     policy: PolicySpec
     clock: str = "lockstep"
@@ -76,20 +76,20 @@ class Conditions:
     drift: str = "none"
     variant: str | None = None
     wording: int = 0
-    """Which of an episode's instructions the robot is given."""
+    """Index of the episode's instruction that the robot receives, from 0."""
     wordings: str = "benchmark"
     swap_instructions: int | None = None
-    """Seed by which every task is given the instruction of another one of its scene; None: its own."""
+    """Seed of the permutation that gives every task the instruction of another task in its scene; None: its own."""
     decoding: str | None = None
-    """Of a policy from artifacts: how its texts are decoded; None: as its manifest says."""
+    """Decoding of an artifact policy's texts; None: the manifest's."""
     recovery: str | None = None
-    """Of a policy from artifacts: whether recoveries may replace its commands; None: as its manifest says."""
+    """Whether recoveries may replace an artifact policy's commands; None: the manifest's."""
     stays: bool = False
-    """Whether a policy from artifacts stands where its texts have placed the stop; an episode ends at the goal."""
+    """Whether an artifact policy halts at the stop that its texts give; otherwise only the goal ends an episode."""
     camera: str = "auto"
-    """`WxH`: render such a picture in every control period; `auto`: what the policy looks at, if it does."""
+    """Image rendered in every control period: `WxH` px, or `auto` for the policy's own input size (none if unused)."""
     external_timeout_s: float = 60.0
-    """How long an external policy may take for an answer."""
+    """Maximum time for an external policy's answer, s."""
 
     def __post_init__(self) -> None:
         _one_of("clock", self.clock, CLOCKS)
@@ -101,18 +101,20 @@ class Conditions:
         if self.mode is not None:
             _one_of("mode", self.mode, MODES)
         if (self.mode is not None) != (kind == "artifacts"):
-            raise ConditionsError(f"mode: belongs to a policy from artifacts, found {self.mode} with {kind}")
-        for name, asked in (("stay", self.stays), ("decoding", self.decoding), ("recovery", self.recovery)):
-            if asked and kind != "artifacts":
-                raise ConditionsError(f"{name}: belongs to a policy from artifacts, found it with {kind}")
+            raise ConditionsError(
+                f"mode: expected one for artifacts:DIR and for no other policy, found {self.mode} with {kind}"
+            )
+        for name, requested in (("stay", self.stays), ("decoding", self.decoding), ("recovery", self.recovery)):
+            if requested and kind != "artifacts":
+                raise ConditionsError(f"{name}: expected only with artifacts:DIR, found with {kind}")
         try:
             _ = self.switches
         except ValueError as error:
             raise ConditionsError(str(error)) from error
         if self.latency is not None and kind in (*BASELINES, "point-goal-net"):
-            raise ConditionsError(f"latency: {kind} does not think; expected artifacts:DIR or external:ADDR with it")
+            raise ConditionsError(f"latency: expected only with artifacts:DIR or external:ADDR, found with {kind}")
         if kind == "artifacts" and self.clock == "lockstep" and self.latency is None:
-            raise ConditionsError("latency: a policy from artifacts needs one in lockstep, found none")
+            raise ConditionsError("latency: expected one for artifacts:DIR in lockstep, found none")
         if self.variant is not None and (kind != "artifacts" or not _VARIANT.fullmatch(self.variant)):
             raise ConditionsError(
                 f"variant {self.variant!r}: expected a name such as waypoints, with --policy artifacts:DIR"
@@ -138,7 +140,7 @@ class Conditions:
 
     @property
     def camera_size(self) -> tuple[int, int] | None:
-        """(width, height) that was asked for; None: what the policy looks at."""
+        """Requested image size (width, height), px; None: the policy's own input size."""
         if self.camera == "auto":
             return None
         match = _CAMERA.fullmatch(self.camera)
@@ -148,14 +150,14 @@ class Conditions:
         return size
 
     def as_json(self) -> dict[str, Any]:
-        """What `of_json` reads."""
+        """Return the conditions as JSON values, to be read by `of_json`."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         latency = None if self.latency is None else self.latency.as_json()
         return {**values, "policy": str(self.policy), "latency": latency}
 
     @staticmethod
     def of_json(content: Mapping[str, Any]) -> Conditions:
-        """Conditions that `as_json` has written, also of a version that did not know all of them yet.
+        """Read conditions written by `as_json`; keys that an older version lacks get their defaults.
 
         Raises ConditionsError.
         """
@@ -169,7 +171,7 @@ class Conditions:
             raise ConditionsError(f"conditions: {error}") from error
 
     def describe(self) -> str:
-        """One line for people."""
+        """Describe the conditions in one line for reports."""
         parts = [str(self.policy), self.clock]
         parts += [part for part in (self.mode, self.variant) if part is not None]
         if self.latency is not None:
@@ -182,7 +184,7 @@ class Conditions:
             f"{name} {value}" for name, value in (("decoding", self.decoding), ("recovery", self.recovery)) if value
         ]
         if self.stays:
-            parts.append("stands where its texts have placed the stop")
+            parts.append("halts at its own stop")
         return ", ".join([*parts, f"drift {self.drift}"])
 
 

@@ -1,4 +1,4 @@
-"""How long a generation takes in virtual time: a constant, or times that were measured, drawn anew for each one."""
+"""Latency of a generation in virtual time: a constant, or a random draw from measured times for each generation."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ _TAG = 0x1A7E
 
 @dataclass(frozen=True)
 class Timing:
-    """A generation started at t: its newest frame is that of t + `anchor_after_ns`, it is there at t + `total_ns`."""
+    """Times of one generation from its start, ns: capture of its newest frame, and release of its result."""
 
     total_ns: int
     anchor_after_ns: int
 
 
 class LatencySampler:
-    """Draws for one episode: the same profile, seed and episode id give the same times."""
+    """Random latencies for one episode; the same profile, seed and episode id give the same sequence."""
 
     def __init__(self, profile: LatencyProfile, seed: int, episode_id: str) -> None:
         self._profile = profile
         self._rng = np.random.default_rng((seed, crc32(episode_id.encode()), _TAG))
 
     def draw(self) -> Timing:
-        """The next generation's times."""
+        """Return the times of the next generation."""
         times, anchors = self._profile.generation_s, self._profile.anchor_after_s
         index = int(self._rng.integers(len(times))) if len(times) > 1 else 0
         return Timing(_ns(times[index]), _ns(anchors[index]) if anchors else 0)
 
 
 def parse_latency(argument: str) -> LatencyProfile:
-    """Read `--latency S|profile:FILE`; raises LatencyError with one clear line."""
+    """Parse the value of `--latency`: seconds or `profile:FILE`. Raises LatencyError with one line."""
     kind, _, where = argument.partition(":")
     if kind == "profile":
         return load_profile(Path(where))

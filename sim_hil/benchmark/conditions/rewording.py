@@ -1,6 +1,6 @@
-"""Episodes with other words: in training's sentence patterns, or with the instruction of another task.
+"""Replace the instructions of episodes: by training's sentence patterns, or by another task's instruction.
 
-Both are told by the episodes themselves, so that whoever runs them knows nothing of it.
+The episodes themselves are changed, so the workers that run them need no extra option.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError, tell
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.benchmark.suite.robots import telling_grid
+from sim_hil.benchmark.suite.robots import route_grid
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, load_scene
 
@@ -28,9 +28,10 @@ Texts = dict[str, tuple[str, ...]]
 def reworded(
     episodes: Sequence[Episode], conditions: Conditions, suite: Callable[[], Sequence[Episode]]
 ) -> tuple[Episode, ...]:
-    """`episodes` with the words that the conditions ask for; `suite` gives all episodes, from whose tasks is swapped.
+    """Return `episodes` with the instructions that the conditions request.
 
-    Raises ConditionsError where there are no such words.
+    `suite` returns all episodes of the suite; instructions are swapped among their tasks. Raises ConditionsError if an
+    instruction cannot be made.
     """
     if conditions.wordings == "benchmark" and conditions.swap_instructions is None:
         return tuple(episodes)
@@ -48,10 +49,10 @@ def reworded(
 
 
 def swapped_tasks(episodes: Sequence[Episode], seed: int) -> dict[str, str]:
-    """For each task the one whose instruction it is given: another one of the same scene, none given twice.
+    """Return for each task the task whose instruction it receives: another of the same scene, each used once.
 
-    Of the same scene, so that a robot is told of things that are there, and only the way is another one. Raises
-    ConditionsError for a scene of one task.
+    Both tasks share the scene, so the named objects exist and only the route is wrong. Raises ConditionsError for a
+    scene with a single task.
     """
     scenes: dict[str, list[str]] = {}
     for episode in episodes:
@@ -63,16 +64,16 @@ def swapped_tasks(episodes: Sequence[Episode], seed: int) -> dict[str, str]:
         if len(tasks) < 2:
             raise ConditionsError(f"swapped instructions: expected two tasks or more in {scene}, found {len(tasks)}")
         order = np.random.default_rng((seed, crc32(scene.encode()), _TAG)).permutation(len(tasks))
-        # One cycle over all: nobody keeps his own.
+        # One cycle over all tasks, so no task keeps its own instruction.
         for here, there in zip(order, np.roll(order, 1), strict=True):
             giver[tasks[here]] = tasks[there]
     return giver
 
 
 def training_texts(episodes: Sequence[Episode]) -> Texts:
-    """As many instructions of each task in sentence patterns of training; always the same ones.
+    """Return by task the same number of instructions in training's sentence patterns; deterministic.
 
-    Raises ConditionsError for a way that cannot be told so.
+    Raises ConditionsError for a route that these patterns cannot describe.
     """
     places: dict[str, tuple[Scene, NavGrid]] = {}
     texts: Texts = {}
@@ -81,7 +82,7 @@ def training_texts(episodes: Sequence[Episode]) -> Texts:
             continue
         if episode.scene not in places:
             scene = load_scene(episode.scene)
-            places[episode.scene] = scene, telling_grid(scene)
+            places[episode.scene] = scene, route_grid(scene)
         try:
             found = _training_wordings(episode, *places[episode.scene])
         except (RouteError, WordingError, StopIteration) as error:
@@ -94,6 +95,6 @@ def _training_wordings(episode: Episode, scene: Scene, grid: NavGrid) -> list[st
     goal = next(thing for thing in scene.objects if thing.label == episode.goal_landmark)
     path = grid.path(episode.start[:2], episode.goal_xy)
     if path is None:
-        raise RouteError("there is no way to its goal")
-    told = tell(scene, grid, path, goal)
-    return wordings(told, len(episode.instructions), crc32(episode.task.encode()), held_out=False)
+        raise RouteError("no path to its goal")
+    route = tell(scene, grid, path, goal)
+    return wordings(route, len(episode.instructions), crc32(episode.task.encode()), held_out=False)

@@ -1,7 +1,7 @@
-"""Variants of the model: artifact directories of their own, chosen and checked by name.
+"""Model variants: one artifact directory each, selected and checked by name.
 
-`--policy artifacts:DIR --variant NAME` takes DIR/NAME if there is one, else DIR itself. A name of the table below must
-agree with the model that the manifest describes; any other name (`rl`, `no-rl` …) only chooses a sub-directory.
+`--policy artifacts:DIR --variant NAME` uses DIR/NAME if it exists, else DIR itself. For a name in the table below, the
+manifest must describe that model. Any other name (`rl`, `no-rl`, ...) only selects a sub-directory.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _CHANGED: Mapping[str, Mapping[str, Any]] = {
     "flow": {"head": "flow"},
 }
 VARIANTS = {name: {**_AS_IN_THE_PAPER, **changed} for name, changed in _CHANGED.items()}
-"""What the model's action expert is in each ablation of the paper (tables 2, 5, 6, 11, 13)."""
+"""Configuration of the action expert in each ablation of the paper (tables 2, 5, 6, 11, 13)."""
 
 
 def artifact_directory(root: Path, variant: str | None) -> Path:
-    """Where the artifacts of a variant are; raises ConditionsError."""
+    """Return the artifact directory of a variant. Raises ConditionsError if there is none."""
     if variant is None:
         return root
     own = root / variant
@@ -53,7 +53,7 @@ def artifact_directory(root: Path, variant: str | None) -> Path:
 
 
 def check_variant(artifacts: Artifacts, variant: str | None) -> None:
-    """Raise ConditionsError if the model is not what a variant of the table says."""
+    """Raise ConditionsError if the model differs from the variant's entry in `VARIANTS`."""
     if variant is None or variant not in VARIANTS:
         return
     found = described(artifacts)
@@ -65,12 +65,15 @@ def check_variant(artifacts: Artifacts, variant: str | None) -> None:
 
 
 def described(artifacts: Artifacts) -> dict[str, Any]:
-    """What the manifest says of the action expert, in the table's words; raises ConditionsError."""
+    """Read the action expert's configuration from the manifest, with the keys of `VARIANTS`.
+
+    Raises ConditionsError.
+    """
     try:
         action = read_manifest(artifacts.directory)["model"]["config"]["action"]
         horizon_s = round(float(action["steps"]) * float(action["step_s"]), 6)
         return {**_AS_IN_THE_PAPER, **action, "horizon_s": horizon_s}
     except (KeyError, TypeError, ValueError) as error:
         raise ConditionsError(
-            f"{artifacts.directory}/{MANIFEST_NAME}: does not describe its model ({error!r}); export again"
+            f"{artifacts.directory}/{MANIFEST_NAME}: expected a description of the model ({error!r}); export again"
         ) from error

@@ -1,1 +1,1 @@
-"""One episode as a world to act in: observations, outcome, metrics, reward, Gymnasium."""
+"""Environment of one episode: observations, outcome, metrics, reward, Gymnasium interface."""

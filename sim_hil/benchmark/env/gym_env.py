@@ -1,4 +1,4 @@
-"""The benchmark as a Gymnasium environment, `DynaNav-v0`: one episode a reset, one control period of 0.1 s a step."""
+"""The benchmark as a Gymnasium environment, `DynaNav-v0`: a reset per episode, a step per control period of 0.1 s."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from sim_hil.scene.scene import Scene
 ENV_ID: Final = "DynaNav-v0"
 LOW: Final = (-0.5, -0.35, -1.2)
 HIGH: Final = (1.5, 0.35, 1.2)
-"""Range of the action: vx m/s, vy m/s, wz rad/s; a robot that cannot move sideways ignores the second."""
+"""Range of the action: vx m/s, vy m/s, wz rad/s; a robot that cannot move sideways ignores vy."""
 MAX_GRIDS: Final = 8
-"""Scenes, once for each robot, whose free space is kept between episodes."""
+"""Maximum number of navigation grids (one per scene and robot) cached between episodes."""
 
 Pictures = NDArray[np.uint8]
 
@@ -34,10 +34,10 @@ Pictures = NDArray[np.uint8]
 class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     """Observations: `image` uint8 [height, width, 3], `state` (vx, vy, wz), `pose` (x, y, theta) and `time`, SI.
 
-    `image` is there only with a camera. The pose is odometry's, which drifts as told. An episode ends (`terminated`)
-    at the goal or in a fall and is cut off (`truncated`) by its timeout. `info` names the episode and its instruction,
-    holds the `outcome` once it is over, and `distance_m` in a straight line. The reward is the paper's equation 5; its
-    progress is along the shortest feasible way.
+    `image` is present only with a camera. `pose` comes from odometry, which drifts as configured. An episode is
+    `terminated` at the goal or by a fall, and `truncated` by its timeout. `info` contains the episode's id, its
+    instruction, `distance_m` (straight line to the goal) and, at the end, the `outcome`. The reward is the paper's
+    equation 5; progress is measured along the shortest feasible path.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium types it
@@ -52,9 +52,9 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         scenes: Mapping[str, Scene] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """`suite`: a name, a file, or episodes; `scenes` stand in for loading them by name. Raises SuiteError.
+        """Load the episodes. `suite`: a name, a file or episodes; `scenes` replaces loading scenes by name.
 
-        There is no default: what learns must not be given "dynanav", the suite that it is measured on.
+        There is no default suite, so that nobody trains on "dynanav", the suite for evaluation. Raises SuiteError.
         """
         episodes = load_suite(suite) if isinstance(suite, str) else tuple(suite)
         if not episodes:
@@ -78,7 +78,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def world(self) -> EpisodeWorld:
-        """The running episode's world, for privileged policies. Raises RuntimeError before the first reset."""
+        """World of the running episode, for privileged policies. Raises RuntimeError before the first reset."""
         if self._world is None:
             raise RuntimeError("DynaNav: expected a reset first")
         return self._world
@@ -86,9 +86,10 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode: `options` {"episode": ID, "crowd_seed": N, "wording": N}, all of them optional.
+        """Begin an episode; `options` {"episode": ID, "crowd_seed": N, "wording": N}, all optional.
 
-        Without an ID one is drawn, by `seed` where it is given. An episode has its own crowd seed. Raises ValueError.
+        Without an ID, an episode is drawn at random (seeded by `seed` if given). `crowd_seed` replaces the episode's
+        own. Raises ValueError.
         """
         super().reset(seed=seed)
         given = dict(options or {})
@@ -109,32 +110,32 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self._contacts = Contacts()
         self._grid = self._grid_of(self._world)
         self._field = self._grid.distance_field(episode.goal_xy)
-        self._left_m = self._way_m(float("nan"))
-        if not isfinite(self._left_m):
+        self._remaining_m = self._remaining_path_m(float("nan"))
+        if not isfinite(self._remaining_m):
             self._close_world()
-            raise ValueError(f"DynaNav: episode {name}: expected a way from its start to its goal, found none")
-        return self._observed(), self._info()
+            raise ValueError(f"DynaNav: episode {name}: expected a path from its start to its goal, found none")
+        return self._observation(), self._info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive 0.1 s with (vx m/s, vy m/s, wz rad/s), clipped to the action's range."""
+        """Drive for 0.1 s with (vx m/s, vy m/s, wz rad/s), clipped to the action's range."""
         world = self.world
         vx, vy, wz = (float(v) for v in np.clip(action, LOW, HIGH))
-        before, left_before_m = world.pose(), self._left_m
+        before, remaining_before_m = world.pose(), self._remaining_m
         world.step((vx, vy, wz))
         after = world.pose()
-        self._left_m = self._way_m(left_before_m)
+        self._remaining_m = self._remaining_path_m(remaining_before_m)
         value = reward(
             reached=world.end == "reached",
-            distance_before_m=left_before_m,
-            distance_after_m=self._left_m,
+            distance_before_m=remaining_before_m,
+            distance_after_m=self._remaining_m,
             collision_began=self._contacts.began(world.touching),
             speed_mps=10.0 * hypot(after.x_m - before.x_m, after.y_m - before.y_m),
             weights=self._weights,
         )
-        return self._observed(), value, world.end in ("reached", "fell"), world.end == "timeout", self._info()
+        return self._observation(), value, world.end in ("reached", "fell"), world.end == "timeout", self._info()
 
     def _grid_of(self, world: EpisodeWorld) -> NavGrid:
-        """Free space for the robot in the scene; the last few are kept."""
+        """Return the robot's navigation grid of the scene, from the cache if possible."""
         robot = world.episode.robot
         key = (world.episode.scene, robot)
         if key not in self._grids:
@@ -143,25 +144,25 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
             self._grids[key] = robot_grid(world.scene, robot)
         return self._grids[key]
 
-    def _way_m(self, where_none_m: float) -> float:
-        """Length of the way left to the goal, m; where there is none, as in an aisle too narrow, the one given."""
+    def _remaining_path_m(self, default_m: float) -> float:
+        """Return the path length left to the goal, m; `default_m` where no path exists, such as in a narrow aisle."""
         pose = self.world.pose()
-        left_m = self._grid.blended_at(self._field, pose.x_m, pose.y_m)
-        return left_m if isfinite(left_m) else where_none_m
+        remaining_m = self._grid.blended_at(self._field, pose.x_m, pose.y_m)
+        return remaining_m if isfinite(remaining_m) else default_m
 
     def _distance(self, pose: SE2) -> float:
         goal_x, goal_y = self.world.episode.goal_xy
         return hypot(goal_x - pose.x_m, goal_y - pose.y_m)
 
-    def _observed(self) -> dict[str, Any]:
-        seen: Observation = self.world.observe()
+    def _observation(self) -> dict[str, Any]:
+        observation: Observation = self.world.observe()
         parts: dict[str, Any] = {
-            "state": np.array(seen.state, np.float32),
-            "pose": np.array(seen.T_odom_base.as_tuple(), np.float32),
-            "time": np.array((seen.time_s,), np.float32),
+            "state": np.array(observation.state, np.float32),
+            "pose": np.array(observation.T_odom_base.as_tuple(), np.float32),
+            "time": np.array((observation.time_s,), np.float32),
         }
-        if seen.image is not None:
-            parts["image"] = seen.image
+        if observation.image is not None:
+            parts["image"] = observation.image
         return parts
 
     def _info(self) -> dict[str, Any]:
@@ -177,7 +178,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         return info
 
     def render(self) -> Pictures | None:
-        """The robot's view now, 320 x 180, in render mode rgb_array; else None."""
+        """Return the robot's current view, uint8 RGB [180, 320, 3], in render mode rgb_array; else None."""
         return self.world.picture(320, 180) if self.render_mode == "rgb_array" else None
 
     def _close_world(self) -> None:
@@ -191,7 +192,7 @@ class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
 
 
 def register() -> None:
-    """Make `gymnasium.make("DynaNav-v0")` known; may be called twice."""
+    """Register `DynaNav-v0` with Gymnasium; may be called twice."""
     if ENV_ID not in gymnasium.registry:
         gymnasium.register(id=ENV_ID, entry_point="sim_hil.benchmark.env.gym_env:DynaNavEnv")
 

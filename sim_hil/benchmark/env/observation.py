@@ -1,4 +1,4 @@
-"""What a policy is given every 0.1 s: a picture, and odometry that drifts as the paper's table 14 says."""
+"""Observations of a policy, one every 0.1 s: an image, and odometry with the drift of the paper's table 14."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 
 @dataclass(frozen=True)
 class Observation:
-    """One instant as the robot knows it.
+    """Observation at one instant.
 
-    `image`: uint8 RGB [height, width, 3], None where no camera was asked for; `state`: body velocity (vx m/s, vy m/s,
-    wz rad/s) by odometry, the mean since the last observation; `T_odom_base`: pose since the start by odometry.
-    `collided`: whether it has run into something so far; `touching`: whether it does now. Both are of contact that a
-    robot can feel; the benchmark also counts a collision with somebody within 0.5 m.
+    `image`: uint8 RGB [height, width, 3], None without a camera. `state`: body velocity (vx m/s, vy m/s, wz rad/s) by
+    odometry, mean since the last observation. `T_odom_base`: pose relative to the start by odometry. `collided`:
+    whether the robot has touched an object or a person so far; `touching`: whether it does now. Both mean physical
+    contact; the benchmark also counts a person within 0.5 m as a collision.
     """
 
     time_s: float
@@ -31,7 +31,7 @@ class Observation:
 
 
 class Odometer:
-    """From true poses at the simulation's 30 Hz to what odometry reports. Raises ValueError for an unknown level."""
+    """Simulated odometry: turns true poses at 30 Hz into drifting ones. Raises ValueError for an unknown level."""
 
     def __init__(self, level: str, seed: int, T_world_base: SE2) -> None:
         if level not in LEVELS:
@@ -47,18 +47,18 @@ class Odometer:
         return self._noise.pose
 
     def step(self, T_world_base: SE2, dt_s: float) -> None:
-        """Take the true pose `dt_s` after the one before."""
+        """Add the true pose `dt_s` after the previous one."""
         self._noise.step(self._last.inverse() @ T_world_base, dt_s)
         self._last = T_world_base
         self._elapsed_s += dt_s
 
     def velocity(self) -> tuple[float, float, float]:
-        """Mean body velocity since it was asked for last, (vx m/s, vy m/s, wz rad/s); zero before the first step."""
+        """Return the mean body velocity (vx m/s, vy m/s, wz rad/s) since the last call; zero before the first step."""
         if self._elapsed_s == 0.0:
             return (0.0, 0.0, 0.0)
         moved, elapsed_s = self._mark.inverse() @ self._noise.pose, self._elapsed_s
         self._mark, self._elapsed_s = self._noise.pose, 0.0
-        # The chord of an arc, turned by half the arc's angle, is what the robot drove along its own axes.
+        # The robot drove an arc: rotate its chord by half the arc's angle to obtain the motion along the body axes.
         along = SE2(0.0, 0.0, -0.5 * moved.theta_rad) @ SE2(moved.x_m, moved.y_m, 0.0)
         stretch = _arc_over_chord(moved.theta_rad)
         return (along.x_m * stretch / elapsed_s, along.y_m * stretch / elapsed_s, moved.theta_rad / elapsed_s)

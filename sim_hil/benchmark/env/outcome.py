@@ -1,4 +1,4 @@
-"""How an episode ended, and the 30 Hz trajectory that says so."""
+"""Outcome of an episode, measured on its 30 Hz trajectory."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ ENDS = ("reached", "timeout", "fell", "stopped")
 class Outcome:
     """Metrics of one episode (paper equations 6 to 10); `spl` 0..1, lengths in m, times in s of simulation.
 
-    `end`: why it was over: the goal was reached, the time was up, the robot fell, or the caller stopped it.
-    `collisions`: labels of what was touched, "person" also for one within 0.5 m; `first_collision_s`: when.
+    `end`: why the episode ended: goal reached, timeout, fall, or stopped by the caller. `collisions`: labels of
+    touched objects; "person" also counts one within 0.5 m. `first_collision_s`: time of the first collision.
     """
 
     id: str
@@ -43,7 +43,7 @@ class Outcome:
 
 
 def trajectory_sha256(trajectory: Array) -> str:
-    """SHA-256 of [n, 3] poses (x m, y m, heading rad) as little-endian doubles: equal only for equal motion."""
+    """Return the SHA-256 of [n, 3] poses (x m, y m, heading rad) as little-endian doubles; equal for equal motion."""
     return hashlib.sha256(np.ascontiguousarray(trajectory, dtype="<f8").tobytes()).hexdigest()
 
 
@@ -57,7 +57,7 @@ def measure(
     first_collision_s: float | None,
     fell: bool,
 ) -> Outcome:
-    """Outcome of an episode whose 30 Hz poses are `trajectory` [n, 3], the start included."""
+    """Compute the outcome from the 30 Hz poses `trajectory` [n, 3], which include the start."""
     last = (float(trajectory[-1, 0]), float(trajectory[-1, 1]))
     success = is_success(last, episode.goal_xy, episode.threshold_m)
     path_m = path_length_m(trajectory[:, :2])

@@ -1,8 +1,8 @@
 """The paper's reward, equation 5, as a pure function of one control step; weights and target speed from appendix D.
 
-The paper names the four terms but does not write them out. Ours: goal is 1 in the step that reaches it; progress is
-how much shorter the way to the goal, round walls and things, became, m; collision is 1 in a step in which one begins
-(`Contacts`); speed is how far the speed is off the target, m/s.
+The paper names the four terms but does not define them. Our definitions: goal is 1 in the step that reaches it;
+progress is the decrease of the path length to the goal around obstacles, m; collision is 1 in a step in which a
+collision begins (`Contacts`); speed is the absolute difference from the target speed, m/s.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from math import isfinite
 from typing import Final
 
 APART_STEPS: Final = 10
-"""Control steps, 1 s, without touching a thing after which touching it is another collision."""
+"""Control steps (1 s) without contact after which touching the same object counts as another collision."""
 
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """w_g, w_p, w_c and w_s of equation 5, and the speed that costs nothing, m/s."""
+    """Weights w_g, w_p, w_c and w_s of equation 5, and the target speed, m/s."""
 
     goal: float = 400.0
     progress: float = 5.0
@@ -35,14 +35,14 @@ PAPER = RewardWeights()
 
 
 class Contacts:
-    """Tells collisions that begin from those that go on: scraping along a wall, or by a person's edge, is one."""
+    """Detector of new collisions: repeated contact while scraping along a wall or a person counts once."""
 
     def __init__(self) -> None:
         self._step = 0
         self._touched: dict[str, int] = {}
 
     def began(self, touching: Set[str]) -> bool:
-        """Whether a collision begins in this control step, which is called once each; labels of what is touched."""
+        """Return whether a collision begins; call once per control step with the labels of touched objects."""
         self._step += 1
         last = {label: self._touched.get(label) for label in touching}
         self._touched.update(dict.fromkeys(touching, self._step))
@@ -58,7 +58,7 @@ def reward(
     speed_mps: float,
     weights: RewardWeights = PAPER,
 ) -> float:
-    """Reward of one control step; distances are of the way left over free space, before and after it."""
+    """Return the reward of one control step; distances are path lengths to the goal before and after it, m."""
     return (
         weights.goal * float(reached)
         + weights.progress * (distance_before_m - distance_after_m)

@@ -1,4 +1,4 @@
-"""One episode as a world to act in: 0.1 s of control at a time, on virtual time, in a physics client of its own."""
+"""World of one episode: control steps of 0.1 s in virtual time, with its own physics client."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FRAMES_PER_STEP: Final = 3  # control at 10 Hz, the action held in between (paper appendix D)
-CAMERA_ASPECT: Final = 16 / 9  # the robot's picture is this wide, however it is squeezed for a policy
+FRAMES_PER_STEP: Final = 3  # control at 10 Hz; the action is constant in between (paper appendix D)
+CAMERA_ASPECT: Final = 16 / 9  # aspect ratio of the rendered view before it is scaled to the policy's input size
 MAX_PIXELS: Final = 2048
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """`camera`: width and height of every observation's picture, px, None for none; `drift`: none, typical or severe.
+    """Options of an episode's world.
 
-    `rate_hz`: physics steps a second, a whole multiple of 30. `linger_s`: the world goes on for so long after the goal
-    has been reached, for who wants to see the robot stay there; the benchmark does not.
+    `camera`: image size (width, height), px; None: no image. `drift`: none, typical or severe. `rate_hz`: physics steps
+    a second, a multiple of 30. `linger_s`: time that the world continues after the goal was reached, s; the benchmark
+    uses 0, training observes whether the robot stays at the goal.
     """
 
     camera: tuple[int, int] | None = None
     drift: str = "none"
-    rate_hz: int = 480  # at 240 the Go2 fell once in half an hour of random commands, at 480 never in an hour
+    rate_hz: int = 480  # under random commands the Go2 fell once in half an hour at 240 Hz, never in an hour at 480 Hz
     linger_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -50,15 +51,14 @@ class WorldOptions:
             raise ValueError(f"world: expected a drift of {', '.join(LEVELS)}, found {self.drift!r}")
         if self.rate_hz % FRAME_HZ or not 120 <= self.rate_hz <= 1200:
             raise ValueError(f"world: expected a whole multiple of {FRAME_HZ} steps a second, found {self.rate_hz}")
-
         if not 0 <= self.linger_s <= 600:
-            raise ValueError(f"world: expected to linger for 0 to 600 s, found {self.linger_s}")
+            raise ValueError(f"world: expected linger_s of 0 to 600 s, found {self.linger_s}")
 
 
 class EpisodeWorld:
-    """The episode from its start, the robot ready to move; the same episode and options give the same bytes anywhere.
+    """World of one episode from its start; the same episode and options give identical results on every machine.
 
-    `on_frame` is called after each 30 Hz frame. Raises SceneError or ValueError when it cannot be built.
+    `on_frame` is called after each 30 Hz frame. Raises SceneError or ValueError if the world cannot be built.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class EpisodeWorld:
         scene: Scene | None = None,
         on_frame: Callable[[EpisodeWorld], None] | None = None,
     ) -> None:
-        """`scene` stands in for loading the episode's by name."""
+        """Build the world and let the robot settle; `scene` replaces loading the episode's scene by name."""
         self.episode = episode
         self.options = options if options is not None else WorldOptions()
         self._on_frame = on_frame
@@ -102,7 +102,7 @@ class EpisodeWorld:
 
     @property
     def scene(self) -> Scene:
-        """The scene, its start replaced by the episode's."""
+        """The scene, with the episode's start."""
         return self._simulation.scene
 
     @property
@@ -112,7 +112,7 @@ class EpisodeWorld:
 
     @property
     def time_s(self) -> float:
-        """Since the episode began."""
+        """Time since the episode began, s."""
         return self._frames / FRAME_HZ
 
     @property
@@ -122,21 +122,21 @@ class EpisodeWorld:
 
     @property
     def end(self) -> str | None:
-        """Why it is over (see Outcome), None while it is not."""
+        """Why the episode ended (see Outcome); None while it runs."""
         return self._end
 
     @property
     def collided(self) -> bool:
-        """Whether there was a collision so far, as the outcome counts them."""
+        """Whether a collision has occurred so far, as counted by the outcome."""
         return self._first_collision_s is not None
 
     @property
     def touching(self) -> frozenset[str]:
-        """Labels of what the robot touches now; "person" also for one within 0.5 m."""
+        """Labels of the objects that the robot touches now; "person" also counts one within 0.5 m."""
         return self._simulation.touching
 
     def observe(self) -> Observation:
-        """What the robot knows now; asking twice without a step gives the same."""
+        """Return the current observation; repeated calls without a step return the same object."""
         if self._observed is None or self._observed[0] != self._frames:
             observation = Observation(
                 time_s=self.time_s,
@@ -150,9 +150,9 @@ class EpisodeWorld:
         return self._observed[1]
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """The forward camera's view now, uint8 RGB [height, width, 3], 16:9 squeezed into that size."""
+        """Render the forward camera's current view, uint8 RGB [height, width, 3]: 16:9 scaled to that size."""
         if self._camera is None:
-            # Imported here: most policies look at no picture, and the renderer is half of an episode's memory.
+            # Imported here: most policies need no image, and the renderer takes half of an episode's memory.
             from sim_hil.simulation.camera import CameraWorld
 
             episode = self.episode
@@ -160,7 +160,7 @@ class EpisodeWorld:
         return self._camera.render(self._simulation.render_state(), width, height, aspect=CAMERA_ASPECT)
 
     def step(self, velocity: tuple[float, float, float]) -> None:
-        """Drive one control period (0.1 s, less when the episode ends in it) with (vx m/s, vy m/s, wz rad/s).
+        """Drive for one control period (0.1 s, shorter if the episode ends) with (vx m/s, vy m/s, wz rad/s).
 
         Raises ValueError unless all three are finite, RuntimeError when the episode is over.
         """
@@ -199,36 +199,36 @@ class EpisodeWorld:
         return "timeout" if self._frames >= round(self.episode.timeout_s * FRAME_HZ) else None
 
     def stop(self) -> None:
-        """End the episode here, as it is."""
+        """End the episode now, with its current state as the outcome."""
         if self._end is None:
             self._end = "stopped"
 
     def truth(self) -> BaseTruth:
-        """Ground truth of the robot now; its `time_s` is the simulation's, which began before the episode."""
+        """Return the robot's ground truth; its `time_s` is simulation time, which began before the episode."""
         return self._simulation.truth()
 
     def pose(self) -> SE2:
-        """True planar pose `T_world_base` of the robot now."""
+        """Return the robot's true planar pose `T_world_base`."""
         return SE2(*self._trajectory[-1])
 
     def people(self) -> Array:
-        """[n, 3]: x m, y m, heading rad of every person."""
+        """Return the pose of every person [n, 3]: x m, y m, heading rad."""
         return self._simulation.people()
 
     def people_velocities(self) -> Array:
-        """[n, 2]: velocity of every person in the world frame, m/s."""
+        """Return the velocity of every person [n, 2] in the world frame, m/s."""
         return self._simulation.people_velocities()
 
     def render_state(self) -> Array:
-        """What a CameraWorld of the same scene, people and seed draws."""
+        """Return the state that a CameraWorld of the same scene, people and seed renders."""
         return self._simulation.render_state()
 
     def trajectory(self) -> Array:
-        """[n, 3]: x m, y m, heading rad at 30 Hz so far, the start included."""
+        """Return the robot's poses so far at 30 Hz [n, 3]: x m, y m, heading rad; the start included."""
         return np.array(self._trajectory, dtype=np.float64)
 
     def outcome(self) -> Outcome:
-        """Metrics of the episode, as far as it has come. Raises RuntimeError before it is over."""
+        """Return the metrics of the finished episode. Raises RuntimeError before it is over."""
         if self._end is None:
             raise RuntimeError(f"episode {self.episode.id} is not over yet: expected `done` or `stop()` first")
         return measure(
@@ -242,7 +242,7 @@ class EpisodeWorld:
         )
 
     def close(self) -> None:
-        """Release physics and renderer; may be called twice."""
+        """Close physics and renderer; may be called twice."""
         self._simulation.close()
         if self._camera is not None:
             self._camera.close()

@@ -1,1 +1,1 @@
-"""Routes through a scene as instructions in words, and back."""
+"""Instructions for routes through a scene: generation and parsing."""

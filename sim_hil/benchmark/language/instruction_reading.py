@@ -1,7 +1,6 @@
-"""Reads an instruction back into what it claims (turns, counts, what is passed, the goal) and holds it against a way.
+"""Parser of instructions into claims (turns, counts, passed landmarks, goal), and their check against a route.
 
-Independent of the grammar that wrote it: it knows words, not choices. A sentence that says something it cannot read, or
-leaves a turn out, is a problem too.
+It is independent of the grammar that generates instructions. Unreadable sentences and omitted turns are problems too.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 
 from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
 from sim_hil.benchmark.language.openings import opening_class
-from sim_hil.benchmark.language.route import Step, Told
+from sim_hil.benchmark.language.route import RouteDescription, Step
 
 _TURN = "(?:turn|go|head|bear)"
 _CORRIDOR = "(?:(?:main|cross|back) aisle|corridor|hallway|hall|passage|aisle|row|sidewalk|pavement)"
@@ -25,7 +24,7 @@ _BESIDE = "(?:on|to) (?:the|your)"
 
 @dataclass(frozen=True)
 class Claim:
-    """One thing that a sentence says. kind: turn, cross, pass, leave, end or goal; what is not said is "" or 0."""
+    """One claim of a sentence; `kind`: turn, cross, pass, leave, end or goal; missing details are "" or 0."""
 
     kind: str
     side: str = ""
@@ -35,7 +34,7 @@ class Claim:
     at_end: bool = False
 
 
-# In the order in which they are tried at each place of a sentence: s = side, c = count, n = a thing, a = an area.
+# In the order in which they are tried: s = side, c = count, n = object, a = area.
 _PATTERNS: tuple[tuple[str, str, str], ...] = (
     ("pass", rf"(?:pass|past|keep) the {_NAME} on (?:the|your) {_SIDE}", "ns"),
     ("turn end", rf"{_TURN} {_SIDE} at the end of the {_CORRIDOR}", "s"),
@@ -67,12 +66,12 @@ _PATTERNS: tuple[tuple[str, str, str], ...] = (
     ("goal", rf"the {_NAME}(?: on (?:the|your) {_SIDE})?", "ns"),
 )
 _MASTER = re.compile("|".join(f"(?P<p{i}>{text})" for i, (_, text, _) in enumerate(_PATTERNS)))
-# Nothing of what decides the way may be left over once the claims are taken out.
+# Words that determine the route; none may remain once the claims are removed.
 _LEFTOVER = re.compile(rf"\b(?:left|right|{'|'.join(ORDINALS)}|{_ZEBRA})\b|{NAME}")
 
 
 def read(text: str) -> list[Claim]:
-    """The claims of an instruction, in their order; raises ValueError for one that says more than can be read."""
+    """Parse an instruction into its claims, in order. Raises ValueError if a part cannot be read."""
     lower = re.sub(r"\ball right\b", "okay", text.lower())
     found, rest = [], lower
     for match in _MASTER.finditer(lower):
@@ -104,8 +103,8 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     )
 
 
-def untrue(text: str, told: Told) -> list[str]:
-    """What an instruction says that is not so of a way, one line each; empty when all of it is true and complete."""
+def untrue(text: str, told: RouteDescription) -> list[str]:
+    """Return the false or missing claims of an instruction about a route, one line each; empty if it is correct."""
     try:
         claims = read(text)
     except ValueError as error:
@@ -156,7 +155,7 @@ def _wrong_step(claim: Claim, step: Step) -> list[str]:
         found.append(f"{where}: says {claim.noun}, it is a {step.kind}")
     elif claim.name and claim.name not in [thing.name for thing in step.near]:
         found.append(f"{where}: the {claim.name} does not mark it")
-    # A turn without a count, an end or a mark is the only one there is: out of a room, or off a crossing.
+    # A turn without count, end or landmark must be the only possible one: out of a room, or off a crossing.
     bare = not (claim.ordinal or claim.at_end or claim.name or claim.noun)
     if claim.kind == "turn" and bare and step.before_kind not in ("room", "crossing", "plaza"):
         found.append(f"{where}: does not say which")
@@ -164,12 +163,12 @@ def _wrong_step(claim: Claim, step: Step) -> list[str]:
 
 
 def _counted_as(kind: str) -> str:
-    """The noun's class; a sidewalk that branches off is a passage too, as no corridor is outdoors."""
+    """Return the class of a noun; a sidewalk that branches off counts as a passage."""
     return "passage" if kind == "sidewalk" else opening_class(kind)
 
 
-def _wrong_pass(claim: Claim, told: Told, steps: list[Step], taken: int) -> list[str]:
-    """A thing is passed on the stretch that comes next, or one that goes on straight after it."""
+def _wrong_pass(claim: Claim, told: RouteDescription, steps: list[Step], taken: int) -> list[str]:
+    """Check that a landmark is passed on the next segment, or on one that continues straight from it."""
     stretches = [told.passed] if taken >= len(steps) else [steps[taken].passed]
     index = told.steps.index(steps[taken]) if taken < len(steps) else len(told.steps)
     while index > 0 and told.steps[index - 1].side == "straight" and told.steps[index - 1] not in steps:

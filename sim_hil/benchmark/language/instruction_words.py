@@ -1,17 +1,17 @@
-"""The words of instructions: counts and names of things, as a pattern that finds them in a sentence."""
+"""Vocabulary of instructions: ordinals and names of objects, also as a pattern."""
 
 from __future__ import annotations
 
 from sim_hil.benchmark.language.route import COLOUR_WORDS
 from sim_hil.scene.scene import KINDS
 
-# Areas that are called by their names rather than counted.
+# Areas that instructions refer to by name instead of by count.
 AREAS = (
     "reception", "waiting area", "service area", "open office", "elevator lobby", "loading area", "main aisle",
     "back aisle", "plaza", "park",
 )  # fmt: skip
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
-# What landmarks may be called: every kind's own name, and what a scene's maker calls them besides.
+# Names of landmarks: those of all kinds, and additional names used in scenes.
 NOUNS = tuple(
     sorted({kind.words for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True)
 )

@@ -1,8 +1,8 @@
-"""A grammar of instructions: a told way becomes words, in thousands of wordings, every one of them true of the scene.
+"""Grammar of instructions: generates thousands of wordings for a described route, all true of the scene.
 
 A wording is opening + steps + stop in one of several orders, each part in many phrasings. `held_out` splits the
-sentence patterns (what is left when landmarks, sides and counts are taken out) into those that benchmark episodes use
-and those that training may use; the two never share a pattern.
+sentence patterns (the text without landmarks, sides and counts) into those of benchmark episodes and those of training;
+the two are disjoint.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import re
 import numpy as np
 
 from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
-from sim_hil.benchmark.language.route import Passed, Step, Told
+from sim_hil.benchmark.language.route import Passed, RouteDescription, Step
 
-HELD_OUT_SHARE = 0.2  # of all sentence patterns
-MAX_WORDS = 60  # a wording is no longer: a small language model must hold it
+HELD_OUT_SHARE = 0.2  # share of the sentence patterns that is reserved for the benchmark
+MAX_WORDS = 60  # maximum length of a wording, for small language models
 
 _CORRIDOR = {
     "corridor": ("corridor", "hallway", "hall", "passage"),
@@ -29,11 +29,11 @@ _CROSSING = ("zebra crossing", "crosswalk")
 
 
 class WordingError(ValueError):
-    """A way for which there are not enough words; one line."""
+    """A route without enough wordings; one line."""
 
 
 class _Writer:
-    """Draws phrases; one per wording."""
+    """Random choices for one wording."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -45,10 +45,10 @@ class _Writer:
         return bool(self.rng.uniform() < share)
 
 
-def wordings(told: Told, count: int, seed: int, *, held_out: bool) -> list[str]:
-    """Different wordings of a way, the same for the same seed, of the benchmark's patterns (`held_out`) or training's.
+def wordings(told: RouteDescription, count: int, seed: int, *, held_out: bool) -> list[str]:
+    """Return `count` different wordings of a route, from the benchmark's patterns (`held_out`) or training's.
 
-    Raises WordingError when the grammar does not yield so many.
+    Deterministic per seed. Raises WordingError if the grammar does not yield enough.
     """
     rng = np.random.default_rng((seed, 5))
     found: list[str] = []
@@ -57,7 +57,7 @@ def wordings(told: Told, count: int, seed: int, *, held_out: bool) -> list[str]:
         text = _compose(_Writer(rng), told)
         if len(text.split()) > MAX_WORDS or is_held_out(text) != held_out or text in found:
             continue
-        # Another pattern each, as long as there are any: four wordings that differ in one word are not four.
+        # Prefer a new pattern for each, because wordings that differ in one word add little.
         if pattern(text) in patterns and attempt < 200 + 30 * count:
             continue
         patterns.add(pattern(text))
@@ -68,19 +68,19 @@ def wordings(told: Told, count: int, seed: int, *, held_out: bool) -> list[str]:
 
 
 def pattern(text: str) -> str:
-    """The sentence without its landmarks, sides and counts."""
+    """Return the sentence without its landmarks, sides and counts."""
     bare = re.sub(NAME, "<thing>", text.lower())
     bare = re.sub(r"\b(left|right)\b", "<side>", bare)
     return re.sub(rf"\b({'|'.join(ORDINALS)})\b", "<count>", bare)
 
 
 def is_held_out(text: str) -> bool:
-    """Whether a wording's pattern belongs to the benchmark: no training text may have it."""
+    """Return whether a wording's pattern is reserved for the benchmark."""
     digest = hashlib.sha256(pattern(text).encode()).digest()
     return int.from_bytes(digest[:4], "big") < HELD_OUT_SHARE * 2**32
 
 
-def _compose(w: _Writer, told: Told) -> str:
+def _compose(w: _Writer, told: RouteDescription) -> str:
     clauses = _steps(w, told)
     goal = told.goal_bare if w.chance(0.5) else told.goal_name
     style = w.pick("route", "route", "route", "goal", "short")
@@ -117,7 +117,7 @@ def _joined(w: _Writer, clauses: list[str]) -> str:
 
 
 def _sentence(text: str) -> str:
-    """Capital letters at the start of sentences and a full stop at the end."""
+    """Capitalise the sentences and add a full stop."""
     parts = re.split(r"(\. )", text.strip())
     text = "".join(part[:1].upper() + part[1:] if not part.startswith(". ") else part for part in parts)
     return text if text.endswith((".", "?", "!")) else text + "."
@@ -138,7 +138,7 @@ def _polite(w: _Writer, text: str) -> str:
 
 
 def _noun(w: _Writer, kind: str, name: str) -> str:
-    """What one calls the thing that one follows."""
+    """Return a noun for the area that is followed."""
     if kind == "corridor" and name.endswith("aisle"):
         return name
     return w.pick(*_CORRIDOR.get(kind, (name,)))
@@ -160,8 +160,8 @@ def _pass(w: _Writer, thing: Passed) -> str:
     )  # fmt: skip
 
 
-def _last_leg(w: _Writer, told: Told) -> list[str]:
-    """What is said of the way after the last turn."""
+def _last_leg(w: _Writer, told: RouteDescription) -> list[str]:
+    """Return the clauses about the route after the last turn."""
     out = []
     if told.passed and w.chance(0.35):
         out.append(_pass(w, told.passed[int(w.rng.integers(len(told.passed)))]))
@@ -174,7 +174,7 @@ def _last_leg(w: _Writer, told: Told) -> list[str]:
     return out
 
 
-def _stop(w: _Writer, told: Told, goal: str) -> str:
+def _stop(w: _Writer, told: RouteDescription, goal: str) -> str:
     side = ""
     if told.goal_side in ("left", "right") and w.chance(0.4):
         side = w.pick(f" on your {told.goal_side}", f" on the {told.goal_side}")
@@ -188,7 +188,7 @@ def _stop(w: _Writer, told: Told, goal: str) -> str:
     )  # fmt: skip
 
 
-def _steps(w: _Writer, told: Told) -> list[str]:
+def _steps(w: _Writer, told: RouteDescription) -> list[str]:
     out: list[str] = []
     for index, step in enumerate(told.steps):
         leave = index == 0 and told.leaves_room
@@ -224,7 +224,7 @@ def _step(w: _Writer, step: Step, leaving: bool) -> str:
         if step.near:
             modes += ["near"] * 2
     if not modes:
-        raise WordingError("a turn that cannot be told")
+        raise WordingError("a turn that cannot be described")
     return {
         "room": _room, "near_room": _near_room, "named": _named, "plain": _plain, "count": _count, "end": _end,
         "near": _near,

@@ -1,4 +1,4 @@
-"""Openings along a way, found in the geometry: where one can leave a corridor, aisle or sidewalk to left or right."""
+"""Openings along a route, from the geometry: exits of a corridor, aisle or sidewalk to the left or right."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, Vec2
 
-LINEAR = frozenset(("corridor", "aisle", "sidewalk", "crossing"))  # areas that one follows along their length
+LINEAR = frozenset(("corridor", "aisle", "sidewalk", "crossing"))  # areas that are followed along their length
 _STEP_M = 0.1
-_BODY_M = 0.3  # an opening is where something of this radius gets through
+_BODY_M = 0.3  # radius of a body that must fit through an opening
 _BEYOND_M = 0.45
-_SIDEWAYS_M = 1.0  # a crossed corridor that reaches this far aside is an opening to that side
+_SIDEWAYS_M = 1.0  # extent to one side from which a crossed corridor counts as an opening
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The upright box round an area, m."""
+    """Axis-aligned bounding box of an area, m."""
 
     x0: float
     y0: float
@@ -32,14 +32,14 @@ class Bounds:
 
 
 def bounds_of(area: Area) -> Bounds:
-    """The upright box round an area's polygon."""
+    """Return the axis-aligned bounding box of an area's polygon."""
     xs, ys = zip(*area.polygon, strict=True)
     return Bounds(min(xs), min(ys), max(xs), max(ys))
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A way out to one side: from `low` to `high` along the direction of travel, into `area`."""
+    """An exit to one side into `area`, from `low_m` to `high_m` along the direction of travel."""
 
     side: str
     low_m: float
@@ -48,13 +48,13 @@ class Opening:
 
     @property
     def middle_m(self) -> float:
-        """Along the direction of travel."""
+        """Middle along the direction of travel, m."""
         return (self.low_m + self.high_m) / 2
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A direction of travel along x or y: `along` grows ahead, `across` to the left."""
+    """Frame of a direction of travel along x or y: `along` increases ahead, `across` to the left."""
 
     direction: Vec2  # a unit vector along an axis
 
@@ -80,12 +80,12 @@ class Frame:
 
 
 def opening_class(kind: str) -> str:
-    """What is counted together: corridors with aisles, rooms (doors), each other kind."""
+    """Return the class of openings that are counted together: corridors and aisles form one class."""
     return "passage" if kind in ("corridor", "aisle") else kind
 
 
 def is_open(grid: NavGrid, a: Vec2, b: Vec2) -> bool:
-    """Whether a small body gets straight from one point to the other."""
+    """Return whether a small body fits through the straight line between two points."""
     count = max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 0.1) + 1)
     share = np.linspace(0, 1, count)[:, None]
     points = np.array(a) * (1 - share) + np.array(b) * share
@@ -95,9 +95,9 @@ def is_open(grid: NavGrid, a: Vec2, b: Vec2) -> bool:
 def side_openings(
     scene: Scene, grid: NavGrid, frame: Frame, followed: list[Area], crossed: list[Area], side: str
 ) -> list[Opening]:  # fmt: skip
-    """Openings to one side of the areas that are followed in a direction, in the order in which they are passed.
+    """Return the openings to one side of the followed areas, in the order in which they are passed.
 
-    `crossed` are corridors that the way runs across: they open to either side.
+    `crossed`: corridors that the route crosses; they open to both sides.
     """
     sign = 1.0 if side == "left" else -1.0
     own = {area.label for area in (*followed, *crossed)}

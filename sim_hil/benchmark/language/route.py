@@ -1,4 +1,4 @@
-"""A way through a scene as one would tell it: legs along corridors, turns with their counts, what is passed, the goal.
+"""Description of a route through a scene: legs along corridors, turns with counts, passed landmarks, the goal.
 
 Everything is read off the scene's geometry (areas, navigation grid, landmarks) and the path; nothing of how the scene
 was made enters. Used both to word instructions and to check them.
@@ -24,21 +24,21 @@ from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Vec2
 
 _SAMPLE_M = 0.1
-_CLIP_M = 0.45  # a corner cut through an area for no longer than this is no part of the way
-_LEG_M = 1.2  # followed for less, a corridor is only crossed
-_AT_START_M = 0.7  # an opening this close beside the start can be counted or not: nobody could tell
-_END_M = 1.6  # a corridor that goes on for less than this ends here
-_GOAL_END_M = 2.4  # the same for the goal: one stops a metre before what stands at the end
-_NEAR_M = 2.4  # a landmark marks a turn when it is no further from it
+_CLIP_M = 0.45  # a path through an area shorter than this only clips its corner
+_LEG_M = 1.2  # a corridor followed for less than this is only crossed
+_AT_START_M = 0.7  # an opening this close to the start is ambiguous: it may be counted or not
+_END_M = 1.6  # a corridor that continues for less than this ends here
+_GOAL_END_M = 2.4  # the same for the goal, which lies about 1 m before the landmark at the end
+_NEAR_M = 2.4  # largest distance of a landmark that marks a turn
 
 
 class RouteError(ValueError):
-    """A way that cannot be told unmistakably; one line: why."""
+    """A route that cannot be described unambiguously; one line with the reason."""
 
 
 @dataclass(frozen=True)
 class Passed:
-    """A landmark beside the way."""
+    """A landmark beside the route."""
 
     label: str
     name: str
@@ -47,12 +47,12 @@ class Passed:
 
 @dataclass(frozen=True)
 class Step:
-    """One thing to do: turn or go on into an area of `kind`, called `name`.
+    """One step of a route: turn or continue into an area of `kind` with `name`.
 
-    `side` is left, right or straight. `ordinal` counts the openings of that kind on that side since the last step (0:
-    not to be counted); `at_end`: the way followed ends there; `near`: landmarks that mark the place; `passed`: what is
-    passed on the way to it; `before_kind` is what is followed before it, for `before_m`, in direction `ahead`.
-    `counted`: all openings of that kind on that side, in the frame of `ahead`; the taken one is the `ordinal`-th.
+    `side`: left, right or straight. `ordinal`: number of the opening among those of that kind on that side since the
+    last step (0: not counted). `at_end`: the followed area ends there. `near`: landmarks that mark the place. `passed`:
+    landmarks passed before it. `before_kind`: area followed before it, for `before_m`, in direction `ahead`. `counted`:
+    all openings of that kind on that side, in the frame of `ahead`; the `ordinal`-th is taken.
     """
 
     side: str
@@ -71,8 +71,8 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Told:
-    """A way: what to do, then where to stop. `goal_side` is left, right, ahead, or "" where it is not to be said."""
+class RouteDescription:
+    """Description of a route: steps, then the goal; `goal_side`: left, right, ahead, or "" if not mentioned."""
 
     steps: tuple[Step, ...]
     goal_label: str
@@ -104,8 +104,8 @@ class _Leg:
     kind: str
 
 
-def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> Told:
-    """The way along a path to a landmark; `grid` is any of the scene. Raises RouteError when it cannot be told."""
+def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> RouteDescription:
+    """Describe a path to a landmark; `grid`: any grid of the scene. Raises RouteError if that is not possible."""
     runs = _runs(scene, path)
     legs = _legs(runs)
     steps = [_step(scene, grid, legs[i - 2] if i > 1 else None, legs[i - 1], legs[i]) for i in range(1, len(legs))]
@@ -115,7 +115,7 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
     linear = last.kind in LINEAR
     length = sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(path))
     last_m = hypot(last.end[0] - last.start[0], last.end[1] - last.start[1])
-    return Told(
+    return RouteDescription(
         steps=tuple(_without(step, goal.label) for step in steps),
         goal_label=goal.label,
         goal_name=goal.landmark,
@@ -132,7 +132,7 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> To
 
 
 def _without(step: Step, label: str) -> Step:
-    """The goal is where one stops: it is neither passed nor does it mark a turn."""
+    """Return the step without the goal, which is neither passed nor marks a turn."""
     return replace(step, near=_others(step.near, label), passed=_others(step.passed, label))
 
 
@@ -141,7 +141,7 @@ def _others(things: tuple[Passed, ...], label: str) -> tuple[Passed, ...]:
 
 
 def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:
-    """The areas that a path leads through, in order, less corners that are only clipped."""
+    """Return the areas along a path, in order, without those of which it only clips a corner."""
     points = [path[0]]
     for a, b in itertools.pairwise(path):
         count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / _SAMPLE_M))
@@ -149,7 +149,7 @@ def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:
     runs: list[_Run] = []
     for point in points:
         area = scene.area_at(*point)
-        if area is None:  # a niche between two houses belongs to whatever one comes from
+        if area is None:  # a niche between two houses belongs to the previous area
             if not runs:
                 raise RouteError("the start lies in no area")
             area = runs[-1].area
@@ -170,7 +170,7 @@ def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:
 
 
 def _legs(runs: list[_Run]) -> list[_Leg]:
-    """Stretches of one direction."""
+    """Return the legs: segments with one direction."""
     legs: list[_Leg] = []
     for index, run in enumerate(runs):
         first, last = index == 0, index == len(runs) - 1
@@ -183,7 +183,7 @@ def _legs(runs: list[_Run]) -> list[_Leg]:
             legs.append(_leg_of_room(runs, index))
             continue
         followed, frame = _direction(run, runs, index)
-        if frame is None:  # the goal is right here: the last leg's direction holds on
+        if frame is None:  # the goal is near: keep the last leg's direction
             if not legs:
                 raise RouteError("the way is too short to have a direction")
             if legs[-1].kind not in LINEAR:
@@ -205,7 +205,7 @@ def _legs(runs: list[_Run]) -> list[_Leg]:
 
 
 def _direction(run: _Run, runs: list[_Run], index: int) -> tuple[bool, Frame | None]:
-    """Whether a corridor is followed (else crossed), and which way."""
+    """Return whether a corridor is followed (else crossed), and the direction."""
     box = bounds_of(run.area)
     (ax, ay), (bx, by) = run.points[0], run.points[-1]
     along, across = (bx - ax, by - ay) if box.along_x else (by - ay, bx - ax)
@@ -219,7 +219,7 @@ def _direction(run: _Run, runs: list[_Run], index: int) -> tuple[bool, Frame | N
 
 
 def _leg_of_room(runs: list[_Run], index: int) -> _Leg:
-    """Into the last room or out of the first: straight through the border with its neighbour."""
+    """Return the leg into the last room or out of the first: straight through the border with its neighbour."""
     run = runs[index]
     box = bounds_of(run.area)
     if index == 0 and len(runs) == 1:
@@ -271,7 +271,7 @@ def _step(scene: Scene, grid: NavGrid, earlier: _Leg | None, before: _Leg, after
 
 
 def _lies_across(leg: _Leg, area: Area) -> bool:
-    """Whether a leg ends by running into an area, rather than passing it at its side."""
+    """Return whether an area lies at the end of a leg instead of at its side."""
     _, (right, left) = leg.frame.span(bounds_of(area))
     (_, (own_right, own_left)) = leg.frame.span(bounds_of(leg.followed[-1]))
     return right < own_left - 0.3 and left > own_right + 0.3
@@ -285,10 +285,10 @@ def _taken(openings: list[Opening], target: Area, along: float) -> Opening:
 
 
 def _counted(openings: list[Opening], taken: Opening, start: float, from_side: str) -> tuple[Opening, ...]:
-    """Those of the taken one's kind from the leg's start on, in order. Raises RouteError where one cannot tell.
+    """Return the openings of the taken one's kind from the leg's start, in order. Raises RouteError if ambiguous.
 
-    Who turned left comes `from_side` left: what opens there at the leg's start was just left behind. A passage straight
-    across belongs to the junction that one turned at; as in streets, nobody counts it. A door there is another matter.
+    `from_side`: side of the previous turn; an opening on that side at the leg's start was just left, so it does not
+    count. A passage straight across belongs to the junction of that turn and does not count either, but a door does.
     """
     counted = []
     for opening in openings:
@@ -307,7 +307,7 @@ def _counted(openings: list[Opening], taken: Opening, start: float, from_side: s
 
 
 def _ends(scene: Scene, grid: NavGrid, leg: _Leg, target: Area | None = None) -> bool:
-    """Whether what a leg follows goes on for no more than a few steps beyond the leg."""
+    """Return whether the followed area ends shortly after the leg."""
     (_, high), (right, left) = leg.frame.span(bounds_of(leg.followed[-1]))
     if target is not None and _lies_across(leg, target):
         (_, high), _ = leg.frame.span(bounds_of(target))
@@ -329,7 +329,7 @@ def _inside(scene: Scene, p: Vec2) -> bool:
 
 
 def _beside(scene: Scene, leg: _Leg) -> list[tuple[float, float, SceneObject]]:
-    """Landmarks within the areas that a leg follows: along, across of the leg's middle line, thing."""
+    """Return the landmarks in the areas that a leg follows: (along, across, object)."""
     found = []
     for thing in scene.landmarks():
         if any(_near_box(bounds_of(area), thing) for area in leg.followed):
@@ -339,7 +339,7 @@ def _beside(scene: Scene, leg: _Leg) -> list[tuple[float, float, SceneObject]]:
 
 
 def _near_box(box: Bounds, thing: SceneObject) -> bool:
-    """Whether a thing stands in an area, or shows its front to it as a shop does to the sidewalk."""
+    """Return whether an object stands in an area or faces it, as a shop faces the sidewalk."""
     x, y, _ = thing.position_m
     reach = thing.size_m[0] / 2 + 0.25
     front = (x + reach * cos(thing.heading_rad), y + reach * sin(thing.heading_rad))
@@ -347,7 +347,7 @@ def _near_box(box: Bounds, thing: SceneObject) -> bool:
 
 
 def _passed(scene: Scene, leg: _Leg, until: float) -> tuple[Passed, ...]:
-    """Landmarks beside a leg before a point, each of a name that is there only once."""
+    """Return the landmarks beside a leg before a point whose name is unique there."""
     start = leg.frame.along(leg.start) + 1.2
     beside = _beside(scene, leg)
     names = [thing.landmark for along, _, thing in beside if along < until + 1.0]
@@ -361,7 +361,7 @@ def _passed(scene: Scene, leg: _Leg, until: float) -> tuple[Passed, ...]:
 
 
 def _near(scene: Scene, before: _Leg, openings: list[Opening], taken: Opening) -> tuple[Passed, ...]:
-    """Landmarks that mark a turn: close to it, one of a kind on the leg, and nearer to it than to any other opening."""
+    """Return the landmarks that mark a turn: close to it, unique on the leg, and nearer than to other openings."""
     beside = _beside(scene, before)
     names = [thing.landmark for _, _, thing in beside]
     others = [o for o in openings if o is not taken and opening_class(o.area.kind) == opening_class(taken.area.kind)]
@@ -377,7 +377,7 @@ def _near(scene: Scene, before: _Leg, openings: list[Opening], taken: Opening) -
 
 
 def _check_goal(scene: Scene, walked: list[Area], goal: SceneObject) -> None:
-    """The goal's name must mean one thing only in all areas that the way leads through."""
+    """Check that the goal's name is unique in all areas of the route. Raises RouteError."""
     for thing in scene.landmarks():
         same = thing.label != goal.label and thing.landmark == goal.landmark
         if same and any(_near_box(bounds_of(area), thing) for area in walked):
@@ -385,7 +385,7 @@ def _check_goal(scene: Scene, walked: list[Area], goal: SceneObject) -> None:
 
 
 def _bare(scene: Scene, walked: list[Area], goal: SceneObject) -> str:
-    """The goal's name without its colour, where nothing else of that kind stands by the way."""
+    """Return the goal's name without its colour if no other object of that kind stands along the route."""
     for thing in scene.objects:
         same = thing.label != goal.label and thing.kind == goal.kind
         if same and any(_near_box(bounds_of(area), thing) for area in walked):

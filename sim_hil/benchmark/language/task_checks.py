@@ -1,4 +1,4 @@
-"""Checks of a task on its scene: landmarks seen on the way, a goal not reached through a wall, turns that bend."""
+"""Checks of a task: visible landmarks, a goal that is not reachable through a wall, turns that match the path."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from math import atan2, degrees, hypot, pi
 import numpy as np
 
 from sim_hil.benchmark.language.instruction_reading import read
-from sim_hil.benchmark.language.route import Passed, Told
+from sim_hil.benchmark.language.route import Passed, RouteDescription
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, Vec2
 
-MIN_PIXELS = 40.0  # of a 128 x 128 picture: about 6 x 6, enough for a colour and a shape
+MIN_PIXELS = 40.0  # least size of a landmark in a 128 x 128 image, about 6 x 6 px: colour and shape are visible
 RANGE_INDOORS_M, RANGE_OUTDOORS_M = 12.0, 30.0
 _POSE_M = 0.4
 _STEP_M = 0.1
@@ -24,7 +24,7 @@ _OPEN = frozenset(("plaza", "yard"))
 
 
 def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
-    """Poses (x m, y m, heading rad) every 0.4 m along a path, looking along it."""
+    """Return poses (x m, y m, heading rad) every 0.4 m along a path, facing along it."""
     poses: list[tuple[float, float, float]] = []
     for a, b in itertools.pairwise(path):
         length = hypot(b[0] - a[0], b[1] - a[1])
@@ -38,8 +38,8 @@ def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
     return poses
 
 
-def named_landmarks(texts: Sequence[str], told: Told) -> tuple[str, ...]:
-    """Labels of the things that any of the texts names, the goal first, then in the order of the way."""
+def named_landmarks(texts: Sequence[str], told: RouteDescription) -> tuple[str, ...]:
+    """Return the labels of the landmarks named in any of the texts: first the goal, then in order of the route."""
     names = {claim.name for text in texts for claim in read(text) if claim.name}
     along: list[Passed] = []
     for step in told.steps:
@@ -55,7 +55,7 @@ def named_landmarks(texts: Sequence[str], told: Told) -> tuple[str, ...]:
 def named_too_small(
     scene: Scene, lines: Sightlines, path: Sequence[Vec2], labels: Sequence[str]
 ) -> list[str]:  # fmt: skip
-    """Landmarks that are nowhere along the path large enough in the picture, one line each."""
+    """Return the landmarks that never appear large enough in the image along the path, one line each."""
     range_m = RANGE_INDOORS_M if scene.ceiling_height_m > 0 else RANGE_OUTDOORS_M
     poses, found = poses_along(path), []
     things = {thing.label: thing for thing in scene.objects}
@@ -70,9 +70,9 @@ def named_too_small(
 
 
 def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
-    """How much further than it should be the goal is, m, from the worst free spot within the threshold; 0: sound.
+    """Return the largest excess path length to the goal from a free spot within the threshold, m; 0: valid.
 
-    A spot behind a wall lies within the circle but a long way off: a robot there would count as having arrived.
+    A spot behind a wall may lie within the circle but far away by path; a robot there would wrongly count as arrived.
     """
     field = grid.distance_field(goal)
     low = grid.cell(goal[0] - threshold_m, goal[1] - threshold_m)
@@ -87,10 +87,10 @@ def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
     return float(np.maximum(worst, 0.0))
 
 
-def wrong_bends(told: Told, path: Sequence[Vec2]) -> list[str]:
-    """The told turns against the bare path: where each one is said to be, the path must bend that way.
+def wrong_bends(told: RouteDescription, path: Sequence[Vec2]) -> list[str]:
+    """Return the described turns at which the path does not bend to that side.
 
-    Not onto a plaza or a yard: their borders are open, and a straight line may run slantwise across.
+    Turns onto a plaza or a yard are not checked, because the path may cross their open borders diagonally.
     """
     dense = _dense(path)
     places = [_nearest(dense, step.at) for step in told.steps]
@@ -98,7 +98,7 @@ def wrong_bends(told: Told, path: Sequence[Vec2]) -> list[str]:
     for index, (step, at) in enumerate(zip(told.steps, places, strict=True)):
         if step.side == "straight" or step.kind in _OPEN:
             continue
-        # No further than half way to the turns before and after: they bend the path too.
+        # At most half way to the neighbouring turns, which bend the path too.
         first = max(at - _LOOK, (places[index - 1] + at) // 2 if index else 0)
         last = min(at + _LOOK, (at + places[index + 1]) // 2 if index + 1 < len(places) else len(dense) - 1)
         before = _minus(dense[min(first + _RUN, at)], dense[first])

@@ -1,4 +1,4 @@
-"""Tasks drawn from a scene: a start, a landmark to go to, and the way between them told; for episodes and training."""
+"""Random tasks of a scene: a start, a landmark as goal, and the described route; for episodes and training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from math import atan2, cos, hypot, pi, sin
 import numpy as np
 
 from sim_hil.benchmark.language.openings import LINEAR, bounds_of
-from sim_hil.benchmark.language.route import RouteError, Told, tell
+from sim_hil.benchmark.language.route import RouteDescription, RouteError, tell
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Vec2, Vec3
 
-GOAL_GAP_M = 0.95  # from a landmark's front to the goal: a robot stands there without touching it
+GOAL_GAP_M = 0.95  # distance from a landmark's front to the goal, so that a robot does not touch it
 _LYING = frozenset(("carpet",))
 _STANDS_M = {"umbrella": 0.15, "umbrella_table": 0.5}  # half of what stands on the ground below the cloth
-# One stops where one gets to these, whichever way they look.
+# Objects at which the robot stops where it arrives, regardless of their heading.
 _FREE_STANDING = frozenset(
     ("forklift", "pallet_jack", "fountain", "umbrella", "umbrella_table", "kiosk", "statue", "drum", "traffic_cone",
      "box_stack", "wet_floor_sign", "meeting_table")
@@ -27,17 +27,17 @@ _NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "
 
 @dataclass(frozen=True)
 class Task:
-    """Where to go: `path` is the shortest way from `start` to `goal`, m, for the grid's robot; `told` says it."""
+    """Task; `path`: shortest path from `start` to `goal`, m, for the grid's robot; `told`: its description."""
 
     start: Vec3
     goal: Vec2
     goal_label: str
     path: tuple[Vec2, ...]
-    told: Told
+    told: RouteDescription
 
 
 def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
-    """Where to stop at a landmark, on the grid's free floor: before its front, or on a carpet; None: nowhere."""
+    """Return the free point in front of a landmark (or on a carpet) at which to stop; None if there is none."""
     x, y, _ = thing.position_m
     if thing.kind in _LYING:
         return (round(x, 2), round(y, 2)) if grid.is_free(x, y) else None
@@ -52,7 +52,7 @@ def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
 
 
 def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> Task:
-    """The task to go from a start to a landmark; raises RouteError when it cannot be done or told."""
+    """Create the task from a start to a landmark. Raises RouteError if it is not feasible or not describable."""
     goal = goal_before(grid, thing)
     if goal is None:
         raise RouteError(f"there is no room before the {thing.landmark}")
@@ -69,7 +69,7 @@ def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> T
 
 
 def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 | None:
-    """Where a way first comes close to a thing that has no side to stop before."""
+    """Return the first point of a path close to an object without a front."""
     for a, b in itertools.pairwise(path):
         count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / 0.1))
         for k in range(count + 1):
@@ -81,7 +81,7 @@ def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 |
 
 
 def outline_gap_m(thing: SceneObject, point: Vec2) -> float:
-    """Distance from a point to what a thing stands on, m: its bounding box, or its parts where it is a parasol."""
+    """Return the distance from a point to an object's outline on the floor, m: bounding box, or parts of a parasol."""
     boxes = thing.boxes if thing.kind in ("umbrella", "umbrella_table", "tree") else (thing.box,)
     gaps = []
     for box in boxes:
@@ -93,19 +93,19 @@ def outline_gap_m(thing: SceneObject, point: Vec2) -> float:
 
 
 def goals(scene: Scene) -> list[SceneObject]:
-    """Landmarks that one can be sent to."""
+    """Return the landmarks that can be goals."""
     return [thing for thing in scene.landmarks() if thing.kind not in _NOT_GOALS]
 
 
 def starts(scene: Scene) -> list[Area]:
-    """Areas in which one can begin: those that one walks along, and rooms that one leaves."""
+    """Return the areas in which a task can start: corridors, aisles, sidewalks and rooms."""
     return [area for area in scene.areas if area.kind in (*LINEAR, "room") and area.kind != "crossing"]
 
 
 def draw_start(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Vec3:
-    """A free pose along a corridor, looking one way, or in a room. Raises RouteError when none was found."""
+    """Draw a free pose along a corridor or in a room. Raises RouteError if none was found."""
     areas = starts(scene)
-    # Corridors by their length; a room now and then.
+    # Corridors are weighted by length, rooms by a constant.
     weights = np.array([_weight(area) for area in areas])
     for _ in range(50):
         area = areas[int(rng.choice(len(areas), p=weights / weights.sum()))]
@@ -131,9 +131,9 @@ def sample_task(
     scene: Scene, grid: NavGrid, rng: np.random.Generator, *, things: Sequence[SceneObject] | None = None,
     length_m: tuple[float, float] = (4.0, 80.0), tries: int = 12,
 ) -> Task:  # fmt: skip
-    """One task by chance, to one of `things` (any goal of the scene), its way's length within limits.
+    """Draw a random task to one of `things` (default: any goal), with a path length within limits.
 
-    Raises RouteError when none of the starts drawn can be told unmistakably: draw again.
+    Raises RouteError if no drawn start gives an unambiguous description; draw again.
     """
     found = goals(scene) if things is None else things
     if not found:

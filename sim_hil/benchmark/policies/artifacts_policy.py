@@ -1,6 +1,6 @@
 """An exported model in virtual time: the runner's own control loop, limits and supervisor, on the episode's clock.
 
-Odometry reaches it as the world reports it, so that its drift is in every anchor and motion offset.
+The policy receives the world's drifting odometry, so the drift affects every anchor and motion offset.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from sim_hil.benchmark.suite.episode import Episode
 
 CONTROL_PERIOD_NS = 100_000_000
 RING_S = 16.0
-"""Of frames: the 9 s that a generation looks back, and what a late newest frame may take."""
+"""Length of the frame history, s: the 9 s that a generation looks back, plus the wait for a late anchor."""
 _START_NS = 1_000_000_000
-"""The loop's clock at an episode's start; its stamps are never zero."""
+"""The loop's clock at an episode's start, ns; not zero, because a stamp of zero means "no stamp"."""
 
 
 class ArtifactsPolicy:
-    """Drives episodes with an artifact directory; one thread for every graph, so that it computes alike everywhere."""
+    """Policy that drives episodes with an artifact directory; one thread per graph, so results are reproducible."""
 
     privileged = False
     needs_image = True
@@ -54,9 +54,9 @@ class ArtifactsPolicy:
         self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig,
         switches: SwitchOptions | None = None,
     ) -> None:  # fmt: skip
-        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they cannot do.
+        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they do not support.
 
-        `switches`: by default the manifest's, and no standing at the goal.
+        `switches`: decoding rules and recoveries; None: the manifest's, without halting at the goal.
         """
         self._artifacts = load_artifacts(directory)
         check_suits(self._artifacts, mode)
@@ -70,16 +70,16 @@ class ArtifactsPolicy:
 
     @property
     def manifest_sha256(self) -> str:
-        """Which artifacts these are."""
+        """SHA-256 of the manifest, which identifies the artifacts."""
         return self._artifacts.manifest_sha256
 
     @property
     def camera(self) -> tuple[int, int]:
-        """(width, height) of the picture that it looks at: the whole field of view, squeezed."""
+        """Input image size (width, height), px: the whole field of view, scaled."""
         return (self._artifacts.runtime.image_px,) * 2
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
-        """Begin an episode with no frames and no semantic state. Raises InstructionError for too long a prompt."""
+        """Begin an episode without frames and semantic state. Raises InstructionError if the prompt is too long."""
         self._language.check_instruction(instruction, len(self._artifacts.runtime.frame_offsets_s))
         draw = LatencySampler(self._latency, seed, episode.id).draw
         self._drive = _Drive(
@@ -87,21 +87,21 @@ class ArtifactsPolicy:
         )
 
     def act(self, observation: Observation) -> tuple[float, float, float]:
-        """The command of one control period. Raises ValueError without a picture or before an episode."""
+        """Return the command of one control period. Raises ValueError without an image or before `reset`."""
         if self._drive is None or observation.image is None:
-            raise ValueError("artifacts: expected an episode that has begun and a picture in every observation")
+            raise ValueError("artifacts: expected reset() first and an image in every observation")
         return self._drive.tick(observation, observation.image)
 
     def notes(self) -> dict[str, Any]:
-        """What the last act knew: delay, text, waypoints, why it stood."""
+        """Return the inputs of the last `act`: delay, text, waypoints, reason for standing still."""
         return {} if self._drive is None else self._drive.notes
 
     def generations(self) -> list[Mapping[str, Any]]:
-        """Generations released so far in this episode, their times from its start."""
+        """Return the generations released so far in this episode; times in s from its start."""
         return [] if self._drive is None else self._drive.generations()
 
     def close(self) -> None:
-        """Let go of the graphs."""
+        """Release the graphs."""
         self._drive = None
 
 
@@ -213,17 +213,17 @@ class _DelayTold:
         self._model = model
         self._blocking = blocking
         self.last: tuple[float, SE2] | None = None
-        """Delay and motion offset that the action expert was told last."""
+        """Delay (s) and motion offset that the action expert received last."""
 
     def encode(self, frame: npt.NDArray[np.uint8], out: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float32]:
-        """Frame → visual tokens."""
+        """Return the visual tokens of a frame."""
         return self._model.encode(frame, out)
 
     def act(
         self, visual_tokens: npt.NDArray[np.float32], state: tuple[float, float, float], delay_s: float, offset: SE2,
         semantic: SemanticState,
     ) -> npt.NDArray[np.float32]:  # fmt: skip
-        """Planned trajectory."""
+        """Return the planned trajectory."""
         if self._blocking:
             delay_s, offset = 0.0, SE2(0.0, 0.0, 0.0)
         self.last = delay_s, offset
@@ -231,19 +231,19 @@ class _DelayTold:
 
 
 class _NoBridge:
-    """Takes the commands, which the episode is given by `act`."""
+    """Replacement of the bridge client: commands reach the episode through `act` instead."""
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
-        """Always sent."""
+        """Accept the command."""
         return True
 
     def poll(self) -> BridgeStatus | None:
-        """There is no bridge."""
+        """Return None: there is no bridge status."""
         return None
 
 
 def check_suits(artifacts: Artifacts, mode: str) -> None:
-    """Raise ConditionsError for a mode that a policy cannot do."""
+    """Raise ConditionsError for a mode that the artifacts do not support."""
     if artifacts.guided_by_waypoints and mode == Mode.NO_REASONING.value:
         raise ConditionsError(
             f"--mode {mode}: {artifacts.directory} is guided by the waypoints that reasoning writes; expected async "

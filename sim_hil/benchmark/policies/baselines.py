@@ -1,4 +1,4 @@
-"""Baselines that need no learning: standing still, wandering, and heading straight for the goal."""
+"""Baselines without learning: standing still, a random walk, and driving straight towards the goal."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ STILL: Final[Velocity] = (0.0, 0.0, 0.0)
 
 
 class StillPolicy:
-    """Never moves: what the crowd alone does to the collision rate."""
+    """Policy that never moves; it measures the collision rate caused by the crowd alone."""
 
     name = "still"
     privileged = False
     needs_image = False
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Nothing to prepare."""
+        """Do nothing."""
 
     def act(self, observation: Observation) -> Velocity:
-        """Zero."""
+        """Return zero velocity."""
         return STILL
 
     def notes(self) -> Mapping[str, object]:
@@ -45,7 +45,7 @@ class StillPolicy:
 
 
 class RandomPolicy:
-    """A smooth random walk in velocity space (Ornstein-Uhlenbeck), never backwards; wanders at about 0.5 m/s."""
+    """Policy that walks randomly in velocity space (Ornstein-Uhlenbeck), never backwards, at about 0.5 m/s."""
 
     name = "random"
     privileged = False
@@ -59,12 +59,12 @@ class RandomPolicy:
         self._v, self._w = 0.0, 0.0
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Begin another walk, of its own for every episode's seed."""
+        """Begin a new walk, seeded by run and episode."""
         self._rng = np.random.default_rng((seed, episode.seed, _TAG))
         self._v, self._w = 0.0, 0.0
 
     def act(self, observation: Observation) -> Velocity:
-        """The next step of the walk."""
+        """Return the next velocity of the walk."""
         self._v = self._drifted(self._v, *self._FORWARD)
         self._w = self._drifted(self._w, *self._TURN)
         return (min(max(self._v, 0.0), 1.0), 0.0, min(max(self._w, -1.0), 1.0))
@@ -82,7 +82,7 @@ class RandomPolicy:
 
 
 class PointGoalPolicy:
-    """Knows where the goal is (by odometry) and nothing else: turns to it, drives straight on, stops while touching."""
+    """Policy that knows only the goal's position by odometry: it turns to it, drives straight and stops on contact."""
 
     name = "point-goal"
     privileged = False
@@ -96,11 +96,11 @@ class PointGoalPolicy:
         self._ahead: tuple[float, float] = (0.0, 0.0)
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Take the goal relative to the start; odometry begins there."""
+        """Compute the goal relative to the start, where odometry begins."""
         self._goal = SE2(*episode.start).inverse() @ SE2(*episode.goal_xy, 0.0)
 
     def act(self, observation: Observation) -> Velocity:
-        """Turn towards the goal, the faster ahead the better it is aimed at."""
+        """Turn towards the goal; the forward speed grows as the heading error shrinks."""
         goal = observation.T_odom_base.inverse() @ self._goal
         self._ahead = (goal.x_m, goal.y_m)
         error = atan2(goal.y_m, goal.x_m)
@@ -111,7 +111,7 @@ class PointGoalPolicy:
         return (min(speed, hypot(goal.x_m, goal.y_m)), 0.0, turn)
 
     def notes(self) -> Mapping[str, object]:
-        """`waypoints`: the goal in the base frame, m."""
+        """Return `waypoints`: the goal in the base frame, m."""
         return {"waypoints": [list(self._ahead)]}
 
     def close(self) -> None:
@@ -119,9 +119,9 @@ class PointGoalPolicy:
 
 
 def make_baseline(name: str) -> Policy:
-    """One of BASELINES (`conditions`). Raises ValueError for another name."""
+    """Create one of the BASELINES. Raises ValueError for another name."""
     if name == "expert":
-        # Imported here: the planner's libraries take a while to load.
+        # Imported here: the planner's libraries load slowly.
         from sim_hil.benchmark.policies.expert import ExpertPolicy
 
         return ExpertPolicy()

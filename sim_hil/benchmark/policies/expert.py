@@ -1,7 +1,7 @@
-"""The privileged expert: knows the scene's plan and where everybody is and walks; shows that an episode can be done.
+"""The privileged expert: it knows the scene's map and the position and velocity of every person.
 
-It drives as a considerate person would: with room to walls and people, slowing, waiting or stepping back rather than
-pushing, and it is the teacher of policies that see only pictures.
+It keeps distance to walls and people, and slows down, waits or backs off instead of pushing. Its success shows that an
+episode is feasible, and it is the teacher of policies that receive only images.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from sim_hil.benchmark.suite.robots import max_step_m
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
 
-PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)  # where a reasoning model is asked to say that it will be
-_REPLAN_TICKS: Final = 5
-_REACH_M: Final = 10.0  # length of the way looked at: 9 s of it, and what the last steps need to aim at
-_SIGHT_M: Final = 7.0  # people further away do not matter yet
-_VIEW_M: Final = 12.0  # who stands about within this is led round
-_STANDING_MPS: Final = 0.25
-_OFF_ROUTE_M: Final = 0.6
-NEAR: Final = 0.8  # of the threshold: so near has arrived for certain
-_END_M: Final = 0.4
+PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)  # times of the waypoints that the language model writes
+_REPLAN_TICKS: Final = 5  # control periods between two searches of the route
+_REACH_M: Final = 10.0  # length of the planned route: 9 s of driving, plus the look-ahead of the last steps
+_SIGHT_M: Final = 7.0  # people beyond this distance are ignored when choosing a velocity
+_VIEW_M: Final = 12.0  # the route avoids standing people within this distance
+_STANDING_MPS: Final = 0.25  # mean speed below which a person counts as standing
+_OFF_ROUTE_M: Final = 0.6  # distance from the route beyond which a new one replaces it
+NEAR: Final = 0.8  # share of the goal threshold within which the expert may end its route
+_END_M: Final = 0.4  # distance to the route's end at which it has arrived
 _STUCK_S: Final = 6.0
-_STUCK_M: Final = 0.5  # who has come no further than this in that time is stuck
+_STUCK_M: Final = 0.5  # progress below this within _STUCK_S counts as stuck
 
 
-# What the expert must know of a robot that the robot itself does not tell.
+# Driving parameters that the robot's own model does not contain.
 _DRIVINGS: Final[Mapping[str, Driving]] = MappingProxyType(
     {"go2": Driving(), "carter": Driving(body_radius_m=0.31, body_reach_m=0.12, margin_m=0.17)}
 )
 
 
 class ExpertPolicy:
-    """Drives by the world itself; needs `reset` with a world."""
+    """Privileged policy that plans on the episode's world; `reset` needs a world."""
 
     name = "expert"
     privileged = True
@@ -57,12 +57,13 @@ class ExpertPolicy:
         self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (),
         patient: bool = False, rests: bool = False, wall_m: float = 0.0,
     ) -> None:  # fmt: skip
-        """For a teacher: `margin_m` kept to people beyond what it keeps in the benchmark, `speed_mps` in its place.
+        """Create the benchmark's expert; a teacher sets further options.
 
-        `told`: the way, m, that its pupil is told in words, and that it keeps to where another one is shorter.
-        `patient`: it keeps its distance to people even after standing long, for it is its pupil that stands.
-        `rests`: it stands at its way's end, where the benchmark's, whose episode is over by then, turns about.
-        `wall_m`: wider than it is by so much on each side it drives where there is room: a pupil is less exact.
+        `margin_m`: distance kept to people in addition to the benchmark's. `speed_mps`: replaces the robot's
+        comfortable speed. `told`: the route of the student's instruction, points in m; the expert follows it even if
+        another one is shorter. `patient`: keep the distance to people even after standing for long, because it is the
+        student that stands. `rests`: stand at the route's end; in the benchmark the episode is over by then. `wall_m`:
+        width added to each side of the robot where there is room, because a student drives less exactly.
         """
         self._rests, self._wall_m = rests, wall_m
         self._patient = patient
@@ -73,15 +74,15 @@ class ExpertPolicy:
         self._choice: Choice | None = None
 
     def alike(self) -> ExpertPolicy:
-        """Another one that drives as this one does, told no way."""
+        """Return a new expert with the same options, without a prescribed route."""
         return ExpertPolicy(
             margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient, wall_m=self._wall_m
         )
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Plan the episode. Raises ValueError without a world, or where the goal cannot be reached."""
+        """Plan the episode. Raises ValueError without a world or if the goal cannot be reached."""
         if world is None:
-            raise ValueError("expert: expected the episode's world, which only a privileged policy is given")
+            raise ValueError("expert: expected the episode's world in reset(), found None")
         planner = RoutePlanner(
             world.scene,
             episode.goal_xy,
@@ -92,7 +93,7 @@ class ExpertPolicy:
         )
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):
-            raise ValueError(f"expert: episode {episode.id}: no way from the start to the goal for a {episode.robot}")
+            raise ValueError(f"expert: episode {episode.id}: no path from the start to the goal for a {episode.robot}")
         driving = _DRIVINGS[episode.robot]
         self._world, self._planner = world, planner
         self._goal, self._threshold_m = episode.goal_xy, episode.threshold_m
@@ -108,10 +109,10 @@ class ExpertPolicy:
         self._ticks = 0
         self._choice = None
         self._left: list[float] = []
-        self._paces = np.ones(episode.people)  # nobody is known to stand before having been watched
+        self._paces = np.ones(episode.people)  # m/s; until observed, every person counts as walking
 
     def act(self, observation: Observation) -> Velocity:
-        """The next velocity, by the world as it is now."""
+        """Choose the next velocity from the world's current state."""
         world = self._running()
         pose = world.pose()
         people, velocities = self._watch(world)
@@ -138,7 +139,7 @@ class ExpertPolicy:
         return (self._choice.vx_mps, 0.0, self._choice.wz_radps)
 
     def _is_there(self, pose: SE2) -> bool:
-        """Whether it has arrived, and its way ends here."""
+        """Return whether the robot is at the goal and at the end of its route."""
         (x, y), end = self._goal, self._route[-1]
         arrived = hypot(x - pose.x_m, y - pose.y_m) < self._threshold_m
         return arrived and hypot(end[0] - pose.x_m, end[1] - pose.y_m) < _END_M
@@ -149,7 +150,7 @@ class ExpertPolicy:
         return self._world
 
     def _watch(self, world: EpisodeWorld) -> tuple[Array, Array]:
-        """Where everybody is and how they walk; keeps each one's pace over the last second or two."""
+        """Return people's positions [k, 2] and velocities [k, 2]; update each one's mean speed over about 1 s."""
         people, velocities = world.people()[:, :2], world.people_velocities()
         self._paces += 0.1 * (np.hypot(velocities[:, 0], velocities[:, 1]) - self._paces)
         return people, velocities
@@ -159,7 +160,7 @@ class ExpertPolicy:
         return hypot(x - pose.x_m, y - pose.y_m) < _OFF_ROUTE_M
 
     def _patience(self) -> float:
-        """1 while it comes on; less and less, down to 0.3, the longer it is stuck."""
+        """Return 1 while the robot makes progress; the longer it is stuck, the less, down to 0.3."""
         ticks = round(_STUCK_S / CONTROL_S)
         if self._patient or len(self._left) <= ticks:
             return 1.0
@@ -171,24 +172,24 @@ class ExpertPolicy:
         return max(0.3, 1.0 - 0.25 * stuck)
 
     def plan(self, times_s: Sequence[float] = PLAN_TIMES_S) -> list[Vec2]:
-        """Where it means to be at these times from now, m in the base frame (x forward, y left); costs next to nothing.
+        """Return the planned position at each time from now, m in the base frame (x forward, y left).
 
-        Along its way, at the comfortable speed as soon as it can be reached: where to go, not how to pass people.
+        Positions lie on the route, reached at the comfortable speed; they do not include avoiding people.
         """
         speed = self._choice.vx_mps if self._choice is not None else 0.0
         return along(self._route, self._running().pose(), speed, self._driving, times_s)
 
     @property
     def choice(self) -> Choice | None:
-        """What the last `act` chose."""
+        """Result of the last `act`."""
         return self._choice
 
     def route(self) -> Array:
-        """[n, 2]: the way ahead, m in the world, points 0.1 m apart."""
+        """Return the route ahead [n, 2], m in the world frame, points 0.1 m apart."""
         return self._route.copy()
 
     def notes(self) -> Mapping[str, object]:
-        """`waypoints`: `plan()`; `future`: the next 4 s as chosen, m in the base frame; `shift_m`: to the left."""
+        """Return `waypoints` (`plan()`), `future` (chosen path of 4 s, m, base frame) and `shift_m` (to the left)."""
         if self._choice is None:
             return {}
         pose = self._running().pose()
@@ -202,24 +203,24 @@ class ExpertPolicy:
         }
 
     def close(self) -> None:
-        """Forget the world."""
+        """Release the world."""
         self._world = None
 
 
 def driving_of(robot: str) -> Driving:
-    """How a robot drives; raises KeyError for an unknown one."""
+    """Return a robot's driving parameters. Raises KeyError for an unknown robot."""
     return _DRIVINGS[robot]
 
 
 def along(route: Array, pose: SE2, speed_mps: float, driving: Driving, times_s: Sequence[float]) -> list[Vec2]:
-    """Where one is at these times on a route, m in the frame of `pose`.
+    """Return the position on a route at each time from now, m in the frame of `pose`.
 
-    `route` [n, 2] m in the world: points SPACING_M apart, from here on.
+    `route` [n, 2]: points ahead, m in the world frame, SPACING_M apart.
     """
     marks = np.arange(len(route)) * SPACING_M
     points = []
     for time_s in times_s:
-        # Speeding up to the comfortable speed, then on at it.
+        # Accelerate to the comfortable speed, then keep it.
         rise_s = min(max(driving.speed_mps - speed_mps, 0.0) / driving.accel_mps2, time_s)
         gone = (speed_mps + 0.5 * driving.accel_mps2 * rise_s) * rise_s + driving.speed_mps * (time_s - rise_s)
         x, y = float(np.interp(gone, marks, route[:, 0])), float(np.interp(gone, marks, route[:, 1]))
@@ -229,7 +230,7 @@ def along(route: Array, pose: SE2, speed_mps: float, driving: Driving, times_s: 
 
 
 def from_here(route: Array, pose: SE2) -> Array:
-    """The part of a route that is still ahead."""
+    """Return the part of a route that lies ahead of `pose`."""
     gaps = np.hypot(route[:15, 0] - pose.x_m, route[:15, 1] - pose.y_m)
     nearest = int(np.argmin(gaps))
     return route[nearest:] if len(route) - nearest >= 2 else route[-2:]

@@ -1,8 +1,8 @@
-"""How the expert moves along its way among people: many short futures are driven in thought, and the best one begun.
+"""Local planner of the expert: simulate many short motions along the route among people, and begin the best one.
 
-Each future follows the way at one speed, shifted to one side by some distance, or turns, waits or backs off; people go
-on as they walk. A future is judged by how far it comes, how near it passes people and walls, and how jerky it starts.
-Sampled velocities with predicted people: after van den Berg's velocity obstacles and Fox's dynamic window.
+Each candidate ("future") follows the route at one speed, shifted sideways by some distance, or turns, waits or backs
+off. People are predicted at constant velocity. The cost rates progress, distance to people and walls, and changes of
+the command. The method combines Fox's dynamic window with van den Berg's velocity obstacles.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ Array = NDArray[np.float64]
 STEP_S: Final = 0.2
 STEPS: Final = 20
 CONTROL_S: Final = 0.1
-PERSON_M: Final = 0.5  # the benchmark's collision distance, centre to centre
+PERSON_M: Final = 0.5  # the benchmark's collision distance between robot and person, centre to centre
 _SHIFTS_M: Final = (0.0, 0.18, -0.18, 0.4, -0.4, 0.7, -0.7, 1.1, -1.1, 1.6, -1.6)
 _SIDES: Final = np.array(_SHIFTS_M)
 _PACES: Final = (1.0, 0.75, 0.5, 0.25)
-# Futures that do not follow the way: share of the top speed, share of the top turning rate.
+# Candidates that do not follow the route: share of the top speed, share of the top turning rate.
 _FIXED: Final = ((0.0, 0.0), (0.0, 0.7), (0.0, -0.7), (-0.25, 0.0), (-0.25, 0.4), (-0.25, -0.4))
 
 
 @dataclass(frozen=True)
 class Driving:
-    """How a robot is driven: comfortable limits, and distances kept; m, s, rad."""
+    """Driving parameters of a robot: comfortable limits and distances; m, s, rad."""
 
     speed_mps: float = 1.0
     turn_radps: float = 1.0
@@ -51,9 +51,9 @@ class Driving:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen: the velocity to command, and the future that it begins.
+    """The chosen velocity and the predicted motion that it begins.
 
-    `future` [STEPS, 2] m in the world and `headings_rad` [STEPS], at STEP_S, 2 STEP_S, … from now.
+    `future` [STEPS, 2], m in the world frame, and `headings_rad` [STEPS], at STEP_S, 2 STEP_S, ... from now.
     """
 
     vx_mps: float
@@ -62,11 +62,11 @@ class Choice:
     headings_rad: Array
     shift_m: float
     cost: float
-    """Below zero: it comes ahead; much above: something is in the way."""
+    """Negative: the robot makes progress; far above zero: the route is blocked."""
 
 
 class Motion:
-    """Chooses velocities, one every CONTROL_S; remembers the last, for smoothness."""
+    """Local planner that chooses a velocity every CONTROL_S and keeps the last one for smoothness."""
 
     def __init__(self, grid: NavGrid, driving: Driving) -> None:
         self._grid = grid
@@ -95,12 +95,12 @@ class Motion:
         *,
         patience: float = 1.0,
     ) -> Choice:
-        """The velocity for the next control period.
+        """Choose the velocity for the next control period.
 
-        `pose` x m, y m, heading rad; `speed_mps` measured; `route` [n, 2] points SPACING_M apart from here on;
-        `people` [k, 2] m, `velocities` [k, 2] m/s. `patience` below 1 lets it pass people closer than is comfortable.
+        `pose`: x m, y m, heading rad. `speed_mps`: measured. `route` [n, 2]: points ahead, SPACING_M apart. `people`
+        [k, 2] m, `velocities` [k, 2] m/s. A `patience` below 1 permits passing people closer than is comfortable.
         """
-        # A robot that something holds back must not think that it still drives at the speed it was told.
+        # If something blocks the robot, its real speed differs from the commanded one: stay close to the measurement.
         self._speed = min(max(self._speed, speed_mps - 0.35), speed_mps + 0.35)
         x, y, v, turned, wanted_v, wanted_w = self._drive(pose, route)
         cost = self._progress(x, y, route) + self._walls(x, y, turned)
@@ -120,7 +120,7 @@ class Motion:
         return Choice(self._speed, self._turn, future, turned[:, best].copy(), self._shift, float(cost[best]))
 
     def stand(self, pose: tuple[float, float, float], speed_mps: float) -> Choice:
-        """Brake and then stand, whoever comes: for who has arrived. `speed_mps` measured."""
+        """Brake and stand, regardless of people: for a robot at its goal. `speed_mps`: measured."""
         driving = self._driving
         v = _stopping(speed_mps, driving.brake_mps2, self._times)
         w = _stopping(self._turn, driving.turn_accel_radps2, self._times)
@@ -132,18 +132,18 @@ class Motion:
         return Choice(self._speed, self._turn, np.array(pose[:2]) + np.cumsum(ways, axis=0), headings, 0.0, 0.0)
 
     def _drive(self, pose: tuple[float, float, float], route: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """All futures at once: x, y, v, heading [STEPS, futures], and what each wants first, v and w."""
+        """Simulate all candidates: x, y, v, heading [STEPS, candidates], and the first commanded v and w of each."""
         driving, count = self._driving, len(self._pace)
         line, left = _line_and_left(route)
         last = len(line) - 1
-        # The way, shifted to each side, flat: where a future aims is one look-up.
+        # The route shifted to each side, flattened, so that a candidate's target point is one look-up.
         aims_x = (line[:, 0] + _SIDES[:, None] * left[:, 0]).ravel()
         aims_y = (line[:, 1] + _SIDES[:, None] * left[:, 1]).ravel()
         row = self._side_row * (last + 1)
         x, y, heading = (np.full(count, value) for value in pose)
         c, s = np.cos(heading), np.sin(heading)
         v, w = np.full(count, self._speed), np.full(count, self._turn)
-        # Where along the way the robot is: the nearest of the first few points.
+        # The robot's position along the route: the nearest of the first points.
         gaps = np.hypot(line[:15, 0] - pose[0], line[:15, 1] - pose[1])
         along = np.full(count, float(np.argmin(gaps)) * SPACING_M)
         out = np.empty((4, STEPS, count))
@@ -159,7 +159,7 @@ class Motion:
             aimed = np.maximum(fore, 0.0) / np.maximum(np.sqrt(fore * fore + side * side), 1e-6)
             want_v = np.where(self._is_fixed, self._fixed_v, self._pace * aimed * aimed)
             turning = np.minimum(np.maximum(1.8 * error, -top), top)
-            # Waiting is standing still unless the way lies off to one side.
+            # A waiting robot stands still unless the route lies to one side.
             turning = np.where(self._waits & (np.abs(error) < 0.5), 0.0, turning)
             want_w = np.where(self._is_fixed, self._fixed_w, turning)
             if step == 0:
@@ -175,7 +175,7 @@ class Motion:
         return out[0], out[1], out[2], out[3], *first
 
     def _progress(self, x: Array, y: Array, route: Array) -> Array:
-        """Minus the share of the way at top speed that a future comes along the route; [futures]."""
+        """Return the progress cost [candidates]: minus the distance along the route, relative to that at top speed."""
         end = np.stack((x[-1], y[-1]), axis=1)
         gaps = np.hypot(end[:, None, 0] - route[None, :, 0], end[:, None, 1] - route[None, :, 1])
         nearest = np.argmin(gaps, axis=1)
@@ -185,13 +185,13 @@ class Motion:
         return np.asarray(-(nearest * SPACING_M - behind - off) / reach)
 
     def _walls(self, x: Array, y: Array, heading: Array) -> Array:
-        """What coming near solid things costs; [futures]."""
+        """Return the cost of approaching obstacles [candidates]."""
         driving = self._driving
         dx, dy = driving.body_reach_m * np.cos(heading), driving.body_reach_m * np.sin(heading)
         nose = self._grid.clearances_at(np.stack((x + dx, y + dy), axis=-1))
         tail = self._grid.clearances_at(np.stack((x - dx, y - dy), axis=-1))
         room = np.minimum(nose, tail) - driving.body_radius_m
-        # From where it stands now it may always leave, also a place that is too narrow.
+        # The robot may always leave its current place, even if that is too narrow.
         here = float(np.min(room[0])) if len(room) else 0.0
         hit = _within((min(0.08, here) - room) / 0.1, 2.0)
         tight = _within(1.0 - room / 0.25, 1.0)
@@ -200,24 +200,24 @@ class Motion:
     def _people(
         self, x: Array, y: Array, v: Array, heading: Array, people: Array, velocities: Array, patience: float
     ) -> Array:
-        """What passing near people costs; [futures]."""
+        """Return the cost of passing near people [candidates]."""
         times = np.minimum(self._times, 3.0)
         px = people[:, 0] + velocities[:, 0] * times[:, None]
         py = people[:, 1] + velocities[:, 1] * times[:, None]
         driving = self._driving
         dx, dy = x[:, None, :] - px[:, :, None], y[:, None, :] - py[:, :, None]
-        # From the middle the benchmark's distance counts, at the nose what would touch.
+        # At the robot's centre the benchmark's collision distance applies, at its front physical contact.
         reach_x, reach_y = driving.body_reach_m * np.cos(heading), driving.body_reach_m * np.sin(heading)
         nose = np.sqrt((dx + reach_x[:, None, :]) ** 2 + (dy + reach_y[:, None, :]) ** 2)
         gaps = np.minimum(np.sqrt(dx * dx + dy * dy) - PERSON_M, nose - (driving.body_radius_m + PERSON_RADIUS_M))
-        # Nobody walks exactly as foreseen, least of all somebody who walks fast.
+        # Predictions are uncertain, more so for fast walkers.
         unsure = 0.05 * self._times[:, None] * np.minimum(np.hypot(velocities[:, 0], velocities[:, 1]), 1.5)
-        # The slower, the nearer it may pass; and so it may who has waited long.
+        # The robot may pass closer at low speed and after a long wait.
         margin_m = driving.margin_m * max(patience, 0.4) * (0.4 + 0.6 * _within(np.abs(v) / 0.8, 1.0))
         room = gaps - margin_m[:, None, :] - np.minimum(unsure, 0.25)[:, :, None]
         hit = _within(-room / 0.25, 2.5)
         near = _within(1.0 - room / (driving.comfort_m * patience), 1.0)
-        # People walk round a robot that stands: running into it is up to them. Into one that drives, less so.
+        # People avoid a standing robot, so contact then is mostly their responsibility; less so if the robot moves.
         blame = (0.3 + 0.7 * _within(np.abs(v) / 0.35, 1.0))[:, None, :]
         weights = self._near_term[:, None, None] * blame
         worst = np.max(hit * weights, axis=0)
@@ -229,7 +229,7 @@ class Motion:
 
 
 def _line_and_left(route: Array) -> tuple[Array, Array]:
-    """The route with at least two points, and the unit vector to the left of the way at each."""
+    """Return the route with at least two points, and the unit vector to its left at each point."""
     if len(route) < 2:
         route = np.vstack((route, route + np.array((1e-3, 0.0))))
     ways = np.diff(route, axis=0, append=2 * route[-1:] - route[-2:-1])
@@ -238,7 +238,7 @@ def _line_and_left(route: Array) -> tuple[Array, Array]:
 
 
 def _stopping(value: float, rate: float, times_s: NDArray[np.floating]) -> Array:
-    """What is left at these times of a value that is brought to zero."""
+    """Return a value at the given times while it is reduced to zero at a constant rate."""
     return np.asarray(np.sign(value) * np.maximum(abs(value) - rate * times_s, 0.0))
 
 
@@ -247,5 +247,5 @@ def _slew(value: float, target: float, down: float, up: float) -> float:
 
 
 def _within(values: Array, top: float) -> Array:
-    """Clipped to 0..top, without numpy.clip's overhead, which counts for arrays as small as these."""
+    """Clip to 0..top; faster than numpy.clip for small arrays."""
     return np.minimum(np.maximum(values, 0.0), top)

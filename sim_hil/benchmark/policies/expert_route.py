@@ -1,7 +1,7 @@
-"""Where the expert means to go: the cheapest way to the goal with room to spare, led round people who stand in it.
+"""Route planner of the expert: the cheapest path to the goal, with clearance to walls and around standing people.
 
-Ways are searched for on cells twice as wide as the navigation grid's, each standing for its roomiest point, so that the
-whole scene can be searched anew, with a price on the places that people take up, twice a second.
+The search uses cells twice as wide as the navigation grid's; each is represented by its point with most clearance.
+This makes a search of the whole scene, with a price for standing people, fast enough to run twice a second.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from sim_hil.scene.scene import Scene, Vec2
 Array = NDArray[np.float64]
 
 SPACING_M: Final = 0.1  # between the points of a route
-ROOM_M: Final = 0.5  # nearer than this beyond its clearance to a wall, a metre costs more
-_WALL_PRICE: Final = 3.0  # a metre right along a wall costs so much more
-_STREET_PRICE: Final = 4.0  # a metre of street, off the crossings, costs so many
-# Distance from somebody who stands there, m, and what a metre costs more at it: between two people one may pass.
+ROOM_M: Final = 0.5  # clearance beyond the required one below which a metre costs more
+_WALL_PRICE: Final = 3.0  # extra price of a metre directly along a wall
+_STREET_PRICE: Final = 4.0  # factor on the price of a metre of street outside the crossings
+# Distance from a standing person, m, and the extra price of a metre there; passing between two people is possible.
 _CROWD: Final = ((0.5, 60.0), (0.7, 12.0), (1.4, 0.0))
-_WAY_M: Final = 2.0  # nearer than this to the way that it was told, it is on it
-_STRAY_PRICE: Final = 5.0  # twice as far from it, a metre costs so much more
-_SHORT_PRICE: Final = 4.0  # each metre that one ends short of the goal is as bad as so many metres of way
-_SHUFFLE_M: Final = 0.25  # who moves by less than this has not moved
-_NO_ROOM: Final = 1000.0
-_DETOUR: Final = 1.01  # a straight piece may cost so much more than the crooked one
-_KEEP: Final = (1.2, 2.5)  # the way so far is kept while it costs at most so many times a better one, and so much more
+_WAY_M: Final = 2.0  # distance from the prescribed route within which a cell counts as on it
+_STRAY_PRICE: Final = 5.0  # extra price of a metre at twice that distance
+_SHORT_PRICE: Final = 4.0  # price of each metre between the route's end and the goal
+_SHUFFLE_M: Final = 0.25  # movements of a standing person below this do not trigger a new search
+_NO_ROOM: Final = 1000.0  # price of a metre without clearance
+_DETOUR: Final = 1.01  # a straight segment may cost up to this factor more than the segment it replaces
+_KEEP: Final = (1.2, 2.5)  # the previous route is kept while it costs at most 1.2 times the new one plus 2.5
 
 
 class RoutePlanner:
-    """Ways to one goal. `clearance_m` is the least distance from the robot's centre to anything solid.
+    """Planner of routes to one goal.
 
-    Within `near_m` of the goal is near enough where people keep the robot from the goal itself. `told`, m, is the way
-    to keep to where there are several. Raises ValueError when the scene has no room for it.
+    `clearance_m`: least distance from the robot's centre to an obstacle. `near_m`: a route may end within this distance
+    of the goal if people occupy it. `told`: points (m) of a prescribed route that is preferred. Raises ValueError if
+    the scene has no free space.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class RoutePlanner:
         lack = np.clip(1.0 - (self.grid.clearances - self.grid.required_m) / ROOM_M, 0.0, 1.0)
         price = 1.0 + _WALL_PRICE * lack * lack
         street = np.zeros(self.grid.shape, np.uint8)
-        # Crossings last: they are streets that one may cross.
+        # Crossings come last, because they overlap streets.
         for kind, value in (("street", 1), ("crossing", 0)):
             for area in scene.areas:
                 if area.kind == kind:
@@ -74,7 +75,7 @@ class RoutePlanner:
         return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
 
     def _stray_price(self, told: Sequence[Vec2]) -> Array:
-        """What leaving the told way multiplies the price of each cell by."""
+        """Return the price factor of each cell for leaving the prescribed route."""
         off = np.ones(self.grid.shape, np.uint8)
         if not told:
             return off.astype(np.float64)
@@ -84,7 +85,7 @@ class RoutePlanner:
         return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)
 
     def _coarsen(self) -> None:
-        """Join every two by two cells to one: free where one of them is, and standing for the roomiest of them."""
+        """Merge blocks of 2 x 2 cells: free if one of them is, represented by the one with most clearance."""
         grid = self.grid
         rows, columns = (size + size % 2 for size in grid.shape)
         room = np.full((rows, columns), -np.inf)
@@ -110,7 +111,7 @@ class RoutePlanner:
         self._goal_node = self._node(*self._goal)
 
     def _node(self, x_m: float, y_m: float) -> int:
-        """The node of the free cell nearest to a point; -1 where there is none within reach."""
+        """Return the node of the free cell nearest to a point; -1 if there is none nearby."""
         point = self.grid.nearest_free(x_m, y_m)
         if point is None:
             return -1
@@ -118,7 +119,7 @@ class RoutePlanner:
         return int(self._ids[row // 2, column // 2])
 
     def _ends_near(self, near_m: float) -> tuple[NDArray[np.int64], Array]:
-        """Nodes at which one has arrived, and what each is worse than the goal itself."""
+        """Return the nodes at which a route may end, and the extra price of each compared with the goal."""
         if self._goal_node < 0:
             return np.zeros(0, np.int64), np.zeros(0)
         gaps = np.hypot(self._nodes[:, 0] - self._goal[0], self._nodes[:, 1] - self._goal[1])
@@ -129,13 +130,13 @@ class RoutePlanner:
         return ends, np.where(ends == self._goal_node, 0.0, _SHORT_PRICE * gaps[ends])
 
     def _search(self, standing: Array) -> tuple[Array, NDArray[np.int32]]:
-        """Cost of the way to the goal from every node, and each one's next, people standing at [k, 2]."""
+        """Return each node's cost to the goal and its next node, with people standing at [k, 2] m."""
         if self._goal_node < 0:
             return np.full(len(self._nodes), np.inf), np.full(len(self._nodes), -1, np.int32)
         price = self._node_price + _crowd_price(self._nodes, standing)
         joins = self._links
         data = joins.data * 0.5 * (price[self._link_source] + price[joins.indices])
-        # One more node is joined to every place at which one has arrived.
+        # An additional node is linked to every possible end.
         count, total = len(self._nodes), joins.nnz + len(self._ends)
         priced = csr_matrix(
             (
@@ -149,19 +150,19 @@ class RoutePlanner:
         return costs[:count], np.where(onwards[:count] == count, -1, onwards[:count])
 
     def reachable(self, x_m: float, y_m: float) -> bool:
-        """Whether there is a way to the goal from a point."""
+        """Return whether a path leads from a point to the goal."""
         return bool(np.isfinite(self.left(x_m, y_m)))
 
     def left(self, x_m: float, y_m: float) -> float:
-        """Price of the way left to the goal, nobody being in it; a metre with room costs 1."""
+        """Return the price of the path left to the goal without people; a metre with clearance costs 1."""
         node = self._node(x_m, y_m)
         return float(self._empty_costs[node]) if node >= 0 else float("inf")
 
     def route(self, start: Vec2, standing: Array, reach_m: float, before: Array | None = None) -> Array:
-        """[n, 2]: points SPACING_M apart from `start` towards the goal, up to `reach_m` of way, led round people.
+        """Return points [n, 2] SPACING_M apart from `start` towards the goal, up to `reach_m`, around people.
 
-        `standing` [k, 2]: who stands about, m. `before`: the route so far, from here on; it is kept unless another is
-        clearly better. Just the start where there is no way.
+        `standing` [k, 2]: positions of standing people, m. `before`: the rest of the previous route, kept unless the
+        new one is clearly better. Without a path, the result is only the start.
         """
         searched = np.round(standing / _SHUFFLE_M).tobytes()
         if searched != self._searched:
@@ -187,7 +188,7 @@ class RoutePlanner:
         return kept if self._price_of(kept, standing) <= share * worth + more else fresh
 
     def _extended(self, line: Array, reach_m: float) -> Array:
-        """A route lengthened to its reach along the newest search."""
+        """Return a route extended to `reach_m` along the newest search."""
         missing = reach_m - SPACING_M * (len(line) - 1)
         node = self._node(float(line[-1, 0]), float(line[-1, 1]))
         if missing < 1.0 or node < 0 or hypot(*(line[-1] - np.array(self._goal))) < 2 * SPACING_M:
@@ -203,13 +204,13 @@ class RoutePlanner:
         return np.vstack((line, self._relaxed(_spaced(points))[1:]))
 
     def _price_of(self, line: Array, standing: Array) -> float:
-        """What a route costs, and the way from its end on to the goal."""
+        """Return the price of a route and of the path from its end to the goal."""
         node = self._node(float(line[-1, 0]), float(line[-1, 1]))
         rest = float(self._costs[node]) if node >= 0 else float("inf")
         return float(np.sum(self._prices_at(line, standing))) * SPACING_M + rest
 
     def _straightened(self, line: Array, standing: Array) -> Array:
-        """The way with every detour of the grid replaced by a straight piece that costs no more."""
+        """Return the route with the grid's detours replaced by straight segments of at most the same price."""
         prices = self._prices_at(line, standing)
         paid = np.concatenate(((0.0,), np.cumsum(0.5 * (prices[1:] + prices[:-1])))) * SPACING_M
 
@@ -235,7 +236,7 @@ class RoutePlanner:
         return _spaced([(float(x), float(y)) for x, y in line[corners]])
 
     def _prices_at(self, points: Array, standing: Array) -> Array:
-        """Price of a metre at each point [n, 2], people included; prohibitive where there is no room."""
+        """Return the price of a metre at each point [n, 2], people included; _NO_ROOM without clearance."""
         column = ((points[:, 0] - self.grid.origin_m[0]) / self.grid.resolution_m).astype(np.int64)
         row = ((points[:, 1] - self.grid.origin_m[1]) / self.grid.resolution_m).astype(np.int64)
         row, column = np.clip(row, 0, self.grid.shape[0] - 1), np.clip(column, 0, self.grid.shape[1] - 1)
@@ -243,7 +244,7 @@ class RoutePlanner:
         return np.asarray(price + _crowd_price(points, standing))
 
     def _relaxed(self, line: Array) -> Array:
-        """The same way with its corners rounded, as far as there is room."""
+        """Return the route with its corners rounded where clearance permits."""
         if len(line) < 5:
             return line
         rounded = _smooth(_smooth(line, 5), 3)
@@ -252,19 +253,19 @@ class RoutePlanner:
 
 
 def _crowd_price(points: Array, standing: Array) -> Array:
-    """What a metre at each point [n, 2] costs more for those who stand about [k, 2]."""
+    """Return the extra price of a metre at each point [n, 2] due to standing people [k, 2]."""
     price = np.zeros(len(points))
     gaps_m, prices = zip(*_CROWD, strict=True)
     for x, y in standing:
         near = np.flatnonzero((np.abs(points[:, 0] - x) < gaps_m[-1]) & (np.abs(points[:, 1] - y) < gaps_m[-1]))
         gap = np.hypot(points[near, 0] - x, points[near, 1] - y)
-        # The dearest of those around: in a dense group a metre is no worse than in the middle of one person.
+        # The maximum, not the sum: a metre in a dense group costs no more than one through a single person.
         price[near] = np.maximum(price[near], np.interp(gap, gaps_m, prices))
     return price
 
 
 def _spaced(points: list[Vec2]) -> Array:
-    """The polyline as points SPACING_M apart."""
+    """Resample a polyline to points SPACING_M apart."""
     line = np.array(points)
     steps = np.hypot(*np.diff(line, axis=0).T) if len(line) > 1 else np.zeros(0)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
@@ -273,7 +274,7 @@ def _spaced(points: list[Vec2]) -> Array:
 
 
 def _smooth(line: Array, half: int) -> Array:
-    """Each point moved to the mean of the `half` before and after it; the ends stay."""
+    """Return each point's mean over `half` neighbours on both sides; the ends stay fixed."""
     padded = np.vstack((np.repeat(line[:1], half, 0), line, np.repeat(line[-1:], half, 0)))
     sums = np.cumsum(np.vstack((np.zeros((1, 2)), padded)), axis=0)
     smooth = (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)

@@ -1,8 +1,8 @@
-"""A policy that runs elsewhere: drives an episode by asking a server over `external_protocol`.
+"""Policy on a server, reached over `external_protocol`.
 
-The server is untrusted: whatever it answers is checked, and its velocities are cut to the robot's limits. With a
-latency an answer to the observation of time t is in force from t + L on, and meanwhile the last one is: one request at
-a time, as a model would run on the robot.
+The server is untrusted: its answers are checked and its velocities clipped to the robot's limits. With a latency L, the
+answer to the observation at time t takes effect at t + L; until then the previous command stays in force. Only one
+request is open at a time, as with a model on the robot.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MAX_WAYPOINTS = 32
 
 
 class ExternalPolicy:
-    """One connection; close it at the end. Methods raise ExternalError with one line when the server misbehaves."""
+    """Policy on a server: one connection, to be closed. Methods raise ExternalError (one line) on a bad answer."""
 
     privileged = False
 
@@ -70,7 +70,7 @@ class ExternalPolicy:
         self._seen_ns: int | None = None
         self._notes: dict[str, Any] = {}
         self.clipped = 0
-        """Answers beyond the limits so far in this episode."""
+        """Number of answers beyond the robot's limits so far in this episode."""
 
     def _welcome(self) -> None:
         peer = self._channel.peer
@@ -89,26 +89,24 @@ class ExternalPolicy:
         check_keys(self._image, {"width", "height", "encoding"}, set(), peer)
         sides = (self._image["width"], self._image["height"])
         if not all(type(side) is int and 32 <= side <= MAX_IMAGE_PX for side in sides):
-            raise ExternalError(
-                f"{peer}: expected a picture of 32 to {MAX_IMAGE_PX} pixels a side, found {sides}"[:300]
-            )
+            raise ExternalError(f"{peer}: expected an image of 32 to {MAX_IMAGE_PX} pixels a side, found {sides}"[:300])
         if self._image["encoding"] not in ENCODINGS:
-            raise ExternalError(f"{peer}: expected a picture encoding of {', '.join(ENCODINGS)}")
+            raise ExternalError(f"{peer}: expected an image encoding of {', '.join(ENCODINGS)}")
 
     @property
     def needs_image(self) -> bool:
-        """Whether the server asked for pictures."""
+        """Whether the server requested images."""
         return self._image is not None
 
     @property
     def camera(self) -> tuple[int, int] | None:
-        """(width, height) of the picture that the server asked for."""
+        """Image size (width, height) that the server requested, px; None: no image."""
         return None if self._image is None else (self._image["width"], self._image["height"])
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
-        """Tell the server that an episode begins; it is told nothing that a robot would not know.
+        """Announce an episode to the server, without information that a robot would not have.
 
-        Episode and seed are told as numbers derived from them: an id names the goal, and the seed is the crowd's.
+        Episode id and seed are sent as hashes, because the id names the goal and the seed determines the crowd.
         """
         self._sampler = None if self._latency is None else LatencySampler(self._latency, seed, episode.id)
         self._step, self._due_ns, self._asked_ns, self.clipped = 0, 0, 0, 0
@@ -129,7 +127,7 @@ class ExternalPolicy:
         check_keys(self._channel.receive("ready").header, set(), set(), self._channel.peer)
 
     def act(self, observation: Observation) -> tuple[float, float, float]:
-        """The command in force after this observation."""
+        """Return the command in force after this observation."""
         now_ns = round(observation.time_s * 1e9)
         if self._answer is not None and now_ns >= self._due_ns:
             self._take()
@@ -167,7 +165,7 @@ class ExternalPolicy:
 
     def _picture(self, image: npt.NDArray[np.uint8] | None) -> bytes:
         if image is None or image.shape != (self._image["height"], self._image["width"], 3):
-            raise ExternalError("the world renders no picture of the size that the server asked for")
+            raise ExternalError("expected an observation with an image of the size that the server requested")
         return encode_image(image, self._image["encoding"])
 
     def _within_limits(self, velocity: tuple[float, ...]) -> tuple[float, float, float]:
@@ -181,12 +179,12 @@ class ExternalPolicy:
         return cut
 
     def notes(self) -> dict[str, Any]:
-        """Age of the observation behind the command in force, the server's text and waypoints."""
+        """Return `delay_s` (age of the command's observation), the server's `text` and `waypoints`, and `clipped`."""
         return {**self._notes, "clipped": self.clipped}
 
     def close(self) -> None:
-        """Say goodbye."""
-        with suppress(ExternalError):  # it may have gone already
+        """Announce the end to the server and close the connection."""
+        with suppress(ExternalError):  # the server may have closed it already
             self._channel.send({"type": "bye"})
         self._channel.close()
 

@@ -1,8 +1,8 @@
-"""Wire format between the benchmark and a policy server: JSON headers, pictures as bytes behind them; version 1.
+"""Wire format between the benchmark and a policy server: JSON headers followed by image bytes; version 1.
 
 A message is 4 bytes of header length (big-endian), the header (UTF-8 JSON object), then `payload_bytes` bytes, if the
-header has that key. `docs/benchmark.md` describes the conversation. Each side treats the other as untrusted: lengths
-are bounded before anything is read, every field is checked, and nothing received is ever run.
+header has that key. `docs/benchmark.md` describes the order of messages. Each side treats the other as untrusted:
+lengths are bounded before reading, every field is checked, and received data is never executed.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ _LENGTH = struct.Struct(">I")
 
 
 class ExternalError(RuntimeError):
-    """The other side is not there, too slow, or says something that it must not; one line."""
+    """The peer is absent, too slow, or sent an invalid message; one line."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """A header and the bytes behind it."""
+    """A header and its payload."""
 
     header: Mapping[str, Any]
     payload: bytes = b""
 
     @property
     def kind(self) -> str:
-        """What it is: the header's `type`."""
+        """Message type: the header's `type`."""
         return str(self.header.get("type", ""))
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a policy server listens: `HOST:PORT` or `unix:PATH`."""
+    """Address of a policy server: `HOST:PORT` or `unix:PATH`."""
 
     host: str = ""
     port: int = 0
@@ -58,7 +58,7 @@ class Address:
 
     @staticmethod
     def parse(text: str) -> Address:
-        """Raises ExternalError for anything else."""
+        """Parse `HOST:PORT` or `unix:PATH`. Raises ExternalError."""
         if text.startswith("unix:") and len(text) > len("unix:"):
             return Address(path=str(Path(text.removeprefix("unix:")).absolute()))
         host, _, port = text.rpartition(":")
@@ -67,7 +67,7 @@ class Address:
         return Address(host.strip("[]"), int(port))
 
     def connect(self, timeout_s: float) -> socket.socket:
-        """A connected socket with that timeout for every later call; raises OSError."""
+        """Return a connected socket with that timeout for every call. Raises OSError."""
         if not self.path:
             return socket.create_connection((self.host, self.port), timeout_s)
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -84,24 +84,24 @@ class Address:
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message. Raises ValueError if it is too large or holds a number that is not finite."""
+    """Encode a message. Raises ValueError if it is too large or contains a number that is not finite."""
     header = dict(message.header)
     if message.payload:
         header["payload_bytes"] = len(message.payload)
     data = json.dumps(header, allow_nan=False).encode()
     if len(data) > MAX_HEADER_BYTES or len(message.payload) > MAX_PAYLOAD_BYTES:
-        raise ValueError(f"message {message.kind}: {len(data)} + {len(message.payload)} bytes are too many")
+        raise ValueError(f"message {message.kind}: {len(data)} + {len(message.payload)} bytes exceed the maximum")
     return _LENGTH.pack(len(data)) + data + message.payload
 
 
 class Decoder:
-    """Takes bytes as they come and gives whole messages. Raises ExternalError on what is no message of ours."""
+    """Incremental decoder from bytes to messages. Raises ExternalError on invalid data."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[Message]:
-        """Messages that are complete now."""
+        """Add received bytes and return the messages that are now complete."""
         self._buffer += data
         messages: list[Message] = []
         while (found := self._next()) is not None:
@@ -139,17 +139,17 @@ def _header(data: bytes) -> dict[str, Any]:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 @dataclass
 class Channel:
-    """Whole messages over a connected socket. Every method raises ExternalError, also when the time is over."""
+    """Message channel over a connected socket. Every method raises ExternalError, also on timeout."""
 
     connection: socket.socket
     peer: str
     timeout_s: float | None = None
-    """For a whole message, however slowly its bytes come; None: for ever."""
+    """Timeout for one whole message, s; None: no timeout."""
     _decoder: Decoder = field(default_factory=Decoder)
     _waiting: list[Message] = field(default_factory=list)
 
@@ -159,17 +159,17 @@ class Channel:
         try:
             self.connection.sendall(encode(Message(header, payload)))
         except TimeoutError as error:
-            raise ExternalError(f"{self.peer}: takes no {header.get('type')} within the time allowed") from error
+            raise ExternalError(f"{self.peer}: timeout while sending {header.get('type')}") from error
         except OSError as error:
             raise ExternalError(f"{self.peer}: connection lost ({error.strerror or error})") from error
 
     def receive(self, *kinds: str) -> Message:
-        """The next message, which must be of one of these types; an `error` of the other side is raised as such."""
+        """Return the next message, which must have one of these types; the peer's `error` raises ExternalError."""
         end_ns = None if self.timeout_s is None else time.monotonic_ns() + round(self.timeout_s * 1e9)
         while not self._waiting:
             try:
                 if end_ns is not None:
-                    # A socket of timeout 0 does not wait at all, and says so with another exception.
+                    # A timeout of 0 would make the socket non-blocking, with another exception.
                     self.connection.settimeout(max((end_ns - time.monotonic_ns()) / 1e9, 1e-3))
                 data = self.connection.recv(1 << 16)
             except TimeoutError as error:
@@ -186,7 +186,7 @@ class Channel:
                 raise ExternalError(f"{self.peer}: {error}") from error
         message = self._waiting.pop(0)
         if message.kind == "error":
-            raise ExternalError(f"{self.peer} says: {text(message.header, 'message', self.peer)[:300]}")
+            raise ExternalError(f"{self.peer} reports: {text(message.header, 'message', self.peer)[:300]}")
         if message.kind not in kinds:
             raise ExternalError(f"{self.peer}: expected {' or '.join(kinds)}, found {message.kind[:40]!r}")
         return message
@@ -205,7 +205,7 @@ def check_keys(header: Mapping[str, object], required: set[str], optional: set[s
 
 
 def text(header: Mapping[str, object], key: str, peer: str, limit: int = MAX_TEXT_CHARS) -> str:
-    """A text of at most `limit` characters; raises ExternalError."""
+    """Return a text field of at most `limit` characters. Raises ExternalError."""
     value = header.get(key)
     if not isinstance(value, str) or len(value) > limit:
         raise ExternalError(f"{peer}: expected {key} to be a text of at most {limit} characters")
@@ -213,7 +213,7 @@ def text(header: Mapping[str, object], key: str, peer: str, limit: int = MAX_TEX
 
 
 def numbers(header: Mapping[str, object], key: str, count: int, peer: str) -> tuple[float, ...]:
-    """So many finite numbers; raises ExternalError."""
+    """Return a field of `count` finite numbers. Raises ExternalError."""
     value = header.get(key)
     if not isinstance(value, list) or len(value) != count:
         raise ExternalError(f"{peer}: expected {key} to be {count} numbers")
@@ -223,23 +223,23 @@ def numbers(header: Mapping[str, object], key: str, count: int, peer: str) -> tu
 
 
 def encode_image(rgb: npt.NDArray[np.uint8], encoding: str) -> bytes:
-    """uint8 RGB [h, w, 3] as JPEG, PNG or its own bytes, row by row."""
+    """Encode uint8 RGB [h, w, 3] as JPEG, PNG or raw bytes, row by row."""
     if encoding == "raw":
         return np.ascontiguousarray(rgb).tobytes()
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if encoding == "jpeg" else []
     done, data = cv2.imencode(".jpg" if encoding == "jpeg" else ".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
-        raise ValueError(f"a picture of shape {rgb.shape} cannot be written as {encoding}")
+        raise ValueError(f"an image of shape {rgb.shape} cannot be encoded as {encoding}")
     return bytes(data.tobytes())
 
 
 def decode_image(payload: bytes, encoding: str, width: int, height: int) -> npt.NDArray[np.uint8]:
-    """The picture [height, width, 3] RGB that `encode_image` has written; raises ExternalError."""
+    """Decode an image written by `encode_image` to RGB [height, width, 3]. Raises ExternalError."""
     if encoding == "raw":
         if len(payload) != width * height * 3:
-            raise ExternalError(f"picture of {len(payload)} bytes, expected {width}x{height}x3")
+            raise ExternalError(f"image of {len(payload)} bytes, expected {width}x{height}x3")
         return np.frombuffer(payload, dtype=np.uint8).reshape(height, width, 3)
     picture = cv2.imdecode(np.frombuffer(payload, dtype=np.uint8), cv2.IMREAD_COLOR) if payload else None
     if picture is None or picture.shape != (height, width, 3):
-        raise ExternalError(f"picture that is no {width}x{height} {encoding}")
+        raise ExternalError(f"expected an image of {width}x{height} px as {encoding}, found another one or none")
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)

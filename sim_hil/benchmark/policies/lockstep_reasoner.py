@@ -1,7 +1,7 @@
-"""The slow half in virtual time (paper appendix D, Algorithms 3 and 4): what was started at t is there at t + L.
+"""Reasoning in virtual time (paper appendix D, Algorithms 3 and 4): a generation started at t is released at t + L.
 
-No thread and no clock: `release` before each tick of the control loop, `start` after it. A generation is computed when
-it is released, from the frames that it captured; how long that really takes changes nothing.
+There is no thread and no clock: call `release` before each tick of the control loop and `start` after it. A generation
+is computed at its release from the frames that it captured, so its real computing time has no effect.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sim_hil.benchmark.conditions.latency import Timing
 
 @dataclass
 class _UnderWay:
-    """A generation that was started; its frames are there once it has captured its newest."""
+    """A started generation; `frames` is None until its newest frame is captured."""
 
     started_ns: int
     timing: Timing
@@ -49,7 +49,7 @@ class _UnderWay:
 
 
 class LockstepReasoner:
-    """One generation at a time; the next starts on the release of the one before (sync: when the robot stands)."""
+    """Reasoner that runs one generation at a time; the next starts at its release (sync: when the robot stands)."""
 
     def __init__(
         self,
@@ -81,20 +81,20 @@ class LockstepReasoner:
         if self._sync:
             slot.drive_until_ns = 0
         self.failure: str | None = None
-        """Why reasoning has ended for good; None while it goes on."""
+        """Why reasoning ended permanently; None while it runs."""
         self.failed = 0
         self.invalid_in_a_row = 0
-        """Complete texts up to the newest that were not of the grammar."""
+        """Number of consecutive complete texts, up to the newest, that the grammar rejects."""
         self.released: list[Mapping[str, Any]] = []
-        """One record a released generation, as JSON values."""
+        """One record per released generation, as JSON values."""
 
     @property
     def thinking_since_ns(self) -> int | None:
-        """When the generation under way was started; None while there is none."""
+        """Start time of the current generation, ns; None if there is none."""
         return None if self._under_way is None else self._under_way.started_ns
 
     def release(self, now_ns: int) -> None:
-        """Before a tick: publish the generation under way if its time has come."""
+        """Publish the current generation if its release time is reached; call before a tick."""
         job = self._under_way
         if job is None or job.frames is None or now_ns < job.release_ns:
             return
@@ -105,7 +105,7 @@ class LockstepReasoner:
             self._fail(str(error), now_ns)
 
     def start(self, now_ns: int) -> None:
-        """After a tick, which has put its frame into the ring: start a generation, or capture a late newest frame."""
+        """Start a generation, or capture its late newest frame; call after a tick, which adds its frame to the ring."""
         if self._under_way is None and self._may_start(now_ns):
             self._under_way = _UnderWay(now_ns, self._draw())
         job = self._under_way
@@ -122,7 +122,7 @@ class LockstepReasoner:
         return seen_standing(self._ring.newest(2), self._slot.drive_until_ns)
 
     def _frames(self) -> list[EncodedFrame] | None:
-        """Those at the offsets that there are, oldest first, the newest last; as the reasoning thread selects them."""
+        """Return the available frames at the offsets, oldest first; same selection as in the reasoning thread."""
         newest_ns = self._ring.newest_ns
         anchor = None if newest_ns is None else self._ring.nearest(newest_ns)
         if anchor is None:
@@ -184,7 +184,7 @@ class LockstepReasoner:
             }
         )
         if not guided:
-            return  # the state before goes on growing old; the supervisor slows down by its age
+            return  # the previous state keeps ageing; the supervisor slows the robot down by its age
         self._slot.state = SemanticState(
             generation=number,
             anchor_ns=anchor.stamp_ns,
@@ -209,4 +209,4 @@ class LockstepReasoner:
 
 
 class _NotFiniteError(RuntimeError):
-    """Keys and values that hold a NaN or an infinity."""
+    """Keys and values that contain NaN or infinity."""

@@ -1,6 +1,6 @@
-"""A learned point-goal baseline (paper Table 1, BC and RL): a picture, the robot's velocity and where the goal is.
+"""Learned point-goal baseline (paper Table 1, BC and RL); inputs: image, velocity, goal position.
 
-One ONNX file that says of itself what it is; the plan goes through the runner's own controller and limits.
+The policy is one ONNX file with its format in the metadata. The runner's own controller and limits follow the plan.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 FORMAT: Final = "tic-vla-edge-point-goal/1"
 KEY: Final = "point_goal"
-_AGE_MS: Final = 1000.0  # in virtual time nothing is old
+_AGE_MS: Final = 1000.0  # age limit of frame and odometry; never reached in virtual time
 
 
 class PointGoalNetPolicy:
-    """Drives by the network in a file. Raises ConditionsError for a file that is not one."""
+    """Policy from an ONNX file. Raises ConditionsError if the file is not a point-goal network."""
 
     privileged = False
     needs_image = True
@@ -43,7 +43,7 @@ class PointGoalNetPolicy:
             self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
             about = json.loads(self._session.get_modelmeta().custom_metadata_map.get(KEY, "{}"))
         except Exception as error:  # ONNX Runtime raises types of its own for every kind of bad file
-            raise ConditionsError(f"policy point-goal-net:{path}: not an ONNX file that opens ({error})") from error
+            raise ConditionsError(f"policy point-goal-net:{path}: expected a readable ONNX file ({error})") from error
         if about.get("format") != FORMAT:
             raise ConditionsError(
                 f"policy point-goal-net:{path}: expected a file of format {FORMAT}, found {about.get('format')}"
@@ -57,18 +57,18 @@ class PointGoalNetPolicy:
 
     @property
     def camera(self) -> tuple[int, int]:
-        """(width, height) of the picture that it looks at."""
+        """Input image size (width, height), px."""
         return (self._px, self._px)
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Take the goal relative to the start; odometry begins there. The instruction is not read."""
+        """Compute the goal relative to the start, where odometry begins; the instruction is ignored."""
         self._goal = SE2(*episode.start).inverse() @ SE2(*episode.goal_xy, 0.0)
         self._controller = Controller(self._config)
 
     def act(self, observation: Observation) -> Velocity:
-        """The command of one control period. Raises ValueError without a picture."""
+        """Return the command of one control period. Raises ValueError without an image."""
         if observation.image is None:
-            raise ValueError("point-goal-net: expected a picture in every observation")
+            raise ValueError("point-goal-net: expected an image in every observation")
         goal = observation.T_odom_base.inverse() @ self._goal
         self._ahead = (goal.x_m, goal.y_m)
         feeds = {
@@ -82,7 +82,7 @@ class PointGoalNetPolicy:
         return (command.vx_mps, command.vy_mps, command.wz_radps)
 
     def notes(self) -> Mapping[str, object]:
-        """`waypoints`: the goal in the base frame, m."""
+        """Return `waypoints`: the goal in the base frame, m."""
         return {"waypoints": [list(self._ahead)]}
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What the benchmark drives with: a policy turns observations into velocities, ten a second."""
+"""Interface of a policy: it turns observations into velocities at 10 Hz."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ Velocity = tuple[float, float, float]
 
 
 class Policy(Protocol):
-    """Drives one episode after the other; the same episodes, wordings and seeds give the same velocities."""
+    """A policy that drives episodes one after another; equal episodes, instructions and seeds give equal velocities."""
 
     @property
     def name(self) -> str:
-        """What results call it."""
+        """Name of the policy in results."""
         ...
 
     @property
     def privileged(self) -> bool:
-        """Whether it looks at the world itself instead of at observations only."""
+        """Whether the policy reads the simulator's ground truth in addition to observations."""
         ...
 
     @property
     def needs_image(self) -> bool:
-        """Whether its observations must hold a picture."""
+        """Whether observations must contain an image."""
         ...
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
-        """Begin an episode; only a privileged policy is given the world."""
+        """Begin an episode; `world` is None for a policy that is not privileged."""
         ...
 
     def act(self, observation: Observation) -> Velocity:
-        """Body velocity for the next 0.1 s: vx m/s, vy m/s, wz rad/s."""
+        """Return the body velocity for the next 0.1 s: vx m/s, vy m/s, wz rad/s."""
         ...
 
     def notes(self) -> Mapping[str, object]:
-        """What the last act knew (such as `delay_s`, `text`, `waypoints` [[x, y], ...] m in the base frame)."""
+        """Return details of the last `act`, such as `delay_s`, `text`, `waypoints` [[x, y], ...] (m, base frame)."""
         ...
 
     def close(self) -> None:
-        """Let go of everything; may be called twice."""
+        """Release all resources; may be called twice."""
         ...

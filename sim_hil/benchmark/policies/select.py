@@ -1,7 +1,6 @@
-"""From the conditions of a run to a policy that drives, and to what the world has to render for it.
+"""Create the policy of a run and determine the image size that the world renders for it.
 
-Each kind of policy is imported when it is asked for: an episode has a process of its own, and one that drives by itself
-need not wait for ONNX Runtime.
+Policies are imported on demand: every episode has its own process, and a baseline should not wait for ONNX Runtime.
 """
 
 from __future__ import annotations
@@ -20,17 +19,20 @@ if TYPE_CHECKING:
     from edge.artifacts.manifest import Artifacts
 
 ROBOT_FILE: Final = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
-"""Its limits hold for both robots, so that a policy is compared on them under the same ones."""
+"""Robot file whose limits apply to both robots, so that a policy is compared under equal limits."""
 BASELINE_CAMERA: Final = (128, 128)
 
 
 def robot_config() -> RobotConfig:
-    """The limits and ages that hold on board."""
+    """Load the robot file with the limits and maximum ages that the runner applies."""
     return load_robot_config(ROBOT_FILE)
 
 
 def open_policy(conditions: Conditions, manifest_sha256: str = "") -> Policy:
-    """A policy ready for `reset`; with a hash, artifacts must be those. Raises ArtifactError, ExternalError, …"""
+    """Open the policy of a run; `manifest_sha256` is the expected hash of its artifacts.
+
+    Raises ArtifactError, ConditionsError or ExternalError.
+    """
     kind = conditions.policy.kind
     if kind == "artifacts":
         return _artifacts(conditions, manifest_sha256)
@@ -46,13 +48,13 @@ def _artifacts(conditions: Conditions, manifest_sha256: str) -> Policy:
     from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 
     if conditions.mode is None or conditions.latency is None:
-        raise ConditionsError("a policy from artifacts needs a mode and a latency in lockstep")
+        raise ConditionsError("artifacts: expected a mode and a latency in lockstep")
     directory = artifact_directory(Path(conditions.policy.where), conditions.variant)
     policy = ArtifactsPolicy(
         directory, mode=conditions.mode, latency=conditions.latency, robot=robot_config(), switches=conditions.switches
     )
     if manifest_sha256 and policy.manifest_sha256 != manifest_sha256:
-        raise ArtifactError(f"{directory}: not the artifacts that this run was started with; copy them to this machine")
+        raise ArtifactError(f"{directory}: expected the artifacts that started this run; copy them to this machine")
     return policy
 
 
@@ -65,15 +67,21 @@ def _external(conditions: Conditions) -> Policy:
 
 
 def camera_for(conditions: Conditions, policy: Policy) -> tuple[int, int] | None:
-    """(width, height) that the world renders; None: nothing. Raises ConditionsError if the policy needs another."""
-    asked, own = conditions.camera_size, getattr(policy, "camera", BASELINE_CAMERA if policy.needs_image else None)
-    if asked is not None and own is not None and asked != own:
-        raise ConditionsError(f"camera {conditions.camera}: {policy.name} looks at {own[0]}x{own[1]}; leave it at auto")
-    return asked or own
+    """Return the image size (width, height) to render, px; None: no image.
+
+    Raises ConditionsError if the policy needs another size than the conditions request.
+    """
+    requested, own = conditions.camera_size, getattr(policy, "camera", BASELINE_CAMERA if policy.needs_image else None)
+    if requested is not None and own is not None and requested != own:
+        raise ConditionsError(f"camera {conditions.camera}: {policy.name} needs {own[0]}x{own[1]}; leave it at auto")
+    return requested or own
 
 
 def check_artifacts(conditions: Conditions) -> Artifacts | None:
-    """Verify the artifacts of a run before any episode; None without any. Raises ArtifactError, ConditionsError."""
+    """Verify the artifacts of a run before any episode and return them; None for another policy.
+
+    Raises ArtifactError or ConditionsError.
+    """
     if conditions.policy.kind != "artifacts":
         return None
     from edge.artifacts.manifest import load_artifacts

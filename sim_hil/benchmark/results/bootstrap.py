@@ -1,4 +1,4 @@
-"""Confidence intervals by resampling tasks and their episodes: seeded, so the same results give the same interval."""
+"""Bootstrap confidence intervals over tasks and their episodes; seeded, so equal results give equal intervals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 RESAMPLES = 10_000
-SEED = 85  # of every interval of a report
+SEED = 85  # random seed of every interval in a report
 _TAG = 0xB007
 _Z2 = 1.959964**2  # 97.5 % point of the normal distribution, squared
 
@@ -22,12 +22,12 @@ def mean_ci95(
     seed: int = SEED,
     resamples: int = RESAMPLES,
 ) -> Range | None:
-    """95 % interval of the mean of per-episode values; None for fewer than two of them. Raises ValueError on lengths.
+    """Return the 95 % interval of the mean of per-episode values; None for fewer than two values.
 
-    Percentile bootstrap in two stages, as episodes of one task resemble each other: tasks with replacement, then of
-    each as many of its episodes (of one task alone: its episodes). Values that are all equal tell nothing when they are
-    resampled; where a value has `bounds` (lowest, highest) the interval is then Wilson's for an event that none of so
-    many episodes showed, at its worst: of 85 successes in 85 episodes [95.7, 100] %.
+    Two-stage percentile bootstrap, because episodes of one task are correlated: draw tasks with replacement, then as
+    many episodes of each task as it has. If all values are equal, resampling is uninformative: with `bounds` (lowest,
+    highest) the interval is then Wilson's for an event with 0 occurrences, such as [95.7, 100] % for 85 successes in 85
+    episodes. Raises ValueError if the numbers of values and tasks differ.
     """
     if len(values) != len(tasks):
         raise ValueError(f"bootstrap: expected a task for every value, found {len(values)} and {len(tasks)}")
@@ -49,7 +49,7 @@ def paired_ci95(
     seed: int = SEED,
     resamples: int = RESAMPLES,
 ) -> Range | None:
-    """The same for the mean of `after - before`, episode by episode; `bounds` are those of one value."""
+    """Return the 95 % interval of the mean of `after - before` per episode; `bounds` are those of one value."""
     if len(before) != len(after):
         raise ValueError(f"paired bootstrap: expected as many values on both sides, found {len(before)}, {len(after)}")
     most = None if bounds is None else bounds[1] - bounds[0]
@@ -61,13 +61,13 @@ def _resampled_means(
     values: NDArray[np.float64], tasks: Sequence[str], seed: int, resamples: int
 ) -> NDArray[np.float64]:  # fmt: skip
     _, task_of, sizes = np.unique(np.asarray(tasks), return_inverse=True, return_counts=True)
-    by_task = np.zeros((len(sizes), int(sizes.max())))  # [task, episode of it], zeros behind its last
+    by_task = np.zeros((len(sizes), int(sizes.max())))  # [task, episode], padded with zeros
     for task in range(len(sizes)):
         by_task[task, : sizes[task]] = values[task_of == task]
     rng = np.random.default_rng((seed, _TAG))
     picked = rng.integers(0, len(sizes), size=(resamples, len(sizes)))
     sums = np.zeros(picked.shape)
-    for turn in range(by_task.shape[1]):  # one episode of every picked task at a time, to stay small
+    for turn in range(by_task.shape[1]):  # one episode of every drawn task at a time, to limit memory
         which = rng.integers(0, sizes[picked])
         sums += np.where(turn < sizes[picked], by_task[picked, which], 0.0)
     return np.asarray(sums.sum(axis=1) / sizes[picked].sum(axis=1))

@@ -1,4 +1,4 @@
-"""`edge-bench compare A B` and `edge-bench report DIR`: from runs that are there to what they say."""
+"""`edge-bench compare A B` and `edge-bench report DIR`: evaluate finished runs."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ EXAMPLES = """examples:
   edge-bench compare out/nano-2s out/nano-5s --json difference.json
   edge-bench report out/nano-2s
 
-A difference is B less A over the episodes that both have; its interval is a paired bootstrap over
-tasks and their episodes.
+A difference is B minus A over the episodes that both runs contain; its interval is a paired bootstrap
+over tasks and their episodes.
 exit codes: 0 done, 2 bad arguments or input
 """
 _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, points"}
@@ -29,14 +29,14 @@ _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, 
 
 @command_line("edge-bench")
 def main(argv: Sequence[str]) -> int:
-    """Command line, the job's name included."""
+    """Run the command and return its exit code; `argv` includes the sub-command's name."""
     parser = argparse.ArgumentParser(
         "edge-bench", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     jobs = parser.add_subparsers(dest="job", required=True)
     comparing = jobs.add_parser("compare", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     comparing.add_argument("before", type=Path, metavar="A", help="directory of a run")
-    comparing.add_argument("after", type=Path, metavar="B", help="directory of another one on the same suite")
+    comparing.add_argument("after", type=Path, metavar="B", help="directory of another run of the same suite")
     comparing.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     reporting = jobs.add_parser("report", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     reporting.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
@@ -56,7 +56,10 @@ def main(argv: Sequence[str]) -> int:
 
 
 def compared(before: Path, after: Path) -> dict[str, Any]:
-    """Both runs' conditions and their paired differences. Raises StoreError or ResultError if none can be."""
+    """Return both runs' conditions and their paired differences.
+
+    Raises StoreError or ResultError if the runs cannot be compared.
+    """
     configs = [read_config(directory) for directory in (before, after)]
     if configs[0].get("suite") != configs[1].get("suite"):
         raise StoreError(
@@ -65,7 +68,7 @@ def compared(before: Path, after: Path) -> dict[str, Any]:
         )
     result = compare(read_results(before), read_results(after))
     if not result["episodes"]:
-        raise StoreError(f"{before} and {after}: expected episodes that both have, found none")
+        raise StoreError(f"{before} and {after}: expected episodes in common, found none")
     described = [Conditions.of_json(config["conditions"]).describe() for config in configs]
     return {"before": {"run": str(before), "conditions": described[0]},
             "after": {"run": str(after), "conditions": described[1]}, **result}  # fmt: skip
@@ -85,7 +88,7 @@ def _lines(result: dict[str, Any]) -> str:
     lines.append(f"{'':<14}{'A':>9}{'B':>9}{'B - A':>9}   95 % interval")
     for name, row in result["differences"].items():
         interval = "–" if row["ci95"] is None else f"{row['ci95'][0]:+.2f} to {row['ci95'][1]:+.2f}"
-        mark = "" if row["significant"] else "   (holds zero)"
+        mark = "" if row["significant"] else "   (contains zero)"
         values = f"{row['before']:>9.2f}{row['after']:>9.2f}{row['difference']:>+9.2f}"
         lines.append(f"{_UNITS[name]:<14}{values}   {interval}{mark}")
     for key in ("succeeded_in_before_only", "succeeded_in_after_only"):

@@ -1,4 +1,4 @@
-"""What happened in one episode, period by period: for the report's maps and histograms, and for whoever asks why."""
+"""Log of one episode, one row per control period: source of the report's maps and histograms."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from edge.core.geometry import SE2
 from edge.core.stats import percentiles
 
 COLUMNS = ("time_s", "x_m", "y_m", "theta_rad", "odom_x_m", "odom_y_m", "vx_mps", "vy_mps", "wz_radps", "delay_s")
-"""True pose, reported position, command, semantic delay (null while nothing was driven by)."""
+"""True pose, odometry position, command, semantic delay (null while there is no semantic state)."""
 
 
 @dataclass
 class EpisodeLog:
-    """One row per control period; generations and the people's last places at the end."""
+    """Log with one row per control period; generations and final positions of people are added on writing."""
 
     rows: list[tuple[float | None, ...]] = field(default_factory=list)
 
@@ -29,12 +29,12 @@ class EpisodeLog:
         self, time_s: float, T_world_base: SE2, T_odom_base: SE2, command: tuple[float, float, float],
         delay_s: float | None,
     ) -> None:  # fmt: skip
-        """Add a period: the state that it began with, and its command."""
+        """Add a period: the state at its beginning, and its command."""
         odom = T_odom_base.as_tuple()[:2]
         self.rows.append((time_s, *T_world_base.as_tuple(), *odom, *command, delay_s))
 
     def delay_summary(self) -> dict[str, float] | None:
-        """mean, p50, p99 and max of the delays; None if there are none."""
+        """Return mean, p50, p99 and max of the delays, s; None if there are none."""
         delays = [row[-1] for row in self.rows if row[-1] is not None]
         if not delays:
             return None
@@ -49,7 +49,7 @@ class EpisodeLog:
         people: NDArray[np.float64],
         goal_xy: Sequence[float],
     ) -> None:
-        """Write it as JSON; raises OSError."""
+        """Write the log as JSON. Raises OSError."""
         columns = {
             name: [None if row[i] is None else round(float(row[i] or 0.0), 4) for row in self.rows]
             for i, name in enumerate(COLUMNS)
@@ -60,7 +60,7 @@ class EpisodeLog:
 
 
 def read_log(path: Path) -> dict[str, Any]:
-    """A log that `write` has written; raises OSError or ValueError."""
+    """Read a log written by `EpisodeLog.write`. Raises OSError or ValueError."""
     content = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict) or set(content) != {"columns", "generations", "people", "goal_xy"}:
         raise ValueError(f"{path}: expected the log of an episode")

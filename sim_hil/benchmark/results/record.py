@@ -1,4 +1,4 @@
-"""The record of one finished episode, whoever ran it: a line of `results.jsonl`, an entry of `episodes`."""
+"""Record of one finished episode: a line of `results.jsonl`, an entry of `episodes`."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ DELAY_POINTS = ("mean", "p50", "p99", "max")
 
 
 class ResultError(ValueError):
-    """A record that cannot be a result; one line: what, expected, found."""
+    """An invalid record; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One finished episode; rates in percent (design section 9). Equal for every number of jobs but for the last three.
+    """Result of one finished episode; rates in percent. Only the last three fields depend on the number of jobs.
 
-    `spl` is this episode's share of equation 9: 100 times success, times shortest over longer of shortest and driven.
+    `spl`: this episode's term of equation 9, 100 * success * shortest_m / max(shortest_m, path_m).
     """
 
     id: str
     task: str
-    """Episodes of one task share start, goal and instructions; intervals resample tasks."""
+    """Name of the task; its episodes share start, goal and instructions, and intervals resample tasks."""
     scene: str
     people: int
     robot: str
@@ -35,22 +35,22 @@ class EpisodeResult:
     spl: float
     collided: bool
     collisions: tuple[str, ...]
-    """Labels of what was hit; "person" also for one within 0.5 m."""
+    """Labels of what the robot hit; "person" also counts one within 0.5 m."""
     first_collision_s: float | None
     fell: bool
     end: str
-    """Why it was over: reached, timeout, fell or stopped."""
+    """Why the episode ended: reached, timeout, fell or stopped."""
     path_m: float
     shortest_m: float
     time_s: float
     timeout_s: float
     trajectory_sha256: str
     delay_s: Mapping[str, float] | None
-    """mean, p50, p99 and max of the semantic delay in the ticks that drove by one; None: none did."""
+    """Mean, p50, p99 and max of the semantic delay over ticks with a semantic state, s; None: no such tick."""
     generations: int | None
-    """Released semantic states; None for a policy that has none."""
+    """Number of released semantic states; None for a policy without any."""
     stopped_by: str
-    """The fault by which the runner's own supervisor ended the run; empty: it did not."""
+    """Fault by which the runner's supervisor stopped the robot; empty: none."""
     clock: str
     wall_s: float
     attempts: int
@@ -76,13 +76,13 @@ class EpisodeResult:
             raise ResultError(f"episode {self.id}: expected delay_s with {', '.join(DELAY_POINTS)}")
 
     def as_json(self) -> dict[str, Any]:
-        """What `of_json` reads."""
+        """Return the record as JSON values, to be read by `of_json`."""
         values = asdict(self)
         return {**values, "collisions": list(self.collisions)}
 
     @staticmethod
     def of_json(content: object) -> EpisodeResult:
-        """A record that `as_json` has written; raises ResultError."""
+        """Read a record written by `as_json`. Raises ResultError."""
         known = {each.name for each in fields(EpisodeResult)}
         if not isinstance(content, Mapping) or set(content) != known:
             raise ResultError(f"result: expected an object with the keys {sorted(known)}")
@@ -94,7 +94,7 @@ class EpisodeResult:
 
 @dataclass(frozen=True)
 class FailedRun:
-    """An episode without a result: its process ended before it, as often as it was tried."""
+    """An episode without a result, because its process died in every attempt."""
 
     id: str
     attempts: int
@@ -102,7 +102,7 @@ class FailedRun:
 
     @staticmethod
     def of_json(content: object) -> FailedRun:
-        """What `asdict` makes of one; raises ResultError."""
+        """Read the output of `asdict`. Raises ResultError."""
         types = {"id": str, "attempts": int, "why": str}
         if not isinstance(content, Mapping) or {key: type(value) for key, value in content.items()} != types:
             raise ResultError("failed run: expected an object with id (text), attempts (whole number) and why (text)")

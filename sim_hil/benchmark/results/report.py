@@ -1,4 +1,4 @@
-"""`report.html` of a benchmark run: one self-contained page from the run's own files."""
+"""`report.html` of a benchmark run: one self-contained page built from the run's files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _HEADLINE = {
 
 
 def write_report(store: ResultStore, summary: Mapping[str, object], title: str) -> Path:
-    """Write the page beside the results; raises OSError."""
+    """Write the page into the run's directory and return its path. Raises OSError."""
     path = store.directory / REPORT
     results = sorted(store.results, key=lambda result: result.id)
     write_whole(path, page.document(title, "\n".join(part for part in _parts(store, results, summary, title) if part)))
@@ -47,12 +47,12 @@ def _parts(
 ) -> list[str]:  # fmt: skip
     conditions = Conditions.of_json(store.config["conditions"])
     logs = {result.id: _log(store.directory, result.id) for result in results}
-    asked = len(store.config["episodes"])
+    requested = len(store.config["episodes"])
     parts = [
         f"<h1>{page.text_html(title)}</h1>",
         f'<p class="quiet">{page.text_html(conditions.describe())}; suite “{page.text_html(store.config["suite"])}”, '
-        f"{len(results)} of {asked} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
-        "over tasks and their episodes. Paths and collisions are the simulator's own, not the robot's odometry.</p>",
+        f"{len(results)} of {requested} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
+        "over tasks and their episodes. Paths and collisions are ground truth, not the robot's odometry.</p>",
         _untrained(store.config),
         page.tiles(_headline(summary)),
         _failed(store),
@@ -65,7 +65,7 @@ def _parts(
         "<h2>Success and collisions</h2>",
         page.figure(
             report_figures.rates(results), "Bars of success and collision rate",
-            "Below each name how many episodes it stands for.", wide=True,
+            "The number of episodes is below each name.", wide=True,
         ),
         _group_tables(summary),
         *_distributions(results, delays),
@@ -75,7 +75,7 @@ def _parts(
         _texts(results, logs),
         "<h2>Episodes</h2>",
         _episode_table(store.directory, results),
-        "<h2>What this was run with</h2>",
+        "<h2>Conditions and versions</h2>",
         page.table(
             ("what", "value"),
             [(page.text_html(key), page.text_html(str(value))) for key, value in _facts(store.config, conditions)],
@@ -84,20 +84,20 @@ def _parts(
 
 
 def _distributions(results: Sequence[EpisodeResult], delays: NDArray[np.float64]) -> list[str]:
-    words = ("Distance to the goal against time used", "One point an episode.")
+    labels = ("Distance to the goal against time used", "One point per episode.")
     if not len(delays):
-        return [page.figure(report_figures.error_and_time(results, width_in=11.0), *words, wide=True)]
-    caption = "How old the semantic state was in every period that drove by one."
+        return [page.figure(report_figures.error_and_time(results, width_in=11.0), *labels, wide=True)]
+    caption = "Age of the semantic state in every control period that had one."
     return [
         '<div class="pair">',
-        page.figure(report_figures.error_and_time(results, width_in=5.4), *words),
+        page.figure(report_figures.error_and_time(results, width_in=5.4), *labels),
         page.figure(delay_histogram(delays), "Histogram of the delay", caption),
         "</div>",
     ]
 
 
 def _hits(result: EpisodeResult) -> str:
-    """What was hit, the first few."""
+    """Return the first few labels of what the robot hit."""
     more = len(result.collisions) - SHOWN_HITS
     shown = [*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])]
     return page.text_html(", ".join(shown))
@@ -107,25 +107,25 @@ def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
     try:
         return read_log(directory / EPISODES / f"{episode_id}.json")
     except (OSError, ValueError):
-        return None  # the results stand without it; the map says how many paths it shows
+        return None  # results do not depend on it; the map's caption gives the number of paths
 
 
 def _untrained(config: Mapping[str, object]) -> str:
     if config.get("trained", True):
         return ""
     return (
-        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed): the robot walks where random '
-        "numbers send it. What this run shows is that the benchmark works, not how good a policy is.</p>"
+        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed): the robot moves at random. '
+        "This run shows that the benchmark works, not how good a policy is.</p>"
     )
 
 
 def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     tiles = []
-    for name, (words, unit) in _HEADLINE.items():
+    for name, (label, unit) in _HEADLINE.items():
         value, interval = summary[name], summary[f"{name}_ci95"]
         shown = "none" if value is None else f"{value:.1f} {unit}"
         span = "" if interval is None else f", 95 %: {interval[0]:.1f} to {interval[1]:.1f}"
-        tiles.append((shown, words + span))
+        tiles.append((shown, label + span))
     return [*tiles, (str(summary["episodes"]), "episodes")]
 
 
@@ -134,8 +134,8 @@ def _failed(store: ResultStore) -> str:
         return ""
     rows = [(page.text_html(run.id), str(run.attempts), page.text_html(run.why)) for run in store.failed]
     return (
-        '<p class="notice"><b>Some episodes have no result</b>: their process ended before it, as often as it was '
-        "tried. They are in no rate above; <code>--resume</code> tries them again.</p>"
+        '<p class="notice"><b>Some episodes have no result</b>: their process died in every attempt. '
+        "No rate above includes them; <code>--resume</code> tries them again.</p>"
         + page.table(("episode", "attempts", "why"), rows, numeric=frozenset({1}))
     )
 
@@ -182,7 +182,7 @@ def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
 
 
 def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
-    """The last picture of some videos, of episodes that were not reached or collided first."""
+    """Return the last frames of some videos; failed episodes come first, then those with collisions."""
     cards: list[str] = []
     for result in sorted(results, key=lambda result: (result.success, not result.collided)):
         path = directory / VIDEOS / f"{result.id}.mp4"
@@ -192,7 +192,7 @@ def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
         name = page.text_html(result.id)
         hit = f", collided with {_hits(result)}" if result.collided else ""
         cards.append(
-            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last picture of {name}">'
+            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last frame of {name}">'
             f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
             f"{result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}</div></figure>"
         )
@@ -205,18 +205,19 @@ def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] |
         log = logs[result.id]
         if log is None or not log["generations"]:
             continue
-        said = log["generations"][len(log["generations"]) // 2]
-        text = page.text_html(str(said.get("text", ""))) or "(empty)"
-        released_s = said["released_s"] - said["anchor_s"]
+        generation = log["generations"][len(log["generations"]) // 2]
+        text = page.text_html(str(generation.get("text", ""))) or "(empty)"
+        released_s = generation["released_s"] - generation["anchor_s"]
         cards.append(
-            f'<figure><div class="meta">{page.text_html(result.id)} · generation {said["generation"]} · seen at '
-            f'{said["anchor_s"]:.1f} s · Δt {released_s:.1f} s at release</div><pre class="vlm">{text}</pre></figure>'
+            f'<figure><div class="meta">{page.text_html(result.id)} · generation {generation["generation"]} · anchor '
+            f"{generation['anchor_s']:.1f} s · Δt {released_s:.1f} s at release</div>"
+            f'<pre class="vlm">{text}</pre></figure>'
         )
     if not cards:
         return ""
     step = max(1, len(cards) // SHOWN_TEXTS)
     shown = "".join(cards[::step][:SHOWN_TEXTS])
-    return f'<h2>What the VLM said</h2><div class="sheet">{shown}</div>'
+    return f'<h2>Reasoning text of the VLM</h2><div class="sheet">{shown}</div>'
 
 
 def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> str:

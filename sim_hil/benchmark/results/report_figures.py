@@ -1,4 +1,4 @@
-"""The benchmark report's pictures: results in, PNG bytes out."""
+"""Figures of the benchmark report as PNG bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _START, _GOAL = (31, 111, 139), (44, 140, 74)
 
 
 def rates(results: Sequence[EpisodeResult]) -> bytes:
-    """Success and collision rate with 95 % bootstrap intervals, by scene, crowd and robot."""
+    """Plot success and collision rate with 95 % bootstrap intervals, by scene, crowd and robot."""
     groups = [(name, grouped_by(results, name)) for name in GROUPS]
     widths = [max(1, len(members)) + 0.6 for _, members in groups]
     figure = new_figure(11.0, 3.6)
@@ -50,7 +50,7 @@ def rates(results: Sequence[EpisodeResult]) -> bytes:
 def scene_map(
     scene: Scene, results: Sequence[EpisodeResult], paths: Sequence[Path2], goals: Sequence[Sequence[float]]
 ) -> bytes:
-    """A scene from above with each episode's goal (x m, y m) and true path [n, 2] m, coloured by how it ended."""
+    """Draw a scene from above with each episode's goal (x m, y m) and true path [n, 2] m, coloured by its end."""
     span_m = max(scene.floor_max_m[0] - scene.floor_min_m[0], 1.0)
     px_per_m = min(40.0, _MAP_PX / (span_m + 1))
     image, view = draw_map(scene, px_per_m, names=True), map_view(scene, px_per_m)
@@ -68,7 +68,7 @@ def scene_map(
 
 
 def error_and_time(results: Sequence[EpisodeResult], width_in: float) -> bytes:
-    """Each episode: how much of its time it took, and how far from the goal it ended."""
+    """Plot each episode's final distance to the goal over the share of its time limit used."""
     figure = new_figure(width_in, 3.1)
     axes = figure.add_subplot()
     for label, colour, chosen in (

@@ -1,8 +1,8 @@
-"""The directory of a benchmark run: what was asked for, and each result as it comes; valid after any interruption.
+"""Directory of a benchmark run: its configuration and its results; consistent after any interruption.
 
 config.json     conditions, episodes, versions: written first, never changed; a resumed run must have the same
-results.jsonl   one line a finished episode, appended whole
-failed.jsonl    episodes whose process died each time; a resumed run tries them again
+results.jsonl   one line per finished episode, appended whole
+failed.jsonl    episodes whose process died in every attempt; a resumed run tries them again
 episodes/ID.json, videos/ID.mp4    written before their line in results.jsonl
 """
 
@@ -24,11 +24,11 @@ EPISODES, VIDEOS = "episodes", "videos"
 
 
 class StoreError(ValueError):
-    """A directory that cannot be used as asked; one line: what, expected, found, what to do."""
+    """A directory that cannot be used as requested; one line: what, expected, found, what to do."""
 
 
 class ResultStore:
-    """One writer; results are in the order in which they came. Methods raise OSError when the disk fails."""
+    """Results of a run in order of arrival, with a single writer. Methods raise OSError when the disk fails."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class ResultStore:
         lock: IO[bytes] | None = None,
         failed: Sequence[FailedRun] = (),
     ) -> None:
-        """`lock` keeps other runs out for as long as it is open."""
+        """Take results that are already on disk; `lock` excludes other runs while it is open."""
         self._lock = lock
         self.directory = directory
         self.config = config
@@ -47,7 +47,7 @@ class ResultStore:
 
     @staticmethod
     def create(directory: Path, config: Mapping[str, object]) -> ResultStore:
-        """A new run in a new or empty directory; raises StoreError."""
+        """Create a run in a new or empty directory. Raises StoreError."""
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise StoreError(
                 f"--out {directory}: expected a new or empty directory; continue that run with --resume, or name "
@@ -59,15 +59,15 @@ class ResultStore:
 
     @staticmethod
     def resume(directory: Path, config: Mapping[str, object]) -> ResultStore:
-        """Continue a run that was asked for the very same; raises StoreError, naming what differs."""
+        """Continue a run with the same configuration. Raises StoreError that names the difference."""
         if not (directory / CONFIG).is_file():
-            raise StoreError(f"--resume: {directory} holds no benchmark run ({CONFIG}); start one without --resume")
+            raise StoreError(f"--resume: {directory} contains no benchmark run ({CONFIG}); start one without --resume")
         found = read_config(directory)
-        asked = json.loads(json.dumps(config))
-        if different := sorted(key for key in {*asked, *found} if asked.get(key) != found.get(key)):
+        requested = json.loads(json.dumps(config))
+        if different := sorted(key for key in {*requested, *found} if requested.get(key) != found.get(key)):
             raise StoreError(
-                f"--resume: {different[0]} of the run in {directory} differs from what is asked for now; repeat the "
-                f"first command, or name another directory ({_difference(found, asked, different[0])})"
+                f"--resume: {different[0]} of the run in {directory} differs from this command; repeat the first "
+                f"command, or name another directory ({_difference(found, requested, different[0])})"
             )
         lock = _locked(directory)
         _make(directory)
@@ -78,26 +78,26 @@ class ResultStore:
         return ResultStore(directory, found, read_results(directory), lock)
 
     def close(self) -> None:
-        """Let other runs in."""
+        """Release the lock on the directory."""
         if self._lock is not None:
             self._lock.close()
 
     @property
     def results(self) -> list[EpisodeResult]:
-        """Finished episodes."""
+        """Results of finished episodes."""
         return list(self._results.values())
 
     @property
     def failed(self) -> list[FailedRun]:
-        """Episodes of this run that have no result."""
+        """Episodes of this run without a result."""
         return list(self._failed)
 
     def has(self, episode_id: str) -> bool:
-        """Whether that episode has a result."""
+        """Return whether an episode has a result."""
         return episode_id in self._results
 
     def add(self, result: EpisodeResult) -> bool:
-        """Append a result; False, and nothing is written, for an episode that has one already."""
+        """Append a result; return False and write nothing if the episode already has one."""
         if result.id in self._results:
             return False
         _append(self.directory / RESULTS, result.as_json())
@@ -111,19 +111,19 @@ class ResultStore:
 
 
 def read_config(directory: Path) -> dict[str, Any]:
-    """What a run was asked for; raises StoreError."""
+    """Read the configuration of a run. Raises StoreError."""
     path = directory / CONFIG
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: expected what a benchmark run has written ({error})") from error
+        raise StoreError(f"{path}: expected the configuration of a benchmark run ({error})") from error
     if not isinstance(content, dict):
         raise StoreError(f"{path}: expected a JSON object, found {type(content).__name__}")
     return content
 
 
 def read_results(directory: Path) -> list[EpisodeResult]:
-    """Results of a run, a torn last line left out; raises StoreError."""
+    """Read the results of a run without a torn last line. Raises StoreError."""
     path = directory / RESULTS
     if not path.exists():
         return []
@@ -134,13 +134,13 @@ def read_results(directory: Path) -> list[EpisodeResult]:
         except (ValueError, ResultError) as error:
             raise StoreError(f"{path}:{number}: {error}") from error
         if result.id in results:
-            raise StoreError(f"{path}:{number}: episode {result.id} is there twice")
+            raise StoreError(f"{path}:{number}: expected one result per episode, found {result.id} twice")
         results[result.id] = result
     return list(results.values())
 
 
 def read_failed(directory: Path) -> list[FailedRun]:
-    """Episodes of a run that have no result, a torn last line left out; raises StoreError."""
+    """Read the episodes of a run without a result, without a torn last line. Raises StoreError."""
     path = directory / FAILED
     failed = []
     for number, line in enumerate(_whole_lines(path) if path.exists() else (), 1):
@@ -152,14 +152,17 @@ def read_failed(directory: Path) -> list[FailedRun]:
 
 
 def _locked(directory: Path) -> IO[bytes]:
-    """The run's directory is one process's; raises StoreError when it is another's. The kernel frees a dead one's."""
+    """Lock the run's directory for this process. Raises StoreError if another process holds the lock.
+
+    The kernel releases the lock of a dead process.
+    """
     file = (directory / CONFIG).open("rb")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         file.close()
         raise StoreError(
-            f"--out {directory}: another edge-bench is running in it; wait for it, or name another"
+            f"--out {directory}: another edge-bench uses this directory; wait for it, or name another directory"
         ) from error
     return file
 
@@ -169,16 +172,16 @@ def _make(directory: Path) -> None:
         for folder in (EPISODES, VIDEOS):
             (directory / folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreError(f"--out {directory}: cannot be made ({error.strerror})") from error
+        raise StoreError(f"--out {directory}: cannot be created ({error.strerror})") from error
 
 
 def _append(path: Path, content: Mapping[str, object]) -> None:
-    """One line in one write to the end, on the disk before anything else is said of it."""
+    """Append one line in one write and sync it to the disk."""
     data = (json.dumps(content) + "\n").encode()
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
         if os.write(handle, data) != len(data):
-            raise OSError(f"{path}: the disk is full; the last line is cut, --resume repairs it")
+            raise OSError(f"{path}: the disk is full; the last line is incomplete, --resume repairs it")
         os.fsync(handle)
     finally:
         os.close(handle)
@@ -192,7 +195,7 @@ def _whole_lines(path: Path) -> list[str]:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Remove what a process that died while writing has left behind the last whole line."""
+    """Remove an incomplete last line, left by a process that died while writing."""
     if not path.exists():
         return
     data = path.read_bytes()
@@ -202,9 +205,9 @@ def _cut_torn_line(path: Path) -> None:
             file.truncate(whole)
 
 
-def _difference(found: Mapping[str, object], asked: Mapping[str, object], key: str) -> str:
-    """The two values of a key, of a table only where they differ, short enough for a line."""
-    was, now = found.get(key), asked.get(key)
+def _difference(found: Mapping[str, object], requested: Mapping[str, object], key: str) -> str:
+    """Describe the two values of a key in one line; of a table only the first entry that differs."""
+    was, now = found.get(key), requested.get(key)
     if isinstance(was, dict) and isinstance(now, dict):
         inner = next(name for name in sorted({*was, *now}) if was.get(name) != now.get(name))
         return f"{inner}: {_short(was.get(inner))} then, {_short(now.get(inner))} now"

@@ -1,4 +1,4 @@
-"""From results of episodes to the numbers of a benchmark: rates in percent, each with its bootstrap interval."""
+"""Summary of a benchmark run: rates in percent with bootstrap intervals, and differences between two runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sim_hil.benchmark.results.bootstrap import Range, mean_ci95, paired_ci95
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 
 CROWD_LEVELS = ((0, "0"), (20, "1-20"), (40, "21-40"), (60, "41-60"), (10_000, "61 and more"))
-"""(up to so many people, name)."""
+"""Crowd levels: (maximum number of people, name)."""
 
 METRICS: dict[str, Callable[[EpisodeResult], float]] = {
     "sr": lambda result: 100.0 * result.success,
@@ -17,11 +17,11 @@ METRICS: dict[str, Callable[[EpisodeResult], float]] = {
     "ne_m": lambda result: result.ne_m,
     "cr": lambda result: 100.0 * result.collided,
 }
-"""What each episode adds to a mean (paper equations 6 to 10)."""
+"""Value of one episode for each metric (paper equations 6 to 10)."""
 BOUNDS: dict[str, Range | None] = {"sr": (0.0, 100.0), "spl": (0.0, 100.0), "ne_m": None, "cr": (0.0, 100.0)}
-"""Lowest and highest that one episode can add."""
+"""Lowest and highest value of one episode for each metric; None: unbounded."""
 _SAME = ("task", "scene", "robot", "people", "seed", "shortest_m", "timeout_s")
-"""What makes two results ones of the same episode; its id is only a name."""
+"""Fields that must agree in two results with the same id: the id alone does not identify an episode."""
 
 GROUPS: dict[str, Callable[[EpisodeResult], str]] = {
     "scene": lambda result: result.scene,
@@ -31,19 +31,19 @@ GROUPS: dict[str, Callable[[EpisodeResult], str]] = {
 
 
 def crowd_level(people: int) -> str:
-    """Name of the crowd level that so many people are."""
+    """Return the name of the crowd level for a number of people."""
     return next(name for most, name in CROWD_LEVELS if people <= most)
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """`episodes`, every metric's mean and `*_ci95`, and the same under `by_scene`, `by_crowd`, `by_robot`."""
+    """Return `episodes`, each metric's mean and `*_ci95`, and the same under `by_scene`, `by_crowd`, `by_robot`."""
     results = sorted(results, key=lambda result: result.id)  # a sum's last digits depend on the order
     grouped = {f"by_{name}": {key: _means(members) for key, members in grouped_by(results, name)} for name in GROUPS}
     return {**_means(results), **grouped}
 
 
 def grouped_by(results: Iterable[EpisodeResult], name: str) -> list[tuple[str, list[EpisodeResult]]]:
-    """Results by scene, crowd or robot; crowd levels in their order, everything else by name."""
+    """Group results by scene, crowd or robot; crowd levels in ascending order, other groups by name."""
     groups: dict[str, list[EpisodeResult]] = {}
     for result in results:
         groups.setdefault(GROUPS[name](result), []).append(result)
@@ -52,8 +52,8 @@ def grouped_by(results: Iterable[EpisodeResult], name: str) -> list[tuple[str, l
 
 
 def interval_of(results: Sequence[EpisodeResult], name: str) -> Range | None:
-    """95 % interval of a metric's mean, None for fewer than two results."""
-    # Resampling depends on the order, and with several jobs results come in any.
+    """Return the 95 % interval of a metric's mean; None for fewer than two results."""
+    # Resampling depends on the order, and parallel jobs return results in any order.
     results = sorted(results, key=lambda result: result.id)
     return mean_ci95([METRICS[name](result) for result in results], [result.task for result in results], BOUNDS[name])
 
@@ -69,9 +69,9 @@ def _means(results: Sequence[EpisodeResult]) -> dict[str, Any]:
 
 
 def compare(before: Sequence[EpisodeResult], after: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Differences `after - before` over the episodes that both have, with paired bootstrap intervals.
+    """Return the differences `after - before` over common episodes, with paired bootstrap intervals.
 
-    `significant`: the interval does not hold zero. Raises ResultError where a name stands for two different episodes.
+    `significant`: the interval does not contain zero. Raises ResultError if an id names two different episodes.
     """
     first, second = ({result.id: result for result in results} for results in (before, after))
     ids = sorted(name for name in first if name in second)
@@ -105,6 +105,6 @@ def _check_same_episode(before: EpisodeResult, after: EpisodeResult) -> None:
         was, now = getattr(before, name), getattr(after, name)
         if was != now:
             raise ResultError(
-                f"episode {before.id}: expected the same {name} in both runs, found {was} and {now}; they are of two "
-                "versions of the suite: run one of them again"
+                f"episode {before.id}: expected the same {name} in both runs, found {was} and {now}; the runs used two "
+                "versions of the suite: repeat one of them"
             )

@@ -1,6 +1,6 @@
-"""A video of an episode: the robot's eye, the map around it, what the language model said, Δt and the command.
+"""Video of an episode: camera view, surrounding map, reasoning text, Δt and command.
 
-Every second control period is a picture, ten pictures a second: twice real time. The file is whole or not there.
+Every second control period becomes a frame at 10 frames a second: twice real time. The file is complete or absent.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ EVERY: Final = 2
 FPS: Final = 10
 WIDTH, HEIGHT = 1280, 720
 EYE_W, EYE_H = 800, 450
-RENDER_W, RENDER_H = 640, 360  # the software renderer is what a video costs; enlarged to the eye's size
+RENDER_W, RENDER_H = 640, 360  # rendered small, because software rendering dominates the cost, and then enlarged
 MAP_PX_PER_M: Final = 24.0
-CODEC: Final = "mp4v"  # what browsers play (VP9) takes 40 times as long, more than the episode itself
+CODEC: Final = "mp4v"  # a codec that browsers play (VP9) takes 40 times as long, longer than the episode itself
 MAX_TEXT_CHARS: Final = 420
 
 _PAPER: Colour = (250, 250, 248)
@@ -51,11 +51,11 @@ _FONTS = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
 
 
 class EpisodeVideo:
-    """Give it every control period; then `keep` or `discard`. Raises OSError when no video can be written."""
+    """Video writer: `add` every control period, then `keep` or `discard`. Raises OSError if it cannot write."""
 
     def __init__(self, path: Path, episode: Episode, instruction: str) -> None:
         self._path, self._episode, self._instruction = path, episode, instruction
-        # A name that still says what is in it, since OpenCV goes by that.
+        # The suffix is kept, because OpenCV derives the format from it.
         self._partial = path.with_name(f"{path.stem}.partial{path.suffix}")
         self._writer = _open(self._partial)
         self._periods = 0
@@ -71,7 +71,7 @@ class EpisodeVideo:
         command: tuple[float, float, float],
         notes: Mapping[str, object],
     ) -> None:
-        """The state that a period begins with, and what the policy made of it."""
+        """Add a control period: its state, and the policy's command and notes."""
         pose = world.pose()
         start = SE2(*self._episode.start)
         reported = start @ observation.T_odom_base
@@ -89,12 +89,12 @@ class EpisodeVideo:
         self._writer.write(cv2.cvtColor(np.asarray(page), cv2.COLOR_RGB2BGR))
 
     def keep(self) -> None:
-        """The episode is over and its video wanted; raises OSError."""
+        """Finish the video and keep it. Raises OSError."""
         self._writer.release()
         self._partial.replace(self._path)
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept; may be called at any time."""
+        """Remove the unfinished video, unless it was kept; may be called at any time."""
         self._writer.release()
         self._partial.unlink(missing_ok=True)
 
@@ -158,7 +158,7 @@ class EpisodeVideo:
 
 
 def last_picture(path: Path, width_px: int) -> bytes | None:
-    """The last picture of a video as JPEG of that width; None when it cannot be read."""
+    """Return the last frame of a video as JPEG of that width; None if the video cannot be read."""
     video = cv2.VideoCapture(str(path))
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -177,14 +177,14 @@ def _open(path: Path) -> cv2.VideoWriter:
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), FPS, (WIDTH, HEIGHT))
     if not writer.isOpened():
-        raise OSError(f"{path}: OpenCV here can write no video ({CODEC}); run with --video none")
+        raise OSError(f"{path}: OpenCV cannot write video with the codec {CODEC}; run with --video none")
     return writer
 
 
 def _around(
     whole: Picture, view: MapView, centre: tuple[float, float], width: int, height: int
 ) -> tuple[Picture, MapView]:
-    """A copy of the part of a map around a point, and the view of it; a map that is smaller lies in the middle."""
+    """Return a copy of the map around a point, and its view; a smaller map is centred."""
     spans: list[tuple[int, int, int]] = []
     for at, size, window in zip(view.pixel(centre), (whole.shape[1], whole.shape[0]), (width, height), strict=True):
         if size <= window:
@@ -200,7 +200,7 @@ def _around(
 
 
 def _point_to(image: Picture, view: MapView, goal: tuple[float, float]) -> None:
-    """An arrow at the edge when the goal is outside the picture."""
+    """Draw an arrow at the edge if the goal lies outside the image."""
     (x, y), (height, width) = view.pixel(goal), image.shape[:2]
     if 0 <= x < width and 0 <= y < height:
         return
@@ -213,7 +213,7 @@ def _point_to(image: Picture, view: MapView, goal: tuple[float, float]) -> None:
 
 
 def _in_world(pose: SE2, notes: Mapping[str, Any]) -> Iterable[tuple[float, float]]:
-    """What the policy aims at: the point that it steers to, else waypoints, in its own frame."""
+    """Yield the policy's target point, or else its waypoints, in the world frame, m."""
     target = notes.get("target")
     points = [target[:2]] if target is not None else notes.get("waypoints") or []
     for x, y in points:
@@ -235,7 +235,7 @@ def _state_line(notes: Mapping[str, object]) -> str:
 
 
 def _printable(text: str) -> str:
-    """Untrusted text without what would break a line or turn the writing."""
+    """Replace characters of an untrusted text that would break a line or change the writing direction."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 

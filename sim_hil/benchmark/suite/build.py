@@ -1,6 +1,6 @@
-"""Builds the DynaNav suite from its four scenes: tasks, wordings, crowds, timeouts. Fixed seeds: always the same text.
+"""Build the DynaNav suite from its four scenes: tasks, wordings, crowds, timeouts; deterministic by fixed seeds.
 
-Run by hand when scenes or grammar change; what it writes is committed, and a test holds the two equal.
+Run it by hand when scenes or grammar change, and commit the file. A test checks that the file equals the output.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_sm
 from sim_hil.benchmark.language.tasks import Task, goals, sample_task
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.benchmark.suite.episode import ROBOTS, SUITES, Episode, suite_to_toml
-from sim_hil.benchmark.suite.robots import robot_grid, telling_grid
+from sim_hil.benchmark.suite.robots import robot_grid, route_grid
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, load_scene
 
@@ -34,7 +34,7 @@ _LEAST_LEG_M = 3.0
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a task must be like: its goal's kinds (of object), length, and least number of turns."""
+    """Requirements on a task: kinds of goal object, range of path length, range of the number of turns."""
 
     task: str
     kinds: tuple[str, ...]
@@ -42,22 +42,22 @@ class Wanted:
     turns: tuple[int, int]
     area_kinds: tuple[str, ...] = ()
     at_end: bool = False
-    counted: int = 0  # some turn must be this ordinal or a later one
+    counted: int = 0  # least ordinal that one of the turns must have
 
     def fits(self, scene: Scene, task: Task) -> bool:
-        """Whether a drawn task is one of these."""
+        """Return whether a drawn task meets the requirements."""
         thing = next(thing for thing in scene.objects if thing.label == task.goal_label)
-        told = task.told
-        turns = sum(step.side != "straight" or step.kind == "crossing" for step in told.steps)
+        route = task.told
+        turns = sum(step.side != "straight" or step.kind == "crossing" for step in route.steps)
         return (
             thing.kind in self.kinds
-            and self.length_m[0] <= told.length_m <= self.length_m[1]
+            and self.length_m[0] <= route.length_m <= self.length_m[1]
             and self.turns[0] <= turns <= self.turns[1]
-            and (not self.area_kinds or told.goal_area_kind in self.area_kinds)
-            and (not self.at_end or told.goal_at_end)
-            # Turns in quick succession can hardly be told apart, nor can what is right beside the start.
-            and all(step.before_m >= _LEAST_LEG_M for step in told.steps if step.before_kind != "room")
-            and (not self.counted or any(step.ordinal >= self.counted for step in told.steps))
+            and (not self.area_kinds or route.goal_area_kind in self.area_kinds)
+            and (not self.at_end or route.goal_at_end)
+            # Turns in quick succession, or right after the start, are ambiguous.
+            and all(step.before_m >= _LEAST_LEG_M for step in route.steps if step.before_kind != "room")
+            and (not self.counted or any(step.ordinal >= self.counted for step in route.steps))
         )
 
 
@@ -106,16 +106,16 @@ PARTS = (
 
 
 def timeout_s(shortest_m: float, people: int, outdoor: bool) -> float:
-    """In proportion to distance, and the more the fuller it is (paper appendix C); whole 5 s.
+    """Return an episode's timeout, a multiple of 5 s: it grows with distance and crowd (paper appendix C).
 
-    Enough for one who stops to think: halts of 2 s and 0.5 s of driving in turn make 0.146 m/s at the Go2's limits.
+    It suffices in sync mode: halts of 2 s alternating with 0.5 s of driving give 0.146 m/s at the Go2's limits.
     """
     driving_s = 30.0 + shortest_m / 0.2 if outdoor else 20.0 + shortest_m / 0.12
     return 5.0 * round((driving_s + 0.5 * people) / 5.0)
 
 
 def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) -> list[Episode]:
-    """One scene's episodes; raises ValueError when a task that is wanted is not found."""
+    """Return one scene's episodes. Raises ValueError if no drawn task meets a requirement."""
     scene = load_scene(part.scene)
     grids = {robot: robot_grid(scene, robot) for robot in ROBOTS}
     episodes: list[Episode] = []
@@ -125,7 +125,7 @@ def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) 
         texts = tuple(_wordings(task, part.seed * 1000 + index))
         lengths = {robot: round(grids[robot].distance_m(task.start[:2], task.goal), 3) for robot in ROBOTS}
         for number, people in enumerate(part.crowds[index]):
-            # Each task has both robots, and over a scene's tasks each crowd has both.
+            # Each task occurs with both robots, and so does each crowd over a scene's tasks.
             robot = ROBOTS[(number + index) % 2]
             episodes.append(
                 Episode(
@@ -149,7 +149,7 @@ def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) 
 
 
 def build(progress: Callable[[str], None] = lambda line: None) -> str:
-    """The suite's text; raises ValueError when a task that is wanted is not found."""
+    """Return the suite's TOML text. Raises ValueError if no drawn task meets a requirement."""
     return suite_to_toml(NAME, VERSION, [episode for part in PARTS for episode in build_part(part, progress)])
 
 
@@ -158,9 +158,9 @@ def _wordings(task: Task, seed: int) -> list[str]:
 
 
 def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
-    """For each, the first drawn task that is what is wanted and sound; no goal comes twice."""
+    """Return for each requirement the first drawn task that meets it and is valid; goals are distinct."""
     rng = np.random.default_rng((part.seed, 17))
-    grid = telling_grid(scene)
+    grid = route_grid(scene)
     lines = Sightlines(scene)
     found: list[tuple[Wanted, Task]] = []
     for index, wanted in enumerate(part.wanted):
@@ -172,7 +172,7 @@ def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
                 drawn = sample_task(scene, grid, rng, things=things, length_m=wanted.length_m)
             except RouteError:
                 continue
-            if wanted.fits(scene, drawn) and _sound(part, scene, grid, lines, drawn, part.seed * 1000 + index):
+            if wanted.fits(scene, drawn) and _is_valid(part, scene, grid, lines, drawn, part.seed * 1000 + index):
                 task = drawn
                 break
         if task is None:
@@ -181,8 +181,8 @@ def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
     return found
 
 
-def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Task, seed: int) -> bool:
-    """Whether what the validator asks of an episode holds of a task."""
+def _is_valid(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Task, seed: int) -> bool:
+    """Return whether a task passes the checks of the validator."""
     try:
         texts = _wordings(task, seed)
     except WordingError:
@@ -194,26 +194,28 @@ def _sound(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Tas
     return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.told))
 
 
-def _say(line: str) -> None:
+def _print_progress(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
 @command_line("build_suite")
 def main(argv: list[str] | None = None) -> int:
-    """Write the suite; returns the exit code."""
+    """Write or check the suite file; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m sim_hil.benchmark.suite.build", description="Build the DynaNav suite from its scenes.",
         epilog="example: python -m sim_hil.benchmark.suite.build --out sim_hil/benchmark/suite/suites/dynanav.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=SUITES / f"{NAME}.toml", metavar="FILE")
-    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if the file says otherwise")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if the file differs")
     args = parser.parse_args(argv)
     try:
-        text = build(_say)
+        text = build(_print_progress)
         if args.check:
             same = args.out.read_text(encoding="utf-8") == text
-            _say(f"{args.out} {'is' if same else 'is not'} what would be built")
+            _print_progress(
+                f"{args.out} {'is up to date' if same else 'differs from the built suite; run without --check'}"
+            )
             return 0 if same else 1
         write_named(args.out, text)
     except (ValueError, OSError) as error:

@@ -1,17 +1,18 @@
-"""A benchmark suite as data: tasks (where to go, in words) and their episodes (robot, crowd, seed, timeout).
+"""Benchmark suite as data: tasks (start, goal, instructions) and their episodes (robot, crowd, seed, timeout).
 
-A suite is a TOML file. Episodes of one task share start, goal and instructions and differ in crowd density, robot and
+A suite is a TOML file. Episodes of one task share start, goal and instructions. They differ in crowd density, robot and
 timeout (paper appendix C: "share the same semantic objective but differ in crowd density, robot platform and timeout").
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, hypot, isfinite, radians
 from pathlib import Path
-from typing import Any
+
+from sim_hil.scene.table import Table
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -20,7 +21,7 @@ else:
 
 SUITES = Path(__file__).with_name("suites")
 ROBOTS = ("go2", "carter")
-FORMAT = 1  # of the file; a suite's own version says which data it holds
+FORMAT = 1  # of the file; `version` in the file identifies the suite's data
 MIN_WORDINGS = 4
 MAX_PEOPLE = 200
 
@@ -29,14 +30,14 @@ Vec3 = tuple[float, float, float]
 
 
 class SuiteError(ValueError):
-    """A suite that cannot be used; one line: what, expected, found."""
+    """An invalid suite; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One run of the benchmark: go from `start` (x m, y m, theta rad) to `goal_xy` (m) as the instruction says.
+    """One run of the benchmark from `start` (x m, y m, theta rad) to `goal_xy` (m) by instruction.
 
-    `landmarks` are labels of the scene's objects that the instructions name; `goal_landmark` is the one by the goal.
+    `landmarks`: labels of the scene's objects that the instructions name; `goal_landmark`: the one at the goal.
     `shortest_m` is the length of the shortest feasible path for this robot (paper equation 9).
     """
 
@@ -76,70 +77,12 @@ class Episode:
         if not self.instructions or any(not text.strip() for text in self.instructions):
             raise SuiteError(f"{what}: expected instructions, none of them empty")
         if len(set(self.instructions)) != len(self.instructions):
-            raise SuiteError(f"{what}: an instruction is there twice")
+            raise SuiteError(f"{what}: expected different instructions, found one twice")
         if self.goal_landmark not in self.landmarks:
             raise SuiteError(f"{what}: goal_landmark {self.goal_landmark!r} is not among its landmarks")
 
 
-class _Table:
-    """A TOML table that insists on every key being known and of the right type."""
-
-    def __init__(self, what: str, table: object) -> None:
-        if not isinstance(table, Mapping):
-            raise SuiteError(f"{what}: expected a table, found {type(table).__name__}")
-        self._what, self._rest = what, dict(table)
-
-    def take(self, key: str) -> Any:
-        if key not in self._rest:
-            raise SuiteError(f"{self._what}: key {key!r} is missing")
-        return self._rest.pop(key)
-
-    def text(self, key: str) -> str:
-        value = self.take(key)
-        if not isinstance(value, str):
-            raise SuiteError(f"{self._what}: {key} must be text, found {value!r}")
-        return value
-
-    def texts(self, key: str) -> tuple[str, ...]:
-        value = self.take(key)
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise SuiteError(f"{self._what}: {key} must be an array of texts, found {value!r}")
-        return tuple(value)
-
-    def whole(self, key: str) -> int:
-        value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise SuiteError(f"{self._what}: {key} must be a whole number, found {value!r}")
-        return value
-
-    def number(self, key: str) -> float:
-        return _number(f"{self._what}: {key}", self.take(key))
-
-    def vector(self, key: str, length: int) -> tuple[float, ...]:
-        value = self.take(key)
-        if not isinstance(value, list) or len(value) != length:
-            raise SuiteError(f"{self._what}: {key} must be {length} numbers, found {value!r}")
-        return tuple(_number(f"{self._what}: {key}", item) for item in value)
-
-    def tables(self, key: str) -> list[object]:
-        value = self.take(key)
-        if not isinstance(value, list) or not value:
-            raise SuiteError(f"{self._what}: {key} must be an array of tables")
-        return value
-
-    def done(self) -> None:
-        if self._rest:
-            raise SuiteError(f"{self._what}: unknown key {sorted(self._rest)[0]!r}")
-
-
-def _number(what: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise SuiteError(f"{what} must be a finite number, found {value!r}")
-    return float(value)
-
-
-def _task(raw: object, index: int) -> list[Episode]:
-    table = _Table(f"tasks[{index}]", raw)
+def _task(table: Table) -> list[Episode]:
     task, scene = table.text("task"), table.text("scene")
     x, y, heading_deg = table.vector("start_deg", 3)
     goal_x, goal_y = table.vector("goal_xy", 2)
@@ -149,8 +92,8 @@ def _task(raw: object, index: int) -> list[Episode]:
     if len(instructions) < MIN_WORDINGS:
         raise SuiteError(f"task {task!r}: expected {MIN_WORDINGS} wordings or more, found {len(instructions)}")
     episodes = []
-    for number, item in enumerate(table.tables("episodes")):
-        row = _Table(f"task {task!r}, episodes[{number}]", item)
+    for row in table.tables("episodes"):
+        row.what = f"task {task!r}, {row.what}"
         episodes.append(
             Episode(
                 id=row.text("id"),
@@ -175,15 +118,17 @@ def _task(raw: object, index: int) -> list[Episode]:
 
 
 def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
-    """Episodes of a suite's TOML text, in the file's order; `source` names it in errors. Raises SuiteError."""
+    """Parse a suite's TOML text into episodes, in the file's order; `source` names it in errors. Raises SuiteError."""
     try:
-        table = _Table("suite", tomllib.loads(text))
+        table = Table("suite", tomllib.loads(text), SuiteError)
         if (found := table.whole("format")) != FORMAT:
             raise SuiteError(f"format {FORMAT} expected, found {found}")
         table.text("name")
         table.whole("version")
-        episodes = [episode for i, raw in enumerate(table.tables("tasks")) for episode in _task(raw, i)]
+        episodes = [episode for task in table.tables("tasks") for episode in _task(task)]
         table.done()
+        if not episodes:
+            raise SuiteError("expected [[tasks]] with [[tasks.episodes]], found none")
     except tomllib.TOMLDecodeError as error:
         raise SuiteError(f"{source}: not valid TOML: {error}") from error
     except SuiteError as error:
@@ -192,12 +137,12 @@ def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
 
 
 def suite_names() -> list[str]:
-    """Names that load_suite knows."""
+    """Return the names of the shipped suites."""
     return sorted(path.stem for path in SUITES.glob("*.toml"))
 
 
 def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
-    """Episodes of a shipped suite, or of a TOML file; ids are unique. Raises SuiteError."""
+    """Load the episodes of a shipped suite or a TOML file; ids are unique. Raises SuiteError."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         if str(name_or_path) not in suite_names():
@@ -211,7 +156,7 @@ def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
     episodes = parse_suite(text, path.name)
     ids = [episode.id for episode in episodes]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):
-        raise SuiteError(f"{path.name}: episode id {twice[0]!r} is there twice")
+        raise SuiteError(f"{path.name}: expected unique episode ids, found {twice[0]!r} twice")
     return episodes
 
 
@@ -225,7 +170,7 @@ def _array(values: Sequence[str]) -> str:
 
 
 def suite_to_toml(name: str, version: int, episodes: Sequence[Episode]) -> str:
-    """The suite as TOML that parse_suite reads back; episodes of one task must follow each other."""
+    """Format a suite as TOML for `parse_suite`; the episodes of one task must be adjacent."""
     lines = [
         "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.",
         f"format = {FORMAT}",

@@ -1,4 +1,4 @@
-"""The benchmark's robots as planners see them."""
+"""Planner parameters of the benchmark's robots: radius and maximum step height."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene
 
 _RADII_M = {"go2": go2.RADIUS_M, "carter": carter_urdf.RADIUS_M}
-# Steps of the ground that are no obstacle: the Go2 takes the scenes' bumps of 5 cm, the base's casters do not.
+# Height of a step that is no obstacle, m: the Go2 climbs the bumps of 5 cm in the scenes, the casters of Carter cannot.
 _STEPS_M = {"go2": 0.06, "carter": 0.03}
 
 
-TELLING_CLEARANCE_M = 0.4  # ways are told for a robot of this radius, which stops at any step, whatever robot drives
+ROUTE_CLEARANCE_M = 0.4  # robot radius for which routes are described, whichever robot drives
 
 
 def footprint_m(robot: str) -> float:
-    """Radius of the circle that a robot sweeps when it turns, m: the clearance of its shortest feasible path.
+    """Return the radius of the circle that a robot sweeps when it turns, m: the clearance of its shortest path.
 
     Raises ValueError for an unknown robot.
     """
@@ -24,7 +24,7 @@ def footprint_m(robot: str) -> float:
 
 
 def max_step_m(robot: str) -> float:
-    """Height of a step that the robot gets over, m: higher ones are edges to its shortest feasible path.
+    """Return the height of a step that the robot can climb, m; higher steps are obstacles.
 
     Raises ValueError for an unknown robot.
     """
@@ -32,13 +32,13 @@ def max_step_m(robot: str) -> float:
 
 
 def robot_grid(scene: Scene, robot: str) -> NavGrid:
-    """The floor that is free for a robot; raises ValueError for an unknown one."""
+    """Return the navigation grid of a scene for a robot. Raises ValueError for an unknown robot."""
     return NavGrid(scene, clearance_m=footprint_m(robot), max_step_m=max_step_m(robot))
 
 
-def telling_grid(scene: Scene) -> NavGrid:
-    """The floor by which ways are told: free for every robot."""
-    return NavGrid(scene, clearance_m=TELLING_CLEARANCE_M, max_step_m=min(_STEPS_M.values()))
+def route_grid(scene: Scene) -> NavGrid:
+    """Return the navigation grid for describing routes: its free cells are free for every robot."""
+    return NavGrid(scene, clearance_m=ROUTE_CLEARANCE_M, max_step_m=min(_STEPS_M.values()))
 
 
 def _of(robot: str, values: dict[str, float]) -> float:

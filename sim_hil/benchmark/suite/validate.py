@@ -1,7 +1,7 @@
-"""`python -m sim_hil.benchmark.suite.validate`: is every episode of a suite feasible, and is every word of it true?
+"""`python -m sim_hil.benchmark.suite.validate`: check that episodes are feasible and their instructions are true.
 
-Everything is computed anew from scene, start and goal; what the suite's file says counts for nothing. The rules by
-which a way is told (route.tell) are the builder's own: a mistake in them is found by neither, but by tests and by eye.
+Everything is recomputed from scene, start and goal and compared with the suite's file. The rules that describe a route
+(route.tell) are shared with the builder, so the validator cannot find mistakes in them.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_sm
 from sim_hil.benchmark.language.tasks import outline_gap_m
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.benchmark.suite.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
-from sim_hil.benchmark.suite.robots import TELLING_CLEARANCE_M, robot_grid, telling_grid
+from sim_hil.benchmark.suite.robots import ROUTE_CLEARANCE_M, robot_grid, route_grid
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, SceneError, SceneObject, Vec2, load_scene
 
-# An episode must be feasible at these mean speeds. Indoors that is below what the Go2 comes to when it halts for 2 s of
-# thought before each 0.5 s of driving (0.146 m/s), and leaves it some detours.
+# Mean speeds at which an episode must be feasible, m/s. Indoors this is below the Go2's mean speed in sync mode
+# (0.146 m/s: halts of 2 s before each 0.5 s of driving) and leaves room for detours.
 INDOOR_SPEED_MPS, OUTDOOR_SPEED_MPS = 0.12, 0.2
 LENGTH_TOLERANCE_M = 0.02
-MAX_GOAL_GAP_M = 1.6  # from the landmark's outline to the goal
+MAX_GOAL_GAP_M = 1.6  # maximum distance from the landmark's outline to the goal
 
 _EXAMPLES = """examples:
   python -m sim_hil.benchmark.suite.validate
   python -m sim_hil.benchmark.suite.validate --suite my_suite.toml --json -
-exit codes: 0 all sound, 1 something is wrong, 2 the suite or a scene cannot be read"""
+exit codes: 0 all valid, 1 an episode is invalid, 2 the suite or a scene cannot be read"""
 
 
 @dataclass
 class _Place:
-    """One scene with what is worked out on it, as it is needed."""
+    """One scene with its lazily computed grids, path lengths and sightlines."""
 
     scene: Scene
     grids: dict[str, NavGrid] = field(default_factory=dict)
@@ -50,8 +50,8 @@ class _Place:
         return self.grids[robot]
 
     @cached_property
-    def telling(self) -> NavGrid:
-        return telling_grid(self.scene)
+    def routes(self) -> NavGrid:
+        return route_grid(self.scene)
 
     @cached_property
     def lines(self) -> Sightlines:
@@ -66,19 +66,19 @@ class _Place:
 
 
 class Validator:
-    """Checks episodes one by one; scenes are loaded once. Raises SceneError for a scene that cannot be read."""
+    """Checker of episodes that loads each scene once. Raises SceneError for a scene that cannot be read."""
 
     def __init__(self) -> None:
         self._places: dict[str, _Place] = {}
         self._tasks: dict[tuple[object, ...], list[str]] = {}
 
     def problems(self, episode: Episode) -> list[str]:
-        """What is wrong with an episode, one line each."""
+        """Return the problems of an episode, one line each."""
         if episode.scene not in self._places:
             self._places[episode.scene] = _Place(load_scene(episode.scene))
         place = self._places[episode.scene]
         found = _feasible(episode, place)
-        # What does not hang on robot and crowd is checked once for all episodes of a task.
+        # Checks that do not depend on robot and crowd run once per task.
         key = (episode.scene, episode.start, episode.goal_xy, episode.instructions, episode.landmarks,
                episode.goal_landmark, episode.threshold_m)  # fmt: skip
         if key not in self._tasks:
@@ -108,37 +108,37 @@ def _feasible(episode: Episode, place: _Place) -> list[str]:
 
 
 def _truthful(episode: Episode, place: _Place) -> list[str]:
-    scene, grid = place.scene, place.telling
+    scene, grid = place.scene, place.routes
     goal = place.thing(episode.goal_landmark)
     if goal is None or not goal.landmark:
-        return [f"goal_landmark {episode.goal_landmark!r} is no landmark of the scene"]
+        return [f"goal_landmark {episode.goal_landmark!r} is not a landmark of the scene"]
     found = []
     gap = outline_gap_m(goal, episode.goal_xy)
     if gap > MAX_GOAL_GAP_M:
         found.append(f"the goal is {gap:.1f} m away from the {goal.landmark}")
     if (leak := worst_leak(grid, episode.goal_xy, episode.threshold_m)) > 0:
-        found.append(f"within the threshold there is a spot {leak:.1f} m too far round: the goal counts through a wall")
+        found.append(f"a spot within the threshold is {leak:.1f} m too far by path: the goal counts through a wall")
     path = grid.path(episode.start[:2], episode.goal_xy)
     if path is None:
-        return [*found, f"no way for a robot of radius {TELLING_CLEARANCE_M} m"]
+        return [*found, f"no path for a robot of radius {ROUTE_CLEARANCE_M} m"]
     try:
-        told = tell(scene, grid, path, goal)
+        route = tell(scene, grid, path, goal)
     except RouteError as error:
-        return [*found, f"the way cannot be told: {error}"]
-    found += wrong_bends(told, path)
+        return [*found, f"the route cannot be described: {error}"]
+    found += wrong_bends(route, path)
     for text in episode.instructions:
-        found += [f"{text!r}: {problem}" for problem in untrue(text, told)]
+        found += [f"{text!r}: {problem}" for problem in untrue(text, route)]
         if not is_held_out(text):
             found.append(f"{text!r}: this sentence pattern belongs to training")
     if not found:
-        named = set(named_landmarks(episode.instructions, told))
+        named = set(named_landmarks(episode.instructions, route))
         if named != set(episode.landmarks):
             found.append(f"landmarks are {sorted(episode.landmarks)}, the instructions name {sorted(named)}")
     return found + named_too_small(scene, place.lines, path, episode.landmarks)
 
 
 def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
-    """Problems by episode id, only of those that have any."""
+    """Return problems by episode id; valid episodes are left out."""
     validator = Validator()
     found = {episode.id: validator.problems(episode) for episode in episodes}
     return {name: lines for name, lines in found.items() if lines}
@@ -146,16 +146,16 @@ def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
 
 @command_line("validate")
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m sim_hil.benchmark.suite.validate",
-        description="Check that a suite's episodes are feasible and true.",
+        description="Check that a suite's episodes are feasible and their instructions are true.",
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument(
         "--suite", default="dynanav", metavar="S", help=f"{', '.join(suite_names())}, or a .toml file"
     )  # fmt: skip
-    parser.add_argument("--json", metavar="FILE|-", help="the result as JSON")
+    parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     args = parser.parse_args(argv)
     try:
         check_result_target(args.json)
@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     for name, lines in wrong.items():
         for line in lines:
             sys.stderr.write(f"{name}: {line}\n")
-    sys.stderr.write(f"{len(episodes)} episodes, {len(wrong)} of them wrong\n")
+    sys.stderr.write(f"{len(episodes)} episodes, {len(wrong)} of them invalid\n")
     return 1 if wrong or not episodes else 0
 
 

@@ -1,1 +1,1 @@
-"""Runs episodes: jobs, worker processes, a Ray cluster, virtual and real time."""
+"""Execution of episodes: jobs, worker processes, a Ray cluster, virtual and real time."""

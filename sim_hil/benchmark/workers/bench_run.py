@@ -1,4 +1,4 @@
-"""A benchmark run as the command asks for it: its episodes, its directory, its backend, its result."""
+"""A benchmark run: its episodes, directory, backend and result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class BenchRun:
-    """What is to be run; `trained` is what the manifest says, True for a policy without one."""
+    """Plan of a run; `trained`: from the manifest, True for a policy without one."""
 
     suite: str
     episodes: tuple[Episode, ...]
@@ -51,7 +51,7 @@ class BenchRun:
 
     @staticmethod
     def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions) -> BenchRun:
-        """Check everything that can be known before the first episode; an external policy is asked who it is.
+        """Check everything that is known before the first episode, and connect once to an external policy.
 
         Raises ArtifactError, ConditionsError, ExternalError.
         """
@@ -70,7 +70,7 @@ class BenchRun:
         return run
 
     def config(self) -> dict[str, Any]:
-        """What a resumed run must have in common with this one."""
+        """Return the configuration that a resumed run must share."""
         return {
             "schema": SCHEMA,
             "suite": self.suite,
@@ -83,7 +83,7 @@ class BenchRun:
         }
 
     def tasks(self, folder: Path, video: str = "none") -> list[EpisodeTask]:
-        """One task an episode, the longest first, so that none is left alone at the end. Raises ConditionsError."""
+        """Return one task per episode, the longest first, for an even load. Raises ConditionsError."""
         tasks = [
             EpisodeTask(episode, self.conditions, folder, video, self.manifest_sha256) for episode in self.episodes
         ]
@@ -92,18 +92,18 @@ class BenchRun:
     def run(
         self, store: ResultStore, backend: Backend, video: str, stopped: Callable[[], bool], watcher: RunWatcher
     ) -> bool:
-        """Run what has no result yet; False when it was interrupted. Raises RefusedRunError, OSError."""
+        """Run the episodes without a result; return False if interrupted. Raises RefusedRunError or OSError."""
         tasks = self.tasks(store.directory, video)
         return run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
 
 
 def expected_cost(episode: Episode) -> float:
-    """Something that grows as the time that an episode takes to simulate."""
+    """Return a value that grows with an episode's simulation time."""
     return episode.timeout_s * (20 + episode.people)
 
 
 def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode]:
-    """Episodes whose id matches a pattern, all without patterns. Raises ConditionsError for one that none matches."""
+    """Return the episodes whose id matches a pattern, all without patterns. Raises ConditionsError if none matches."""
     for pattern in patterns:
         if not any(fnmatchcase(episode.id, pattern) for episode in episodes):
             some = ", ".join(episode.id for episode in episodes[:3])
@@ -115,7 +115,7 @@ def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode
 
 
 def versions() -> dict[str, str]:
-    """What results may depend on beside the conditions."""
+    """Return the versions of code and packages, on which results may depend."""
     found = {"python": platform.python_version(), "machine": platform.machine(), "system": sys.platform}
     found["code"] = code_sha256()
     for name in _PACKAGES:
@@ -127,7 +127,7 @@ def versions() -> dict[str, str]:
 
 
 def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_ns: int) -> dict[str, Any]:
-    """What `--json` writes (design section 9)."""
+    """Return the result for `--json`."""
     results = sorted(store.results, key=lambda result: result.id)
     wall_s = (time.monotonic_ns() - started_ns) / 1e9
     return {
@@ -154,14 +154,14 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
 
 
 def latency_result(directory: Path, conditions: Conditions, results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Delays of all periods of all episodes, and what they were drawn from."""
+    """Return the delays over all control periods of all episodes, and their latency profile."""
     delays: list[float] = []
     for result in results:
         if result.delay_s is not None:
             try:
                 columns: Mapping[str, Any] = read_log(directory / EPISODES / f"{result.id}.json")["columns"]
             except (OSError, ValueError):
-                continue  # its log was removed: the others still tell
+                continue  # the log was removed; use the others
             delays += [delay for delay in columns["delay_s"] if delay is not None]
     profile = conditions.latency
     return {

@@ -1,7 +1,7 @@
-"""Episodes on a Ray cluster: one Ray task each, which runs the same worker process that a local run would.
+"""Episodes on a Ray cluster: one Ray task per episode, which runs the same worker process as a local run.
 
-The driver counts: a task whose worker or node dies is handed out again, and each episode's result is taken once.
-Ray is an optional extra, imported only here. Nodes need this package, and artifacts at the same path.
+If a worker or node dies, the driver submits its task again; each episode's result counts once. Ray is an optional
+extra, imported only here. Nodes need this package, and the artifacts at the same path.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from sim_hil.benchmark.workers.local_jobs import WORKER, LocalJobs
 from sim_hil.benchmark.workers.task import EpisodeTask
 
 ATTEMPTS = 4
-"""On a cluster a node takes its episodes along when it dies, which says nothing of the episode."""
+"""Attempts per episode; more than locally, because a dying node ends its episodes regardless of their content."""
 CPUS_PER_EPISODE = 1
 NO_PROCESSOR_S = 60.0
-"""How long a cluster may be without any processor: a node that starts again is back by then."""
+"""Longest time without any processor in the cluster, s; a restarting node is back by then."""
 
 
 class ClusterError(RuntimeError):
-    """No cluster, or none with a processor, to hand episodes to; one line."""
+    """No cluster, or no processor in it; one line."""
 
 
 class ClusterJobs:
-    """As many episodes at a time as the cluster has processors. Raises ClusterError when it cannot be reached.
+    """Backend that runs as many episodes in parallel as the cluster has processors.
 
-    `free` and `wait` raise it too, after NO_PROCESSOR_S in which the cluster had no processor at all.
+    Raises ClusterError if the cluster cannot be reached, or (in `free` and `wait`) has no processor for NO_PROCESSOR_S.
     """
 
     attempts = ATTEMPTS
@@ -52,7 +52,7 @@ class ClusterJobs:
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`worker`: the command of a worker process on a node, if it is not its own interpreter's."""
+        """Connect; `worker`: command of a worker process on a node, default: the node's own interpreter."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             import ray
@@ -69,7 +69,7 @@ class ClusterJobs:
                 f"--cluster {address}: no Ray cluster there ({line[:200]}); start one with `ray start --head`, and run "
                 "this on one of its nodes"
             ) from error
-        # The driver retries, so that every death is told and counted in one place.
+        # The driver retries, so that every death is reported and counted in one place.
         self._remote = ray.remote(num_cpus=CPUS_PER_EPISODE, max_retries=0)(run_on_node)
         self._worker = None if worker is None else list(worker)
         self._code_sha256 = code_sha256()
@@ -79,7 +79,7 @@ class ClusterJobs:
         self._had_processor_ns = now_ns()
 
     def free(self) -> int:
-        """Processors of the cluster without an episode of this run."""
+        """Return the number of processors without an episode of this run."""
         return self._slots() - len(self._running)
 
     def _slots(self) -> int:
@@ -95,12 +95,12 @@ class ClusterJobs:
         return slots
 
     def start(self, task: EpisodeTask) -> None:
-        """Hand out a task."""
+        """Submit a task."""
         reference = self._remote.remote(json.dumps(task.as_json()), self._code_sha256, self._worker)
         self._running[reference] = task.episode.id
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
-        """Tasks that have ended, with or without a result."""
+        """Return the tasks that have ended, with or without a result."""
         self._slots()
         if not self._running:
             self._sleep(timeout_s)
@@ -121,11 +121,11 @@ class ClusterJobs:
         return Ended(name, result, tuple(files))
 
     def times_s(self) -> dict[str, float]:
-        """Nodes do not tell."""
+        """Return nothing, because nodes do not report times."""
         return {}
 
     def close(self) -> None:
-        """Cancel what runs and leave the cluster as it is."""
+        """Cancel the running tasks and disconnect from the cluster."""
         if not self._open:
             return
         self._open = False
@@ -137,13 +137,13 @@ class ClusterJobs:
 
 
 def run_on_node(task_json: str, code: str, worker: Sequence[str] | None) -> tuple[str, list[tuple[str, bytes]]]:
-    """Run a task in a process of this node; (what came of it as JSON, files by their path below the run's folder).
+    """Run a task in a process of this node; return its outcome as JSON, and its files by path below the run's folder.
 
-    `code`: the driver's `code_sha256`; with other code on this node the task is refused.
+    `code`: the driver's `code_sha256`; the task is refused if this node has other code.
     """
     host = os.uname().nodename
     if code_sha256() != code:
-        why = f"{host} has other code than where the run was started: install the same version on every node"
+        why = f"{host} has other code than the machine that started the run: install the same version on every node"
         return json.dumps({"result": None, "why": why, "refused_code": EXIT_BAD_INPUT, "host": host}), []
     with tempfile.TemporaryDirectory(prefix="edge-bench-") as folder:
         for name in (EPISODES, VIDEOS):

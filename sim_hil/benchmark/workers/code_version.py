@@ -1,4 +1,4 @@
-"""Which code computes an episode: a hash of its source and data files, finer than a package's version."""
+"""Hash of the source and data files that compute an episode; finer than a package version."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SUFFIXES = frozenset((".py", ".toml", ".urdf", ".dbc"))
 
 
 def code_sha256() -> str:
-    """SHA-256 over the names and bytes of what `edge`, `firmware_bridge` and `sim_hil` consist of."""
+    """Return the SHA-256 over names and content of the files of `edge`, `firmware_bridge` and `sim_hil`."""
     digest = hashlib.sha256()
     for package in (edge, firmware_bridge, sim_hil):
         root = Path(package.__path__[0])

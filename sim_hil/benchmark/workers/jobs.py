@@ -1,6 +1,6 @@
-"""Hands episodes to workers and takes each result once, whatever happens to a worker.
+"""Distribution of episodes to workers; each result counts once, even if workers die.
 
-Where the workers are is a `Backend`: processes of this machine (`local_jobs`) or a Ray cluster (`cluster`).
+A `Backend` provides the workers: processes of this machine (`local_jobs`) or a Ray cluster (`cluster`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ POLL_S = 0.2
 
 
 class RefusedRunError(Exception):
-    """An episode that no further attempt can run; the whole run is ended by it. `code` is the exit code."""
+    """An episode that can never run, which ends the whole run; `code` is the exit code."""
 
     def __init__(self, line: str, code: int) -> None:
         super().__init__(line)
@@ -28,48 +28,48 @@ class RefusedRunError(Exception):
 
 @dataclass(frozen=True)
 class Ended:
-    """What came of one attempt: a result, or why there is none; a refusal holds for every further attempt."""
+    """Outcome of one attempt: a result, or why there is none; a refusal applies to every further attempt."""
 
     id: str
     result: EpisodeResult | None = None
     files: tuple[tuple[str, bytes], ...] = ()
-    """Files of a worker elsewhere, by their path below the run's directory."""
+    """Files of a remote worker, by path below the run's directory."""
     why: str = ""
     refused_code: int | None = None
 
 
 class Backend(Protocol):
-    """Runs tasks; `close` ends what still runs and may be called twice."""
+    """Executor of tasks; `close` ends running tasks and may be called twice."""
 
     @property
     def attempts(self) -> int:
-        """How often an episode is tried."""
+        """Maximum number of attempts per episode."""
         ...
 
     def free(self) -> int:
-        """How many more tasks it takes now."""
+        """Return the number of further tasks that can start now."""
         ...
 
     def start(self, task: EpisodeTask) -> None:
-        """Begin a task."""
+        """Start a task."""
         ...
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
-        """Attempts that have ended, waited for until there is one or the time is over."""
+        """Wait until an attempt ends or the time is over; return the ended attempts."""
         ...
 
     def times_s(self) -> dict[str, float]:
-        """Episode time of what runs, by id, as far as it is known."""
+        """Return the episode times of running tasks by id, s, as far as known."""
         ...
 
     def close(self) -> None:
-        """End everything that was started."""
+        """End all started tasks."""
         ...
 
 
 @dataclass
 class RunWatcher:
-    """What is told while episodes run; the default tells nobody."""
+    """Callbacks while episodes run; by default they do nothing."""
 
     finished: Callable[[EpisodeResult], None] = lambda result: None
     failed: Callable[[FailedRun], None] = lambda failed: None
@@ -85,10 +85,10 @@ def run_all(
     stopped: Callable[[], bool] = lambda: False,
     watcher: RunWatcher | None = None,
 ) -> bool:
-    """Run every task that has no result yet; False when `stopped` ended it before.
+    """Run every task without a result; return False if `stopped` ended the run.
 
-    An attempt that ends without a result is repeated up to the backend's attempts, then recorded as failed. Raises
-    RefusedRunError, OSError. What was started is ended in any case.
+    An attempt without a result is repeated up to the backend's maximum, then recorded as failed. All started tasks are
+    ended in any case. Raises RefusedRunError or OSError.
     """
     watcher = watcher or RunWatcher()
     waiting = deque(task for task in tasks if not store.has(task.episode.id))
@@ -102,7 +102,7 @@ def run_all(
                 under_way[task.episode.id] = task
                 backend.start(task)
             for ended in backend.wait(POLL_S):
-                # Told twice, an attempt counts once: the second finds nothing under way.
+                # A duplicate report of an attempt is ignored: its task is no longer under way.
                 task_ended = under_way.pop(ended.id, None)
                 if task_ended is not None:
                     _take(ended, task_ended, backend, store, watcher, waiting)

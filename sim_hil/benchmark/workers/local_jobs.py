@@ -1,4 +1,4 @@
-"""Episodes in processes of this machine."""
+"""Backend that runs episodes in processes of this machine."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sim_hil.benchmark.workers.worker_pool import Workers
 from sim_hil.benchmark.workers.worker_process import Message
 
 ATTEMPTS = 2
-"""An episode whose process died is run once more."""
+"""Attempts per episode: one repetition if its process died."""
 WORKER: Sequence[str] = (sys.executable, "-m", "sim_hil.benchmark.workers.worker")
 
 
 class LocalJobs:
-    """Up to `jobs` episodes at a time."""
+    """Backend with up to `jobs` episodes in parallel."""
 
     attempts = ATTEMPTS
 
@@ -31,21 +31,21 @@ class LocalJobs:
         self._said: dict[str, Ended] = {}
 
     def free(self) -> int:
-        """Processes that may still be started."""
+        """Return the number of further processes that may start."""
         return self._workers.free()
 
     def pids(self) -> dict[str, int]:
-        """Process id of every episode that runs."""
+        """Return the process id of every running episode."""
         return self._workers.pids()
 
     def start(self, task: EpisodeTask) -> None:
-        """Start a worker; raises OSError when there can be no process."""
+        """Start a worker. Raises OSError if no process can be created."""
         name = task.episode.id
         self._workers.start(name, task.as_json(), task.folder / EPISODES / f"{name}.log")
         self._times_s[name] = 0.0
 
     def wait(self, timeout_s: float) -> Sequence[Ended]:
-        """Attempts whose process has ended."""
+        """Return the attempts whose process has ended."""
         ended: list[Ended] = []
         for told in self._workers.wait(timeout_s):
             if told.message is not None:
@@ -57,7 +57,7 @@ class LocalJobs:
         return ended
 
     def times_s(self) -> dict[str, float]:
-        """Episode time of what runs."""
+        """Return the episode times of running tasks, s."""
         return dict(self._times_s)
 
     def close(self) -> None:
@@ -66,7 +66,7 @@ class LocalJobs:
         self._times_s.clear()
 
     def _understand(self, name: str, content: Message) -> None:
-        """What a worker has said; what makes no sense is as good as nothing."""
+        """Process a worker's message; invalid messages are ignored."""
         try:
             if "result" in content:
                 self._said[name] = Ended(name, result=EpisodeResult.of_json(content["result"]))

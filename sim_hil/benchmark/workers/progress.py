@@ -1,4 +1,4 @@
-"""How a benchmark run shows itself on stderr: a bar on a terminal, a line an episode elsewhere."""
+"""Progress of a benchmark run on stderr: a bar on a terminal, otherwise a line per episode."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHOWN = 4
 
 
 class BenchProgress(AbstractContextManager["BenchProgress"]):
-    """Counts what is finished; `watcher` is what a run tells it."""
+    """Progress display; pass `watcher` to the run."""
 
     def __init__(self, total: int, done: int, stream: TextIO | None = None) -> None:
         self._stream = stream if stream is not None else sys.stderr
@@ -43,11 +43,11 @@ class BenchProgress(AbstractContextManager["BenchProgress"]):
 
     @property
     def watcher(self) -> RunWatcher:
-        """Give it to the run."""
+        """Callbacks for the run."""
         return RunWatcher(self._finished, self._failed, self._retried, self._running)
 
     def say(self, line: str) -> None:
-        """A line above the bar."""
+        """Print a line above the bar."""
         self._console.print(line, markup=False)
 
     def _finished(self, result: EpisodeResult) -> None:
@@ -66,7 +66,7 @@ class BenchProgress(AbstractContextManager["BenchProgress"]):
         self._advance()
 
     def _retried(self, episode_id: str, why: str) -> None:
-        self.say(f"{episode_id}: is run again: {why}")
+        self.say(f"{episode_id}: runs again: {why}")
 
     def _advance(self) -> None:
         if self._bar is not None:

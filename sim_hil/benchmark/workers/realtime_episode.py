@@ -1,7 +1,7 @@
 """One episode of the benchmark in real time: edge-hil, edge-bridge and edge-run drive it, ground truth judges it.
 
-The record is that of lockstep, the path summed over 30 Hz poses like there. What differs: delays are this machine's
-own, and nothing is the same twice.
+The record and its 30 Hz trajectory are as in lockstep. But delays are those of this machine, and results are not
+reproducible.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ Tell = Callable[[float], None]
 
 
 def check_realtime(conditions: Conditions, *, jobs: int, cluster: bool, video: str) -> None:
-    """Raises ConditionsError for what does not go with this clock."""
+    """Check that the options are compatible with this clock. Raises ConditionsError."""
     wrong = (
-        (conditions.policy.kind != "artifacts", "--policy artifacts:DIR, which edge-run drives by"),
+        (conditions.policy.kind != "artifacts", "--policy artifacts:DIR, because edge-run drives"),
         (conditions.latency is not None, "no --latency: it is this machine's own"),
         (conditions.camera != "auto", "no --camera: it is the simulated robot's own"),
-        (jobs != 1 or cluster, "--jobs 1 and no --cluster: episodes side by side would slow each other down"),
-        (video != "none", "no --video: the flight logs below realtime/ hold the pictures"),
+        (jobs != 1 or cluster, "--jobs 1 and no --cluster: parallel episodes would slow each other down"),
+        (video != "none", "no --video: the flight logs below realtime/ contain the images"),
     )
     for fails, expected in wrong:
         if fails:
@@ -59,7 +59,7 @@ def check_realtime(conditions: Conditions, *, jobs: int, cluster: bool, video: s
 
 
 def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
-    """Episodes that can be run, and the ids of those that are left out: edge-bridge drives a go2 only."""
+    """Return the episodes that can run, and the ids of the skipped ones: edge-bridge drives only the go2."""
     return (
         [episode for episode in episodes if episode.robot == ROBOT],
         [episode.id for episode in episodes if episode.robot != ROBOT],
@@ -68,7 +68,7 @@ def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
 
 @dataclass
 class RealtimeDrive:
-    """What was seen while the episode was driven."""
+    """Ground truth recorded during the episode."""
 
     poses: list[TruePose] = field(default_factory=list)
     end: str = "stopped"
@@ -84,7 +84,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
     if episode.robot != ROBOT:
         raise ConditionsError(f"episode {episode.id}: expected the robot {ROBOT} in real time, found {episode.robot}")
     folder = task.folder / FOLDER / episode.id
-    shutil.rmtree(folder, ignore_errors=True)  # of an attempt before
+    shutil.rmtree(folder, ignore_errors=True)  # left by a previous attempt
     folder.mkdir(parents=True)
     options = StackOptions(
         folder=folder,
@@ -153,7 +153,7 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
 
 @contextmanager
 def _asked_to_end() -> Iterator[None]:
-    """Let SIGTERM, by which a worker is ended, unwind the stack: the runner first, then the rest."""
+    """Let SIGTERM, which ends a worker, unwind the stack: first the runner, then the rest."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -169,7 +169,7 @@ def _asked_to_end() -> Iterator[None]:
 
 
 def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> RealtimeDrive:
-    """Start everything and follow the robot until the episode is over; the clock starts when the robot is armed."""
+    """Start the stack and record the robot until the episode is over; its time starts when the robot is armed."""
     stack.start_robot(lambda: None)
     stack.start_bridge(lambda: None)
     runner = stack.start_runner(task.instruction)
@@ -213,7 +213,7 @@ def is_over(drive: RealtimeDrive, pose: TruePose, episode: Episode) -> bool:
 
 
 def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapping[str, Any]]]:
-    """One row per tick and the generations, from the flight log, within the episode."""
+    """Read one row per tick and the generations within the episode from the flight log."""
     log = EpisodeLog()
     generations: list[Mapping[str, Any]] = []
     at = np.array([pose.t_ns for pose in poses], np.int64)
@@ -232,12 +232,12 @@ def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapp
                 time_s = (record["now_ns"] - int(at[0])) / 1e9
                 log.add(time_s, truth, moved, tuple(record["command"]), record["delay_s"])
     except (OSError, RecordingError):
-        pass  # the runner ended before its first record; the rows that there are stay
+        pass  # the runner ended before its first record; keep the rows read so far
     return log, generations
 
 
 def _generation(record: Mapping[str, Any], begin_ns: int) -> dict[str, Any]:
-    """One generation as lockstep logs it, times since the episode's begin."""
+    """Return a generation in the format of lockstep, with times since the episode began, s."""
     times = {
         "started_s": record["started_ns"],
         "anchor_s": record["anchor_ns"],

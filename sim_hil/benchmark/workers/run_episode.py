@@ -1,4 +1,4 @@
-"""One episode from beginning to end: a fresh world, a policy, a record. The clocks differ only in who moves time on."""
+"""One whole episode: a new world, a policy, a record; on the lockstep or the real-time clock."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from sim_hil.benchmark.results.video import EpisodeVideo
 
 Tell = Callable[[float], None]
-"""Told the episode's time, s, now and then."""
+"""Callback that receives the episode's time, s, from time to time."""
 
 
 def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
-    """Virtual time: the world waits for the policy in every control period, so the same task gives the same bytes."""
+    """Run an episode in virtual time: the world waits for the policy, so the same task gives identical results."""
     started_ns = time.monotonic_ns()
     episode, log = task.episode, EpisodeLog()
     with ExitStack() as cleanup:
@@ -103,7 +103,7 @@ def _realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
 
 
 RUNNERS: Mapping[str, Callable[[EpisodeTask, Tell], EpisodeResult]] = {"lockstep": run_lockstep, "realtime": _realtime}
-"""Who runs an episode on which clock; all give the same record."""
+"""Function that runs an episode, by clock; all return the same record."""
 
 
 def run_episode(task: EpisodeTask, tell: Tell = lambda _: None) -> EpisodeResult:

@@ -1,4 +1,4 @@
-"""One episode as it is handed to whoever runs it: light, so that a driver of many need not load the physics."""
+"""Task of a worker: one episode to run; lightweight, so that a driver need not load the physics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VIDEO_CHOICES = ("all", "failed", "none")
 
 @dataclass(frozen=True)
 class EpisodeTask:
-    """One episode to run, as it is handed to a worker; files go below `folder`."""
+    """One episode to run by a worker; its files are written below `folder`."""
 
     episode: Episode
     conditions: Conditions
@@ -36,32 +36,32 @@ class EpisodeTask:
 
     @property
     def instruction(self) -> str:
-        """What the robot is told."""
+        """Instruction of the robot."""
         return self.episode.instructions[self.conditions.wording]
 
     @property
     def log_path(self) -> Path:
-        """Where the episode's log goes."""
+        """Path of the episode's log."""
         return self.folder / EPISODES / f"{self.episode.id}.json"
 
     @property
     def video_path(self) -> Path:
-        """Where its video goes."""
+        """Path of the episode's video."""
         return self.folder / VIDEOS / f"{self.episode.id}.mp4"
 
     def as_json(self) -> dict[str, Any]:
-        """What `of_json` reads."""
+        """Return the task as JSON values, to be read by `of_json`."""
         values = {key: getattr(self, key) for key in ("video", "manifest_sha256", "attempt")}
         conditions = self.conditions.as_json()
         return {**values, "episode": asdict(self.episode), "conditions": conditions, "folder": str(self.folder)}
 
     @staticmethod
     def of_json(content: Mapping[str, Any]) -> EpisodeTask:
-        """A task that `as_json` has written; raises ConditionsError, SuiteError."""
+        """Read a task written by `as_json`. Raises ConditionsError or SuiteError."""
         try:
             raw: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
             rest = {key: content[key] for key in ("video", "manifest_sha256", "attempt")}
             conditions = Conditions.of_json(content["conditions"])
             return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)
         except (KeyError, TypeError, AttributeError) as error:
-            raise SuiteError(f"task: expected what the benchmark hands to a worker ({error!r})") from error
+            raise SuiteError(f"task: expected a worker's task as written by edge-bench ({error!r})") from error

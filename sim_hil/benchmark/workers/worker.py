@@ -1,4 +1,4 @@
-"""The process of one episode: a task in, progress and one result out, both as lines of JSON."""
+"""Worker process of one episode: reads a task, writes progress and one result as lines of JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionE
 
 
 def refusal_of(error: Exception) -> tuple[str, int] | None:
-    """The one line and exit code of an error that trying again cannot mend; None for any other."""
+    """Return message and exit code of an error that a retry cannot fix; None for any other error."""
     if isinstance(error, ArtifactError):
         return str(error), EXIT_REFUSED
     if isinstance(error, _BAD_INPUT):
@@ -33,7 +33,7 @@ def refusal_of(error: Exception) -> tuple[str, int] | None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Read one task from standard input and run it; exit code 0 once the result or a refusal has been told."""
+    """Read one task from standard input and run it; return 0 once the result or a refusal has been sent."""
     with line_to_parent("python -m sim_hil.benchmark.workers.worker", argv) as tell:
         told_ns = time.monotonic_ns()
 
@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
             line, code = refusal_of(error) or (str(error), EXIT_BAD_INPUT)
             tell({"refused": line, "code": code})
         except ExternalError as error:
-            # A policy server that is gone or misbehaves: this run has failed, another attempt may not.
+            # The policy server ended or misbehaved: this attempt failed, but another may succeed.
             tell({"failed": str(error)})
     return EXIT_DONE
 

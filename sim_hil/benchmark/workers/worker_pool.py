@@ -1,6 +1,6 @@
-"""Jobs in processes of their own: a fresh interpreter each, one core, ended with their parent; JSON both ways.
+"""Pool of worker processes: a new interpreter per job, one core each, ended with the parent; messages are JSON.
 
-What a worker module is like: `sim_hil.benchmark.workers.worker_process`.
+`sim_hil.benchmark.workers.worker_process` is the worker's side.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from sim_hil.benchmark.workers.worker_process import SINGLE_THREADED, Message
 
 GRACE_S: Final = 2.0
 SILENT_S: Final = 3600.0
-"""A worker that says nothing for so long hangs."""
+"""Time without a message after which a worker counts as hanging, s."""
 _TAIL_CHARS: Final = 400
-_GREETING: Final = "pybullet build time"  # of every process that loads the engine
+_GREETING: Final = "pybullet build time"  # printed by every process that loads the engine
 _EXIT_POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a worker has said; `message` is None once it has ended, and `why` says how if it did not end well."""
+    """Event of a worker; `message` is None once it has ended, and `why` explains a failure."""
 
     key: str
     message: Message | None
@@ -48,7 +48,7 @@ class _Worker:
 
 
 class Workers:
-    """Up to `jobs` processes of `command` at a time."""
+    """Pool of up to `jobs` parallel processes of `command`."""
 
     def __init__(self, command: Sequence[str], jobs: int) -> None:
         if jobs < 1:
@@ -58,19 +58,19 @@ class Workers:
         self._selector = selectors.DefaultSelector()
 
     def free(self) -> int:
-        """Processes that may still be started."""
+        """Return the number of further processes that may start."""
         return self._jobs - len(self._running)
 
     def running(self) -> int:
-        """Processes that have not ended."""
+        """Return the number of running processes."""
         return len(self._running)
 
     def pids(self) -> dict[str, int]:
-        """Process id of every job that runs."""
+        """Return the process id of every running job."""
         return {key: worker.process.pid for key, worker in self._running.items()}
 
     def start(self, key: str, job: Mapping[str, object], log: Path) -> None:
-        """Start a process on a job; what it prints is in `log` until it ends well. Raises OSError for none."""
+        """Start a process for a job; its output is in `log` until it succeeds. Raises OSError."""
         reading, writing = os.pipe()
         try:
             with log.open("wb") as output:
@@ -94,13 +94,13 @@ class Workers:
         self._selector.register(worker.lines, selectors.EVENT_READ, worker)
         stdin = process.stdin
         if stdin is not None:
-            with suppress(BrokenPipeError):  # it has died already, which `wait` finds
+            with suppress(BrokenPipeError):  # it has already died, which `wait` detects
                 stdin.write(json.dumps(job).encode())
             with suppress(BrokenPipeError):
                 stdin.close()
 
     def wait(self, timeout_s: float) -> list[Told]:
-        """What was said since, waited for until something is or the time is over."""
+        """Wait until a worker reports or the time is over; return the events since the last call."""
         if any(worker.at_end for worker in self._running.values()):
             timeout_s = min(timeout_s, _EXIT_POLL_S)
         told: list[Told] = []
@@ -154,7 +154,7 @@ class Workers:
 
 
 def _message(line: bytes) -> Message | None:
-    """A line that makes sense; one that a dying process has torn does not."""
+    """Parse a line; None if it is invalid, such as one torn by a dying process."""
     try:
         content = json.loads(line)
     except ValueError:

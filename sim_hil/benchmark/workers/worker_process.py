@@ -1,7 +1,7 @@
-"""What a worker process is like, apart from what it runs: one core, and no longer alive than its parent.
+"""Common part of worker processes: single-threaded, ended with the parent.
 
-It reads one job from its standard input and writes lines of JSON to the descriptor that it is given: its standard
-output belongs to the libraries (the physics engine prints).
+A worker reads one job from standard input and writes lines of JSON to a descriptor, because libraries print to standard
+output.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ SINGLE_THREADED: Mapping[str, str] = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Environment of every worker: one core each, and sums in one order."""
+"""Environment of every worker: one core each, and a fixed order of sums."""
 _PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Let the kernel kill this process when its parent has gone, whatever ended that."""
+    """Let the kernel kill this process when its parent ends for any reason."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:
-        os._exit(1)  # it had gone before
+        os._exit(1)  # the parent has already ended
 
 
 @contextmanager
 def line_to_parent(prog: str, argv: Sequence[str] | None = None) -> Iterator[Tell]:
-    """Of a worker module: become the worker that the command line says, and tell its parent of one thing at a time."""
+    """Set up a worker from its command line; yield a function that sends one message to the parent."""
     parser = argparse.ArgumentParser(prog=prog)
     parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
     parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
@@ -57,7 +57,7 @@ def line_to_parent(prog: str, argv: Sequence[str] | None = None) -> Iterator[Tel
 
 
 def worker_main(prog: str, messages: Callable[[Message], Iterable[Mapping[str, object]]]) -> int:
-    """Of a worker module: run the job from standard input, telling each of its messages; returns 0."""
+    """Run the job from standard input and send its messages to the parent; return 0."""
     with line_to_parent(prog) as tell:
         for message in messages(json.loads(sys.stdin.read())):
             tell(message)

@@ -1,1 +1,1 @@
-"""The Carter on CAN: frames with end-to-end protection, node, buses, and bus faults."""
+"""CAN protocol of the Carter: frames with end-to-end protection, node, buses, bus faults."""

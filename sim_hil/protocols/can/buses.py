@@ -1,7 +1,7 @@
-"""A bus of python-can that nobody waits for: a thread that listens and one that sends.
+"""Non-blocking access to a CAN bus of python-can: one thread receives and one sends.
 
-Which interfaces: "serial" (a serial line or a pty), "socketcan" (the real thing), "virtual" (inside one process) and
-"udp_multicast" (several processes of one machine, on its loopback interface alone).
+Interfaces: "serial" (a serial line or a pty), "socketcan" (a real bus), "virtual" (inside one process) and
+"udp_multicast" (several processes of one machine, on its loopback interface only).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LISTEN_S: Final = 0.1
 _SEND_QUEUE: Final = 256
 _RECEIVE_QUEUE: Final = 4096
 _SERIAL_TIMEOUT_S: Final = 0.05
-_SERIAL_WRITE_S: Final = 0.5  # generous: what is given up in the middle of a frame breaks the next one too
+_SERIAL_WRITE_S: Final = 0.5  # long, because a write aborted inside a frame also corrupts the next frame
 _END_S: Final = 1.0
 _SERIAL_START: Final = 0xAA
 _SERIAL_END: Final = 0xBB
@@ -34,12 +34,12 @@ _SERIAL_HEAD: Final = struct.Struct("<BIBI")
 
 
 class BusError(RuntimeError):
-    """The bus cannot be opened, or has gone."""
+    """The bus cannot be opened, or it was lost."""
 
 
 @dataclass(frozen=True)
 class BusAddress:
-    """Which bus: `interface` and `channel` as python-can knows them."""
+    """Address of a bus: `interface` and `channel` of python-can."""
 
     interface: str
     channel: str
@@ -53,7 +53,7 @@ class BusAddress:
 
     @staticmethod
     def parse(text: str) -> BusAddress:
-        """From INTERFACE:CHANNEL. Raises ValueError."""
+        """Parse INTERFACE:CHANNEL. Raises ValueError."""
         interface, _, channel = text.partition(":")
         return BusAddress(interface, channel)
 
@@ -62,9 +62,9 @@ class BusAddress:
 
 
 class SerialFrames:
-    """Cuts the bytes of python-can's serial format into messages, and finds the next one after lost or false bytes.
+    """Decoder of python-can's serial format that resynchronises after lost or wrong bytes.
 
-    0xAA, time stamp (4 bytes), length, identifier (4 bytes, little endian, flags as in the kernel), data, 0xBB.
+    Frame: 0xAA, time stamp (4 bytes), length, identifier (4 bytes, little endian, flags as in the kernel), data, 0xBB.
     """
 
     def __init__(self) -> None:
@@ -72,11 +72,11 @@ class SerialFrames:
         self.errors = 0
 
     def put(self, data: bytes) -> None:
-        """Add what was read."""
+        """Add received bytes."""
         self._bytes += data
 
     def take(self) -> can.Message | None:
-        """The next message; None until more bytes come."""
+        """Return the next message; None if more bytes are needed."""
         while (start := self._bytes.find(_SERIAL_START)) >= 0:
             del self._bytes[:start]
             if len(self._bytes) < _SERIAL_HEAD.size:
@@ -89,7 +89,7 @@ class SerialFrames:
                 data = bytes(self._bytes[_SERIAL_HEAD.size : end])
                 del self._bytes[: end + 1]
                 return _message(stamp_ms / 1000, identifier, data)
-            del self._bytes[0]  # not a beginning, though it looked like one
+            del self._bytes[0]  # a start byte without a frame behind it
             self.errors += 1
         self._bytes.clear()
         return None
@@ -107,7 +107,7 @@ def _message(stamp_s: float, identifier: int, data: bytes) -> can.Message:
 
 
 class _SerialBus(SerialBus):
-    """python-can's serial bus that neither waits for ever for a peer that does not read, nor trips over lost bytes."""
+    """python-can's serial bus with a write timeout and with resynchronisation after lost bytes."""
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel, timeout=_SERIAL_TIMEOUT_S)
@@ -116,7 +116,7 @@ class _SerialBus(SerialBus):
 
     @property
     def line_errors(self) -> int:
-        """Places where a frame was expected and none was."""
+        """Number of start bytes without a valid frame."""
         return self._frames.errors
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -128,7 +128,7 @@ class _SerialBus(SerialBus):
 
 
 def open_bus(address: BusAddress) -> can.BusABC:
-    """Open the bus. Raises BusError with one clear line."""
+    """Open the bus. Raises BusError with one line."""
     try:
         if address.interface == "serial":
             return _SerialBus(address.channel)
@@ -140,7 +140,7 @@ def open_bus(address: BusAddress) -> can.BusABC:
 
 
 class BusLink:
-    """`send` and `receive` never wait; `wait` waits for a frame. Frames are stamped with time.monotonic_ns."""
+    """Link to a bus whose `send` and `receive` never wait; frames are stamped with time.monotonic_ns."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
@@ -160,25 +160,25 @@ class BusLink:
 
     @property
     def line_errors(self) -> int:
-        """Broken frames of a serial line, datagrams that are none of multicast."""
+        """Number of invalid serial frames or multicast datagrams."""
         return int(getattr(self._bus, "line_errors", 0))
 
     @property
     def pending(self) -> int:
-        """Frames that wait to be sent."""
+        """Number of frames waiting to be sent."""
         return self._to_send.qsize()
 
     def send(self, frame: Frame) -> None:
-        """Queue a frame; counted in `unsent` when the queue is full, because nobody takes frames off the line."""
+        """Queue a frame; if the queue is full, because the line takes no data, the frame counts as `unsent`."""
         try:
             self._to_send.put_nowait(frame)
         except queue.Full:
             self.unsent += 1
 
     def receive(self) -> list[tuple[int, Frame]]:
-        """What has arrived since the last call, with its time. Raises BusError when the bus has gone."""
+        """Return the frames since the last call with their receive times, ns. Raises BusError if the bus was lost."""
         if self._failure is not None:
-            raise BusError(f"CAN bus {self._bus.channel_info}: has gone: {self._failure}")
+            raise BusError(f"CAN bus {self._bus.channel_info}: connection lost: {self._failure}")
         self._arrived.clear()
         received = []
         while self._received:
@@ -186,7 +186,7 @@ class BusLink:
         return received
 
     def wait(self, left_ns: int) -> None:
-        """Until something arrives, at most `left_ns`."""
+        """Wait until a frame arrives, at most `left_ns`."""
         self._arrived.wait(left_ns / 1e9)
 
     def close(self) -> None:
@@ -194,7 +194,7 @@ class BusLink:
         if self._ending:
             return
         self._ending = True
-        with contextlib.suppress(queue.Full):  # then it looks at _ending after the next frame
+        with contextlib.suppress(queue.Full):  # then the thread checks _ending after the next frame
             self._to_send.put_nowait(None)
         for thread in self._threads:
             thread.join(_END_S)
@@ -231,10 +231,7 @@ class BusLink:
             try:
                 self._bus.send(message, timeout=_SERIAL_TIMEOUT_S)
                 self.sent += 1
-            except (
-                can.CanError,
-                OSError,
-            ):  # nobody listens, the queue is full, bus off: the frame is lost, as on a bus
+            except (can.CanError, OSError):  # no receiver, full queue or bus off: the frame is lost, as on a real bus
                 self.unsent += 1
 
 

@@ -1,5 +1,4 @@
-"""The controller's side of the Carter's CAN frames: for tests, for `sim_hil.protocols.can.drive`, and to read as an
-example."""
+"""Controller's side of the Carter's CAN protocol; used by tests and `sim_hil.protocols.can.drive`, and an example."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ _ODOMETRY_S: Final = 0.02
 
 @dataclass(frozen=True)
 class Odometry:
-    """One sample; `stamp_s` is the base's own clock, which its heartbeat carries and its cycle time continues."""
+    """One odometry sample; `stamp_s` is the base's clock, from its heartbeat and advanced by the cycle time."""
 
     stamp_s: float
     x_m: float
@@ -31,10 +30,10 @@ class Odometry:
 
 
 class CanClient:
-    """Speaks to one base. `poll` takes in what has arrived; everything else sends at once and never waits."""
+    """Client of one base: `poll` reads the received frames; the other methods send at once and never wait."""
 
     def __init__(self, link: BusLink) -> None:
-        """Takes over `link`: `close` closes it."""
+        """Take ownership of `link`, which `close` closes."""
         self._link = link
         self._encoder = Encoder()
         self._decoder = Decoder("Base")
@@ -47,7 +46,7 @@ class CanClient:
         self.lost = 0
 
     def poll(self) -> None:
-        """Take in the frames that have arrived. Raises BusError when the bus has gone."""
+        """Read the received frames. Raises BusError if the bus was lost."""
         for _, frame in self._link.receive():
             received = self._decoder.decode(frame)
             if received is None:
@@ -59,7 +58,7 @@ class CanClient:
                 self._pair(received)
 
     def _pair(self, received: Received) -> None:
-        """Put the two frames of one odometry sample together, and date them."""
+        """Combine the two frames of an odometry sample and set its time stamp."""
         if received.name == "BaseHeartbeat":
             self._stamp_s = received.signals["Uptime"]
         elif received.name == "OdometryPosition":
@@ -76,50 +75,50 @@ class CanClient:
                 self.odometry.append(Odometry(self._stamp_s, x, y, own["Heading"], own["Vx"], own["Wz"]))
 
     def latest(self, name: str) -> dict[str, float]:
-        """Signals of the newest good frame of that name; empty before the first."""
+        """Return the signals of the newest valid frame of that name; empty before the first."""
         return self._latest.get(name, {})
 
     @property
     def state(self) -> int | None:
-        """STATE_IDLE, STATE_ARMED or STATE_ESTOP as the base's heartbeat says; None before the first."""
+        """State in the base's last heartbeat (STATE_IDLE, STATE_ARMED, STATE_ESTOP); None before the first."""
         state = self.latest("BaseHeartbeat").get("State")
         return None if state is None else round(state)
 
     def wait(self, left_ns: int) -> None:
-        """Until a frame arrives, at most `left_ns`."""
+        """Wait until a frame arrives, at most `left_ns`."""
         self._link.wait(left_ns)
 
     def heartbeat(self) -> None:
-        """Say that the controller lives; every 100 ms."""
+        """Send a heartbeat; required every 100 ms."""
         self._link.send(self._encoder.encode("ControllerHeartbeat"))
 
     def drive(self, vx_mps: float, wz_radps: float) -> None:
-        """Command a velocity; every 20 ms."""
+        """Command a velocity; required every 20 ms."""
         self._link.send(self._encoder.encode("VelocityCommand", Vx=vx_mps, Wz=wz_radps))
 
     def arm(self) -> None:
-        """Ask to be armed."""
+        """Request arming."""
         self._event("ModeCommand", frames.MODE_ARM)
 
     def disarm(self) -> None:
-        """Ask to be disarmed."""
+        """Request disarming."""
         self._event("ModeCommand", frames.MODE_DISARM)
 
     def stop(self) -> None:
-        """Emergency stop, until `reset`."""
+        """Request an emergency stop, which lasts until `reset`."""
         self._event("EstopControl", frames.ESTOP_STOP)
 
     def reset(self) -> None:
-        """Take the emergency stop back; the base is idle then."""
+        """Reset the emergency stop; the base is idle afterwards."""
         self._event("EstopControl", frames.ESTOP_RESET)
 
     def _event(self, name: str, request: int) -> None:
-        # Three times: the first may only begin a stream, and one of the others may get lost.
+        # Three times: the first frame may only begin a stream, and one of the others may be lost.
         for _ in range(_EVENT_FRAMES):
             self._link.send(self._encoder.encode(name, Request=request))
 
     def spin(self, seconds: float, vx_mps: float | None = None, wz_radps: float = 0.0) -> None:
-        """Keep the base alive for that long in real time, and drive it when `vx_mps` is given."""
+        """Send heartbeats for that time, and velocity commands if `vx_mps` is given."""
         begin_ns = next_command_ns = next_heartbeat_ns = time.monotonic_ns()
         end_ns = begin_ns + round(seconds * 1e9)
         while (now_ns := time.monotonic_ns()) < end_ns:

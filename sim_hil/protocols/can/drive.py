@@ -1,4 +1,4 @@
-"""A scripted session with a Carter on CAN from a process of its own: arm, drive, stop, print the odometry."""
+"""Scripted session with a Carter on CAN: arm, drive, stop, print the odometry."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ EPILOG: Final = """examples, beside `edge-hil --robot carter --protocol can --sc
   python -m sim_hil.protocols.can.drive --channel carter-can --vx 0.5 --duration 5
   python -m sim_hil.protocols.can.drive --interface socketcan --channel can0 --vx 0 --wz 0.5 --duration 3 --json -
 exit codes: 0 driven and stopped; 1 the base did not answer, arm or stop; 2 bad arguments or no such bus; 130
-interrupted, the base told to stand"""
+interrupted, zero velocity and a disarm request were sent"""
 
 
 class DriveError(RuntimeError):
-    """The base does not do what it should."""
+    """Unexpected behaviour of the base; one line."""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -42,25 +42,27 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--interface", choices=INTERFACES, default="serial", help="of python-can (default serial)")
+    parser.add_argument(
+        "--interface", choices=INTERFACES, default="serial", help="interface of python-can (default serial)"
+    )
     parser.add_argument("--channel", required=True, help="path of the serial line, or the interface's channel")
     parser.add_argument("--vx", type=float, default=0.3, metavar="MPS", help="forward speed (default 0.3)")
     parser.add_argument("--wz", type=float, default=0.0, metavar="RADPS", help="turning speed (default 0)")
-    parser.add_argument("--duration", type=float, default=3.0, metavar="S", help="how long it drives (default 3)")
+    parser.add_argument("--duration", type=float, default=3.0, metavar="S", help="driving time (default 3)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return parser
 
 
-def _until(client: CanClient, state: int, what: str, hint: str) -> None:
+def _wait_for_state(client: CanClient, state: int, name: str, hint: str) -> None:
     for _ in range(round(_ANSWER_S / 0.1)):
         if client.state == state:
             return
         client.spin(0.1)
     found = "no answer" if client.state is None else f"state {client.state}"
-    raise DriveError(f"expected the base to be {what} within {_ANSWER_S:g} s, found {found}; {hint}")
+    raise DriveError(f"expected the base to be {name} within {_ANSWER_S:g} s, found {found}; {hint}")
 
 
-def _say(client: CanClient) -> None:
+def _print_odometry(client: CanClient) -> None:
     if client.odometry:
         last = client.odometry[-1]
         sys.stderr.write(
@@ -70,29 +72,29 @@ def _say(client: CanClient) -> None:
 
 
 def drive(client: CanClient, vx_mps: float, wz_radps: float, duration_s: float) -> dict[str, object]:
-    """Run the session; the result for --json. Raises DriveError or BusError."""
+    """Run the session and return the result for --json. Raises DriveError or BusError."""
     client.spin(0.5)
     if client.state == frames.STATE_ESTOP:
         raise DriveError("expected no emergency stop, found it latched; release the button and send a reset")
     client.arm()
-    _until(client, frames.STATE_ARMED, "armed", "is it the right bus, and its battery above 10 %?")
+    _wait_for_state(client, frames.STATE_ARMED, "armed", "check the bus and that the battery is above 10 %")
     before = len(client.odometry)
     left_s = duration_s
     while left_s > 0:
         client.spin(min(_REPORT_S, left_s), vx_mps, wz_radps)
         left_s -= _REPORT_S
-        _say(client)
+        _print_odometry(client)
     driven = client.odometry[before:]
     client.spin(1.5, 0.0)
     client.disarm()
-    _until(client, frames.STATE_IDLE, "disarmed", "it may still be moving")
-    _say(client)
+    _wait_for_state(client, frames.STATE_IDLE, "disarmed", "it may still be moving")
+    _print_odometry(client)
     return _result(client, driven)
 
 
 def _result(client: CanClient, driven: list[Odometry]) -> dict[str, object]:
     if len(driven) < 2 or not client.odometry:
-        raise DriveError("expected odometry every 20 ms, found none; is another controller on the bus?")
+        raise DriveError("expected odometry every 20 ms, found none; check for another controller on the bus")
     first, last, end = driven[0], driven[-1], client.odometry[-1]
     battery, faults = client.latest("Battery"), client.latest("Faults")
     return {
@@ -109,7 +111,7 @@ def _result(client: CanClient, driven: list[Odometry]) -> dict[str, object]:
 
 @command_line("drive")
 def main(argv: list[str] | None = None) -> int:
-    """Command line; see EPILOG for the exit codes."""
+    """Run the command and return its exit code (see EPILOG)."""
     args = _parser().parse_args(argv)
     try:
         if not all(map(math.isfinite, (args.vx, args.wz, args.duration))) or args.duration <= 0:
@@ -123,7 +125,7 @@ def main(argv: list[str] | None = None) -> int:
         result = drive(client, args.vx, args.wz, args.duration)
         write_result(args.json, result)
     except KeyboardInterrupt:
-        sys.stderr.write("drive: interrupted; the base is told to stand\n")
+        sys.stderr.write("drive: interrupted; sending zero velocity and a disarm request\n")
         with contextlib.suppress(BusError, OSError):
             client.drive(0.0, 0.0)
             client.disarm()

@@ -1,7 +1,7 @@
-"""End-to-end protection of the base's frames: CRC-8 and a counter in every one of them. Pure.
+"""End-to-end protection of CAN frames: a CRC-8 and a counter in every frame. Pure functions and state.
 
-In the manner of AUTOSAR's E2E profile 1: the identifier goes into the CRC, so that a frame that arrives under another
-identifier is wrong too; byte 0 holds the CRC, the low half of byte 1 the counter.
+Similar to AUTOSAR E2E profile 1. The CRC covers the identifier, so a frame received under another identifier is
+invalid. Byte 0 contains the CRC, the low half of byte 1 the counter.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import Enum, auto
 from typing import Final
 
 COUNTER_PERIOD: Final = 16
-MAX_AHEAD: Final = 6  # frames further ahead than this are rather older ones, come late
+MAX_AHEAD: Final = 6  # a counter further ahead than this more likely belongs to an older, delayed frame
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Frame:
 
 
 class Verdict(Enum):
-    """What a receiver makes of a frame. Only GOOD ones are obeyed."""
+    """Result of checking a frame. Only GOOD frames are obeyed."""
 
     GOOD = auto()
-    FIRST = auto()  # of a stream: right, but nothing says yet that it is new
+    FIRST = auto()  # first of a stream: valid, but possibly old
     REPEATED = auto()
     OUT_OF_ORDER = auto()
     WRONG_CRC = auto()
@@ -59,21 +59,21 @@ def crc8_j1850(data: bytes) -> int:
 
 
 def frame_crc(identifier: int, data: bytes) -> int:
-    """What byte 0 of a frame must be."""
+    """Return the CRC for byte 0 of a frame."""
     return crc8_j1850(bytes((identifier & 0xFF, identifier >> 8)) + data[1:])
 
 
 def protect(identifier: int, data: bytes, counter: int) -> bytes:
-    """The payload with counter and CRC put in; `data` has at least 2 bytes."""
+    """Return the payload with counter and CRC inserted; `data` has at least 2 bytes."""
     body = bytes((0, (data[1] & 0xF0) | counter)) + data[2:]
     return bytes((frame_crc(identifier, body),)) + body[1:]
 
 
 class Checker:
-    """Judges the frames of one identifier as they arrive."""
+    """Checker for the frames of one identifier, in order of arrival."""
 
     def __init__(self, length: int) -> None:
-        """`length`: bytes that a frame must have."""
+        """Create a checker; `length`: required bytes of a frame."""
         self._length = length
         self._last: int | None = None
         self._trusted = False
@@ -81,7 +81,7 @@ class Checker:
         self.newly_lost = 0
 
     def check(self, frame: Frame) -> Verdict:
-        """The verdict; `newly_lost` then is how many frames are missing before a GOOD one, `lost` all of them."""
+        """Check a frame; `newly_lost` is then the number of frames missing before a GOOD one, `lost` their total."""
         self.newly_lost = 0
         if len(frame.data) != self._length:
             return Verdict.WRONG_LENGTH
@@ -96,7 +96,7 @@ class Checker:
             return Verdict.REPEATED
         self._last = counter
         if ahead > MAX_AHEAD:
-            # Follow it nevertheless, without trust: a sender that was switched off and on goes on from here.
+            # Accept the new counter without trust: a restarted sender continues from it.
             self._trusted = False
             return Verdict.OUT_OF_ORDER
         if not self._trusted:
@@ -107,5 +107,5 @@ class Checker:
         return Verdict.GOOD
 
     def forget(self) -> None:
-        """The stream has ended: the next frame is the first of another."""
+        """Reset after the end of a stream: the next frame counts as FIRST."""
         self._last = None

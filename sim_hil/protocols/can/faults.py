@@ -1,8 +1,8 @@
-"""`edge-hil --protocol can --faults PATH`: faults of the bus, and the base's red button, switched while it runs.
+"""Fault socket of `edge-hil --protocol can --faults PATH`: bus faults and the emergency stop button.
 
-One JSON object a datagram: {"fault": NAME, "on": true|false, "value": NUMBER}. The names are the fields of `FaultPlan`
-with their values, "button" (held down) and "bus_off", which need none; {"fault": "clear"} ends all. The answer is
-{"fault", "on", "effect_ns"} or {"error"}.
+A request is one JSON object per datagram: {"fault": NAME, "on": true|false, "value": NUMBER}. Names are the fields of
+`FaultPlan`, which need a value, and "button" (pressed) and "bus_off", which need none. {"fault": "clear"} ends all
+faults. The answer is {"fault", "on", "effect_ns"} or {"error"}.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _LARGEST: Final = 1e9
 
 
 class CanFaults(FaultSocket):
-    """`plan`, `button` and `bus_off` are what is asked for now; `poll` takes in what has come. Raises OSError."""
+    """Fault socket whose `plan`, `button` and `bus_off` are the active faults; call `poll`. Raises OSError."""
 
     def __init__(self, path: Path, plan: FaultPlan) -> None:
-        """`plan`: in force until it is changed, and what "clear" and "off" go back to."""
+        """Bind the socket; `plan`: initial faults, restored by "clear" and by "on": false."""
         super().__init__(path)
         self._begin = self.plan = plan
         self.button = self.bus_off = False
@@ -47,7 +47,7 @@ class CanFaults(FaultSocket):
     def _value(self, name: str, on: bool, value: object) -> float:
         if not on:
             return float(getattr(self._begin, name))
-        # An integer may be longer than any float.
+        # An integer may exceed the range of a float.
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
             raise ValueError(f"{name}: expected a number up to {_LARGEST:g} as value, found {str(value)[:60]}")
         return float(value)

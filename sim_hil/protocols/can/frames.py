@@ -1,4 +1,4 @@
-"""The base's frames as the DBC file describes them: names and physical values on one side, bytes on the other."""
+"""Encoder and decoder of the base's CAN frames, as described by the DBC file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _UPTIME_MODULUS_MS: Final = 1 << 32
 
 @dataclass(frozen=True)
 class Received:
-    """One frame that a receiver has judged; `signals` is empty unless its CRC is right."""
+    """One received and checked frame; `signals` is empty unless its CRC is valid."""
 
     name: str
     verdict: Verdict
@@ -35,30 +35,30 @@ class Received:
 
     @property
     def good(self) -> bool:
-        """Whether it may be obeyed."""
+        """Whether the frame may be obeyed."""
         return self.verdict is Verdict.GOOD
 
 
 @cache
 def database() -> Database:
-    """The DBC file, read once."""
+    """Load the DBC file (cached)."""
     loaded = cantools.database.load_file(DBC_PATH)
     assert isinstance(loaded, Database)
     return loaded
 
 
 def sent_by(node: str) -> tuple[Message, ...]:
-    """Messages that `node` ("Base" or "Controller") sends."""
+    """Return the messages that `node` ("Base" or "Controller") sends."""
     return tuple(message for message in database().messages if node in message.senders)
 
 
 def periods_s(node: str) -> dict[str, float]:
-    """Cycle times of the messages that `node` sends by the clock."""
+    """Return the cycle times of the periodic messages of `node`, s."""
     return {message.name: message.cycle_time / 1000 for message in sent_by(node) if message.cycle_time}
 
 
 def clipped(name: str, signals: Mapping[str, float]) -> dict[str, float]:
-    """Every value moved into its signal's range; so a sensor beyond its range reports the range's end."""
+    """Clip every value to its signal's range, as a sensor does."""
     values = {}
     for signal in database().get_message_by_name(name).signals:
         if signal.name in signals:
@@ -68,13 +68,13 @@ def clipped(name: str, signals: Mapping[str, float]) -> dict[str, float]:
 
 
 class Encoder:
-    """Makes the frames of one sender, each with its next counter."""
+    """Encoder of one sender's frames, with a counter per message."""
 
     def __init__(self) -> None:
         self._counters: dict[str, int] = {}
 
     def encode(self, name: str, **signals: float) -> Frame:
-        """The frame, values clipped to their ranges. Raises ValueError for a missing, unknown or not finite signal."""
+        """Encode a frame with clipped values. Raises ValueError for a missing, unknown or non-finite signal."""
         message = database().get_message_by_name(name)
         expected = {signal.name for signal in message.signals} - {"Crc", "Counter"}
         if set(signals) != expected:
@@ -88,14 +88,14 @@ class Encoder:
 
 
 class Decoder:
-    """Judges and reads the frames that `node` sends; a stream for every identifier."""
+    """Decoder and checker of the frames that `node` sends, with one stream per identifier."""
 
     def __init__(self, node: str) -> None:
         self._messages = {message.frame_id: message for message in sent_by(node)}
         self._checkers = {identifier: Checker(message.length) for identifier, message in self._messages.items()}
 
     def decode(self, frame: Frame) -> Received | None:
-        """What the frame says; None for an identifier that is not expected."""
+        """Decode a frame; None for an unknown identifier."""
         message = self._messages.get(frame.identifier)
         if message is None:
             return None
@@ -109,15 +109,15 @@ class Decoder:
         return Received(message.name, verdict, signals, checker.newly_lost)
 
     def forget(self, name: str) -> None:
-        """The stream of that message has ended: its next frame only starts another."""
+        """Reset the stream of a message: its next frame counts as FIRST."""
         self._checkers[database().get_message_by_name(name).frame_id].forget()
 
     def forget_all(self) -> None:
-        """The bus was away."""
+        """Reset all streams, after a bus failure."""
         for checker in self._checkers.values():
             checker.forget()
 
 
 def uptime_s(stamp_s: float) -> float:
-    """A time since switching on as BaseHeartbeat carries it."""
+    """Return the time since switching on in the format of BaseHeartbeat, s (wraps at 2^32 ms)."""
     return (round(stamp_s * 1000) % _UPTIME_MODULUS_MS) / 1000

@@ -1,10 +1,9 @@
-"""CAN as a front end of `edge-hil`: the Carter's node on a bus of python-can, its camera beside it over HTTP.
+"""CAN front end of `edge-hil`: the Carter's node on a bus of python-can, with its camera over HTTP.
 
 --link INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...], for example
   serial:carter-can            a serial line; a path that does not exist becomes the client's end of a pty
   socketcan:can0,camera=8091   a real bus, the camera on another port
-  serial:carter-can,drop=0.05,corrupt=0.01    a bus on which frames get lost and broken; see
-  sim_hil/protocols/can/shim.py
+  serial:carter-can,drop=0.05,corrupt=0.01    a bus that loses and corrupts frames (sim_hil/protocols/can/shim.py)
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from sim_hil.protocols.can.frames import Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
 from sim_hil.protocols.can.shim import FaultPlan, FaultShim
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.robots.carter.body import Carter
 from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
@@ -38,12 +37,12 @@ if TYPE_CHECKING:
 
 CAMERA_PORT: Final = 8090
 _EVENT_S: Final = 0.1
-_SHOWN: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
+_TRACED: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
 
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """What `--link` says."""
+    """Parsed value of `--link`."""
 
     address: BusAddress
     camera_port: int = CAMERA_PORT
@@ -55,7 +54,7 @@ class LinkOptions:
 
     @staticmethod
     def parse(text: str | None) -> LinkOptions:
-        """From the command line; None: a pty in the user's runtime directory. Raises FrontEndError."""
+        """Parse `--link`; None: a pty in the user's runtime directory. Raises FrontEndError."""
         if text is None:
             text = f"serial:{_own_folder() / 'carter-can'}"
         where, *settings = text.split(",")
@@ -73,7 +72,7 @@ class LinkOptions:
 
 
 def _own_folder() -> Path:
-    """The user's runtime directory, made if there is none, and nobody else's: under /tmp anybody could have made it."""
+    """Return the user's runtime directory; create it if needed and check its owner (/tmp is open to all users)."""
     folder = runtime_dir()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -92,7 +91,7 @@ def _port(text: str) -> int:
 
 
 class CommandLog:
-    """What has been commanded over the bus, for the result: what was heard, not what was meant."""
+    """Summary of the commands received over the bus, for the result."""
 
     def __init__(self) -> None:
         self._commands = 0
@@ -101,7 +100,7 @@ class CommandLog:
         self._at_zero = True
 
     def note(self, received: Received) -> None:
-        """Count one frame that was obeyed."""
+        """Count one obeyed frame."""
         self._last_command = received.name
         if received.name == "VelocityCommand":
             self._commands += 1
@@ -114,7 +113,7 @@ class CommandLog:
             self._at_zero = True
 
     def summary(self) -> dict[str, object]:
-        """The `wire` part of the result, without `malformed`."""
+        """Return the `wire` part of the result, without `malformed`."""
         return {
             "commands": self._commands,
             "last_move": None if self._last_move is None else list(self._last_move),
@@ -124,10 +123,10 @@ class CommandLog:
 
 
 class CanFrontEnd:
-    """A simulated Carter answering on CAN."""
+    """CAN front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
-        """Raises FrontEndError, BusError or OSError when bus or camera cannot be had."""
+        """Open bus and camera. Raises FrontEndError, BusError or OSError."""
         self._options, self._address = options, link.address
         self._node = CanNode(robot)
         self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
@@ -136,7 +135,7 @@ class CanFrontEnd:
         self._inwards = FaultShim(link.faults, options.seed, 0)
         self._outwards = FaultShim(link.faults, options.seed, 1)
         self._log = CommandLog()
-        self._heard: list[Heard] = []
+        self._commands: list[ReceivedCommand] = []
         self._last_event: tuple[tuple[str, float], float] | None = None
         self._now_s = 0.0
         self._states = 0
@@ -146,7 +145,7 @@ class CanFrontEnd:
         try:
             if options.faults is not None:
                 self._faults = _faults(options.faults, link.faults)
-            self._link = BusLink(open_bus(self._plugged_in(link.address)))
+            self._link = BusLink(open_bus(self._bus_to_open(link.address)))
             if options.camera_size is not None:
                 self._camera = CameraStream(
                     options.scene_source,
@@ -161,16 +160,16 @@ class CanFrontEnd:
             self.close()
             raise
 
-    def _plugged_in(self, address: BusAddress) -> BusAddress:
-        """The bus to open: for a serial path that does not exist, our end of a pty whose other end it becomes."""
+    def _bus_to_open(self, address: BusAddress) -> BusAddress:
+        """Return the bus to open: for a serial path that does not exist, our end of a new pty linked to that path."""
         path = Path(address.channel)
         if address.interface != "serial":
             return address
         if path.is_symlink() and not path.exists():
-            path.unlink()  # left behind by a run that was killed: its pty has gone
+            path.unlink()  # left by a killed run; its pty no longer exists
         if path.is_symlink() and str(path.resolve()).startswith("/dev/pts/"):
             raise FrontEndError(
-                f"--link {address}: expected a free path, found the line of another run; end that, or remove the link"
+                f"--link {address}: expected a free path, found the line of another run; end it or remove the link"
             )
         if path.exists():
             return address
@@ -181,7 +180,7 @@ class CanFrontEnd:
         return BusAddress("serial", self._line.near)
 
     def where(self) -> str:
-        """Bus and camera."""
+        """Return the addresses of bus and camera."""
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"CAN {self._address}, {camera}"
 
@@ -193,41 +192,41 @@ class CanFrontEnd:
         return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
-        """Until a frame arrives."""
+        """Wait until a frame arrives, at most `left_ns`."""
         assert self._link is not None
         self._link.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
-        """Obey what has arrived. Raises BusError when the bus has gone."""
+    def serve(self) -> list[ReceivedCommand]:
+        """Execute the received commands and return them. Raises BusError if the bus was lost."""
         assert self._link is not None
         for received_ns, frame in self._link.receive():
             if self._faulty:
                 self._inwards.put(frame, self._now_s)
             else:
-                self._hear(frame, received_ns)
-        self._hear_late()
+                self._handle(frame, received_ns)
+        self._handle_delayed()
         if self._camera is not None:
             self._camera.poll()
-        heard, self._heard = self._heard, []
-        return heard
+        commands, self._commands = self._commands, []
+        return commands
 
-    def _hear_late(self) -> None:
+    def _handle_delayed(self) -> None:
         if self._faulty:
             for frame in self._inwards.take(self._now_s):
-                self._hear(frame, time.monotonic_ns())
+                self._handle(frame, time.monotonic_ns())
 
-    def _hear(self, frame: Frame, received_ns: int) -> None:
+    def _handle(self, frame: Frame, received_ns: int) -> None:
         received = self._node.receive(frame, self._now_s)
-        if received is None or received.name not in _SHOWN:
+        if received is None or received.name not in _TRACED:
             return
         stop = received.name == "EstopControl" and received.signals.get("Request") == frames.ESTOP_STOP
-        if (received.good or stop) and not self._again(received):
+        if (received.good or stop) and not self._is_repeated(received):
             self._log.note(received)
-            content = " ".join(f"{key}={received.signals[key]:g}" for key in _SHOWN[received.name])
-            self._heard.append(Heard(received_ns, "can", frame.identifier, received.name, content))
+            content = " ".join(f"{key}={received.signals[key]:g}" for key in _TRACED[received.name])
+            self._commands.append(ReceivedCommand(received_ns, "can", frame.identifier, received.name, content))
 
-    def _again(self, received: Received) -> bool:
-        """Whether this is one more frame of an event that is sent three times."""
+    def _is_repeated(self, received: Received) -> bool:
+        """Return whether this frame repeats an event, which is sent three times."""
         if received.name == "VelocityCommand":
             return False
         event, last = (received.name, received.signals["Request"]), self._last_event
@@ -235,23 +234,23 @@ class CanFrontEnd:
         return last is not None and last[0] == event and self._now_s - last[1] < _EVENT_S
 
     def publish(self, step: int, stamp_s: float) -> None:
-        """Let the node's clock go on, and send what is due."""
+        """Advance the node's clock and send the frames that are due."""
         assert self._link is not None
         self._now_s = stamp_s
-        self._heed_faults()
-        self._hear_late()
+        self._apply_faults()
+        self._handle_delayed()
         self._node.step(stamp_s)
         due = self._node.due(stamp_s, self._read)
         if self._faulty:
             for frame in due:
                 self._outwards.put(frame, stamp_s)
-            # The bus's own error frames are seen by each node for itself.
+            # Each node detects the bus's error frames by itself.
             due = [frame for frame in self._outwards.take(stamp_s) if not frame.error]
         for frame in due:
             self._states += frame.identifier == _MOTION_ID
             self._link.send(frame)
 
-    def _heed_faults(self) -> None:
+    def _apply_faults(self) -> None:
         if self._faults is None:
             return
         self._faults.poll()
@@ -261,19 +260,19 @@ class CanFrontEnd:
 
     @property
     def pending(self) -> int:
-        """Frames that wait for the bus."""
+        """Number of frames waiting to be sent."""
         return 0 if self._link is None else self._link.pending
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
 
     def show(self, render_state: NDArray[np.float64]) -> None:
-        """Hand the camera process what it renders from now on."""
+        """Pass the state to render to the camera process."""
         if self._camera is not None:
             self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process, leave the bus, remove the pty and the faults' socket."""
+        """End the camera process, close the bus, remove the pty and the fault socket."""
         if self._faults is not None:
             self._faults.close()
         if self._camera is not None:
@@ -284,7 +283,7 @@ class CanFrontEnd:
             self._line.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Return the counts of received and sent messages."""
         counts, link = self._node.counts, self._link
         line_errors, sent, unsent = (0, 0, 0) if link is None else (link.line_errors, link.sent, link.unsent)
         can = {
@@ -307,7 +306,7 @@ class CanFrontEnd:
 
 
 def _faults(path: Path, plan: FaultPlan) -> CanFaults:
-    # Imported here: without --faults nobody can press anything from outside.
+    # Imported here: needed only with --faults.
     from sim_hil.protocols.can.faults import CanFaults
 
     return CanFaults(path, plan)
@@ -317,7 +316,7 @@ _MOTION_ID: Final = frames.database().get_message_by_name("OdometryMotion").fram
 
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> CanFrontEnd:
-    """The front end of `--protocol can`. Raises FrontEndError or OSError."""
+    """Open the front end of `--protocol can`. Raises FrontEndError or OSError."""
     robot = simulation.robot
     if not isinstance(robot, Carter):
         raise FrontEndError(f"--protocol can: expected the Carter, found a {type(robot).__name__}")

@@ -1,8 +1,8 @@
-"""The base's CAN node: what it obeys, when it stops by itself, what it reports. Pure: no clock, no bus.
+"""CAN node of the base: which commands it obeys, when it stops by itself, what it reports. Pure: no clock, no bus.
 
-States: idle -> armed -> idle, and emergency stop from anywhere, latched until it is reset. Every time is the robot's
-own clock, s. The limits are those of a wheeled robot's firmware that has no driver to fall back on: 100 ms without a
-good velocity command stop the base (openpilot's body: 100 ms), 500 ms without the controller's heartbeat disarm it.
+States: idle -> armed -> idle, and from every state an emergency stop, latched until a reset. All times are the robot's
+own clock, s. The timeouts fit a wheeled robot without a driver on board: after 100 ms without a valid velocity command
+the base stops (openpilot's body: 100 ms), after 500 ms without the controller's heartbeat it disarms.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from sim_hil.robots.carter.sensors import Sensors
 
 COMMAND_TIMEOUT_S: Final = 0.100
 HEARTBEAT_TIMEOUT_S: Final = 0.500
-# A node may come back 128 x 11 recessive bits after it went off (ISO 11898-1: 2.8 ms at 500 kbit/s); ours waits longer,
-# as Linux does with "restart-ms 100".
+# A node may rejoin 128 x 11 recessive bits after bus-off (ISO 11898-1: 2.8 ms at 500 kbit/s); ours waits longer, like
+# Linux with "restart-ms 100".
 BUS_OFF_RECOVERY_S: Final = 0.100
 BATTERY_LOW_PERCENT: Final = 10.0
 # Error classes of the kernel's error frames (linux/can/error.h).
 ERROR_BUS_OFF: Final = 0x040
 ERROR_RESTARTED: Final = 0x100
-_TICK_S: Final = 1e-6  # a sum of steps is not exact
+_TICK_S: Final = 1e-6  # tolerance for the rounding error of summed steps
 _LEVELS: Final = ("CommandTimeout", "HeartbeatLost", "BatteryLow", "DriveOverload")
 _SIDES: Final = ("Front", "Rear", "Left", "Right")
 
 
 class Base(Protocol):
-    """What the node asks of the robot."""
+    """Interface of the robot to the node."""
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity would be obeyed."""
+        """Whether the robot would obey a velocity."""
         ...
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity."""
+        """Set the commanded velocity."""
         ...
 
     def stand(self) -> None:
-        """Power the drive."""
+        """Power the drive on."""
         ...
 
     def rest(self) -> None:
-        """Brake, without power afterwards."""
+        """Brake, then power the drive off."""
         ...
 
     def press_estop(self) -> None:
@@ -56,13 +56,13 @@ class Base(Protocol):
         ...
 
     def release_estop(self) -> None:
-        """Let the drive be powered again."""
+        """Allow the drive to be powered again."""
         ...
 
 
 @dataclass
 class Counts:
-    """What was received and not obeyed, and how often the bus was off."""
+    """Counts of rejected frames, bus-off events and error frames."""
 
     wrong_crc: int = 0
     wrong_length: int = 0
@@ -74,12 +74,12 @@ class Counts:
 
     @property
     def malformed(self) -> int:
-        """Frames that no correct sender makes; one for somebody else on the bus is none of them."""
+        """Number of invalid frames; frames for other nodes are not included."""
         return self.wrong_crc + self.wrong_length
 
 
 class CanNode:
-    """One base on one bus: `receive` every frame, then `step` and `due` after every physics step."""
+    """Node of one base: call `receive` for every frame, then `step` and `due` after every physics step."""
 
     def __init__(self, base: Base) -> None:
         self._base = base
@@ -94,16 +94,16 @@ class CanNode:
         self._bus_off_until_s: float | None = None
         self._periods = frames.periods_s("Base")
         self._next_s = dict.fromkeys(self._periods, 0.0)
-        self._told: dict[str, dict[str, float]] = {}
+        self._reported: dict[str, dict[str, float]] = {}
         self._low_battery = False
 
     @property
     def bus_off(self) -> bool:
-        """Whether it takes no part in the bus now."""
+        """Whether the node is disconnected from the bus."""
         return self._bus_off_until_s is not None
 
     def receive(self, frame: Frame, now_s: float) -> Received | None:
-        """Obey a frame if it may be obeyed; None for an error frame and for one that is not for the base."""
+        """Check a frame and obey it if valid; None for an error frame and for one that is not for the base."""
         if frame.error:
             self._bus_error(frame.identifier, now_s)
             return None
@@ -129,7 +129,7 @@ class CanNode:
 
     def _estop_control(self, received: Received) -> None:
         request = received.signals.get("Request", frames.ESTOP_NONE)
-        # To stop, a frame need not be new, only whole: a repeated stop does no harm.
+        # A stop frame needs a valid CRC only, no valid counter: a repeated stop does no harm.
         if request == frames.ESTOP_STOP:
             self._stop(frames.SOURCE_BUS)
         elif request == frames.ESTOP_RESET and received.good and not self.button:
@@ -150,7 +150,7 @@ class CanNode:
     def _arm(self, now_s: float) -> None:
         if self.state == frames.STATE_IDLE and self._heartbeat_alive(now_s) and not self._low_battery:
             self.state = frames.STATE_ARMED
-            self._command_s = now_s  # the first command has as long as every other
+            self._command_s = now_s  # the timeout of the first command starts now
             self._base.stand()
 
     def _disarm(self) -> None:
@@ -186,7 +186,7 @@ class CanNode:
         return self._command_s is None or now_s - self._command_s > COMMAND_TIMEOUT_S + _TICK_S
 
     def step(self, now_s: float) -> None:
-        """Stop when nobody has commanded in time; come back to the bus; heed the red button."""
+        """Apply timeouts, rejoin the bus when due, and apply the emergency stop button."""
         if self._bus_off_until_s is not None and now_s >= self._bus_off_until_s:
             self._bus_off_until_s = None
         if self.button:
@@ -202,7 +202,7 @@ class CanNode:
                 self._base.command(0.0, 0.0, 0.0)
 
     def due(self, now_s: float, read: Callable[[], Sensors]) -> list[Frame]:
-        """The frames to be sent now; `read` is called when there is one. Nothing while the bus is off."""
+        """Return the frames to send now, none while the bus is off; `read` is called only if there are any."""
         if self.bus_off:
             return []
         names = [name for name, at_s in self._next_s.items() if now_s >= at_s]
@@ -213,24 +213,24 @@ class CanNode:
         self._low_battery = sensors.charge_percent <= BATTERY_LOW_PERCENT
         made = []
         for name in names:
-            # From the last date on, so that the rate is kept; not after a standstill, which would bring a burst.
+            # Relative to the last due time, to keep the rate; after a pause relative to now, to avoid a burst.
             self._next_s[name] = max(self._next_s[name] + self._periods[name], now_s)
             made.append(self._make(name, now_s, sensors))
         for name in ("EstopState", "Faults"):
-            if name not in names and self._told.get(name) != self._levels(name, sensors, now_s):
+            if name not in names and self._reported.get(name) != self._levels(name, sensors, now_s):
                 made.append(self._make(name, now_s, sensors))
         return made
 
     def _state_has_changed(self) -> bool:
-        """Whether the emergency stop's state differs from what was told; fault bits are looked at on every report."""
-        return self._told.get("EstopState") != self._estop_signals()
+        """Return whether the emergency stop's state differs from the last report; fault bits are checked in `due`."""
+        return self._reported.get("EstopState") != self._estop_signals()
 
     def _estop_signals(self) -> dict[str, float]:
         latched = self.state == frames.STATE_ESTOP
         return {"Latched": float(latched), "Button": float(self.button), "Source": float(self._source)}
 
     def _levels(self, name: str, sensors: Sensors, now_s: float) -> dict[str, float]:
-        """The part of a report whose change is told at once."""
+        """Return the signals of a report whose change is sent at once."""
         if name == "EstopState":
             return self._estop_signals()
         late = self.state == frames.STATE_ARMED and self._timed_out(now_s)
@@ -242,7 +242,7 @@ class CanNode:
 
     def _make(self, name: str, now_s: float, sensors: Sensors) -> Frame:
         if name in ("EstopState", "Faults"):
-            self._told[name] = self._levels(name, sensors, now_s)
+            self._reported[name] = self._levels(name, sensors, now_s)
         return self._encoder.encode(name, **self._signals(name, now_s, sensors))
 
     def _signals(self, name: str, now_s: float, sensors: Sensors) -> dict[str, float]:
@@ -268,7 +268,7 @@ class CanNode:
         if name == "EstopState":
             return self._estop_signals()
         counts = self.counts
-        told = (counts.wrong_crc + counts.wrong_length, counts.wrong_counter, counts.lost, counts.unknown)
+        totals = (counts.wrong_crc + counts.wrong_length, counts.wrong_counter, counts.lost, counts.unknown)
         keys = ("CrcErrors", "CounterErrors", "LostFrames", "UnknownFrames")
-        modulo = {key: float(count % 256) for key, count in zip(keys, told, strict=True)}
+        modulo = {key: float(count % 256) for key, count in zip(keys, totals, strict=True)}
         return {**self._levels("Faults", sensors, now_s), **modulo, "BusOffs": float(counts.bus_offs % 256)}

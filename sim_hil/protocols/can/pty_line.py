@@ -1,6 +1,6 @@
-"""A serial line between two processes of one machine: two ptys and a thread that carries bytes between them.
+"""Serial line between two processes of one machine: two ptys and a thread that copies bytes between them.
 
-Nothing is kept for an end that nobody has opened: whoever plugs in hears what is said from then on.
+Data for an end that no process has opened is discarded, so a new client receives only data sent from then on.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _UNPLUGGED_S: Final = 0.01
 
 
 class PtyLine:
-    """`near` is the device of our own end; `far` a link that the other process opens. Raises OSError."""
+    """Serial line; `near`: device of our end, `far`: link that the other process opens. Raises OSError."""
 
     def __init__(self, far: Path) -> None:
-        """`far`: a path that does not exist yet; removed again by `close`."""
+        """Create the line; `far`: a path that does not exist yet, removed by `close`."""
         self._masters: list[int] = []
         self.far = far
         devices = []
@@ -32,7 +32,7 @@ class PtyLine:
                 master, slave = os.openpty()
                 tty.setraw(slave)
                 devices.append(os.ttyname(slave))
-                os.close(slave)  # so that the line can tell whether somebody has opened this end
+                os.close(slave)  # so that the line can detect whether a process has opened this end
                 os.set_blocking(master, False)
                 self._masters.append(master)
             far.symlink_to(devices[1])
@@ -45,7 +45,7 @@ class PtyLine:
         self._thread.start()
 
     def close(self) -> None:
-        """Unplug both ends; may be called twice."""
+        """Close both ends and remove the link; may be called twice."""
         if self._ending:
             return
         self._ending = True
@@ -72,19 +72,19 @@ class PtyLine:
                     unplugged = events.get(other[master], 0) & select.POLLHUP or _unplugged(other[master])
                     self._move(master, None if unplugged else other[master])
             if any(event & select.POLLHUP for event in events.values()):
-                time.sleep(_UNPLUGGED_S)  # an unplugged end would otherwise wake us all the time
+                time.sleep(_UNPLUGGED_S)  # an unplugged end would otherwise wake this thread continuously
 
     def _move(self, source: int, target: int | None) -> None:
         with contextlib.suppress(BlockingIOError):
             try:
                 data = os.read(source, _CHUNK)
-            except OSError:  # EIO: unplugged between the look and the read
+            except OSError:  # EIO: unplugged between poll and read
                 return
             if target is not None:
-                os.write(target, data)  # what does not fit is lost, as on a line without handshake
+                os.write(target, data)  # overflow is lost, as on a line without handshake
 
 
 def _unplugged(master: int) -> bool:
-    look = select.poll()
-    look.register(master, 0)
-    return any(event & select.POLLHUP for _, event in look.poll(0))
+    poller = select.poll()
+    poller.register(master, 0)
+    return any(event & select.POLLHUP for _, event in poller.poll(0))

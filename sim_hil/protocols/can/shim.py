@@ -1,7 +1,7 @@
-"""What can go wrong between two nodes of a bus, on purpose and repeatably. Pure: frames and times in, frames out.
+"""Reproducible faults of a CAN bus. Pure: frames and times in, frames out.
 
-One shim stands for one direction. The n-th frame meets the same fate for the same seed, whatever the clock says; only
-how long a fault lasts is a matter of time.
+One shim stands for one direction. With the same seed, the n-th frame suffers the same fault at any time; only the
+duration of a fault depends on the clock.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
 
 # A frame of 8 bytes with its stuff bits, about 130 bits, on a bus of 500 kbit/s.
 FRAME_S: Final = 130 / 500_000
-BABBLER_ID: Final = 0x000  # wins every arbitration
+BABBLER_ID: Final = 0x000  # highest priority: wins every arbitration
 _PROBABILITIES: Final = ("drop", "corrupt", "duplicate", "delay")
 
 
 @dataclass(frozen=True)
 class FaultPlan:
-    """Probabilities per frame (0..1), and what happens by the clock.
+    """Faults of a bus: probabilities per frame (0..1), and timed faults.
 
-    `drop`, `corrupt` (1 to 3 bits of the data flipped), `duplicate`, `delay` (by `delay_s`; later frames overtake it).
-    Every `bus_off_every_s` the bus is off for `bus_off_s` (0: never). A babbling idiot sends `babble_hz` frames of the
-    highest priority from `babble_from_s` on for `babble_s` seconds; the others wait, or find no gap at all.
+    Probabilities: `drop`, `corrupt` (flips 1 to 3 data bits), `duplicate`, `delay` (by `delay_s`; later frames
+    overtake). Every `bus_off_every_s` the bus is off for `bus_off_s` (0: never). A babbling idiot sends `babble_hz`
+    frames of highest priority from `babble_from_s` for `babble_s` seconds; other frames wait or are never sent.
     """
 
     drop: float = 0.0
@@ -53,7 +53,7 @@ class FaultPlan:
 
     @staticmethod
     def parse(text: str) -> FaultPlan:
-        """From `drop=0.1,corrupt=0.05`; raises ValueError with one clear line."""
+        """Parse `drop=0.1,corrupt=0.05`. Raises ValueError with one line."""
         known = {each.name for each in fields(FaultPlan)}
         values: dict[str, float] = {}
         for part in text.split(","):
@@ -68,12 +68,12 @@ class FaultPlan:
 
 
 class FaultShim:
-    """One direction of a faulty bus: `put` frames in, `take` what arrives; both with a clock that never goes back."""
+    """One direction of a faulty bus: `put` frames in and `take` the arriving ones, with a monotonic clock."""
 
     def __init__(self, plan: FaultPlan, seed: int, direction: int) -> None:
-        """`direction`: 0 to the base, 1 from it; the two go wrong independently.
+        """Create one direction: 0 to the base, 1 from it; their faults are independent.
 
-        `plan` may be replaced while it runs; `held_off`: the bus is off until it is taken back.
+        `plan` may be replaced at any time; while `held_off` is true, the bus is off.
         """
         self.plan = plan
         self.held_off = False
@@ -81,20 +81,20 @@ class FaultShim:
         self._waiting: list[tuple[float, int, Frame]] = []
         self._order = 0
         self._free_s = 0.0
-        self._babbled_until_s: float | None = None  # None: it is silent
+        self._babbled_until_s: float | None = None  # None: not babbling
         self._off = False
-        self._looked_s = 0.0
+        self._last_take_s = 0.0
         self._done = dict.fromkeys(("drop", "corrupt", "duplicate", "delay", "bus_off", "babble", "starved"), 0)
 
     @property
     def done(self) -> Mapping[str, int]:
-        """How often each fault has happened."""
+        """Number of occurrences of each fault."""
         return dict(self._done)
 
     def put(self, frame: Frame, now_s: float) -> None:
-        """Give a frame to the bus."""
+        """Send a frame."""
         plan = self.plan
-        # The same four draws for every frame, so that one fault's probability does not move the others' dice.
+        # Always the same draws, so that the probability of one fault does not change the others' random numbers.
         drop, corrupt, duplicate, delay = (float(value) for value in self._rng.random(4))
         bits = self._rng.integers(0, 8 * max(len(frame.data), 1), self._rng.integers(1, 4))
         if self.is_off(now_s):
@@ -123,7 +123,7 @@ class FaultShim:
         return Frame(frame.identifier, bytes(data), frame.error)
 
     def _arrival(self, now_s: float) -> float | None:
-        """When a frame that is sent now gets its gap beside the babbler; None when there is none."""
+        """Return when a frame sent now gets onto the bus beside the babbler; None if never."""
         plan = self.plan
         if not self._babbling(now_s):
             return now_s
@@ -139,7 +139,7 @@ class FaultShim:
         return plan.babble_hz > 0 and plan.babble_from_s <= now_s < plan.babble_from_s + plan.babble_s
 
     def is_off(self, now_s: float) -> bool:
-        """Whether nothing passes at that time."""
+        """Return whether the bus is off at that time."""
         every_s = self.plan.bus_off_every_s
         return self.held_off or (every_s > 0 and now_s >= every_s and now_s % every_s < self.plan.bus_off_s)
 
@@ -148,11 +148,11 @@ class FaultShim:
         heapq.heappush(self._waiting, (arrives_s, self._order, frame))
 
     def take(self, now_s: float) -> list[Frame]:
-        """What arrives up to now, error frames of the bus and the babbler's frames included."""
+        """Return the frames that have arrived, including the bus's error frames and the babbler's frames."""
         arrived = self._bus_state(now_s)
         if not self.is_off(now_s):
             arrived += self._babble(now_s)
-        self._looked_s = now_s
+        self._last_take_s = now_s
         while self._waiting and self._waiting[0][0] <= now_s:
             frame = heapq.heappop(self._waiting)[2]
             if not self._off:
@@ -168,12 +168,12 @@ class FaultShim:
         return [Frame(ERROR_BUS_OFF if off else ERROR_RESTARTED, bytes(8), error=True)]
 
     def _babble(self, now_s: float) -> list[Frame]:
-        """The babbler's frames since the last look; it fills the bus and no more."""
+        """Return the babbler's frames since the last call, limited by the bus's capacity."""
         if not self._babbling(now_s):
             self._babbled_until_s = None
             return []
-        if self._babbled_until_s is None:  # from now on, however long its time has been running
-            self._babbled_until_s = max(self.plan.babble_from_s, self._looked_s)
+        if self._babbled_until_s is None:  # starts now, even if its period began earlier
+            self._babbled_until_s = max(self.plan.babble_from_s, self._last_take_s)
         period_s = max(1 / self.plan.babble_hz, FRAME_S)
         count = int((now_s - self._babbled_until_s) / period_s + 1e-9)
         self._babbled_until_s += count * period_s

@@ -1,1 +1,1 @@
-"""The Carter as a MAVLink rover on UDP."""
+"""MAVLink protocol of the Carter, as a rover on UDP."""

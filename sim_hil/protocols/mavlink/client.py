@@ -1,4 +1,4 @@
-"""A ground station in a few lines: what tests and the scripted session drive the rover with."""
+"""Minimal ground station, with which tests drive the rover."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SETPOINT_S: Final = 0.05
 
 
 class MavlinkClient:
-    """Talks to one rover; `poll` takes in what has come, `spin` lets time pass with heartbeats and setpoints."""
+    """Client of one rover: `poll` reads messages, `spin` waits while sending heartbeats and setpoints."""
 
     def __init__(
         self, robot: Address, *, system: int = 255, target: int = 1, key: bytes | None = None, now_ticks: int = 0
     ) -> None:
-        """`system`: our own number; with `key` everything sent is signed."""
+        """Open a socket; `system`: own MAVLink number; with `key`, all packets are signed."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -34,42 +34,42 @@ class MavlinkClient:
         self._target = target
         self._reader = Reader()
         self._writer = Writer(system, common.MAV_COMP_ID_MISSIONPLANNER, key, now_ticks)
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
         self._latest: dict[str, Message] = {}
 
     @property
     def latest(self) -> Mapping[str, Message]:
-        """Newest message of every type."""
+        """Newest message of each type."""
         return self._latest
 
     @property
     def address(self) -> Address:
-        """Our own."""
+        """Own address."""
         host, port = self._socket.getsockname()
         return host, port
 
     def send(self, message: Message) -> None:
-        """One message in one datagram."""
+        """Send a message in one datagram."""
         self.send_bytes(self._writer.pack(message))
 
     def send_bytes(self, data: bytes) -> None:
-        """A datagram as it is."""
-        with contextlib.suppress(ConnectionError):  # the robot has gone
+        """Send a raw datagram."""
+        with contextlib.suppress(ConnectionError):  # the robot's socket is closed
             self._socket.sendto(data, self._robot)
 
     def poll(self) -> list[Message]:
-        """Take in what has come; returns it."""
+        """Read the received messages and return them."""
         new: list[Message] = []
         with contextlib.suppress(BlockingIOError, ConnectionError):
             while True:
                 new += self._reader.read(self._socket.recv(2048))
         for message in new:
             self._latest[message.get_type()] = message
-        self.heard += new
+        self.received += new
         return new
 
     def heartbeat(self) -> None:
-        """Say that a ground station is there."""
+        """Send a ground station's heartbeat."""
         self.send(
             common.MAVLink_heartbeat_message(
                 common.MAV_TYPE_GCS, common.MAV_AUTOPILOT_INVALID, 0, 0, common.MAV_STATE_ACTIVE, 3
@@ -77,24 +77,24 @@ class MavlinkClient:
         )
 
     def command(self, number: int, *params: float) -> None:
-        """A COMMAND_LONG; what is missing of its seven parameters is 0."""
+        """Send a COMMAND_LONG; missing parameters of the seven are 0."""
         values = (*params, *[0.0] * (7 - len(params)))
         self.send(common.MAVLink_command_long_message(self._target, 1, number, 0, *values))
 
     def arm(self, *, force: bool = False) -> None:
-        """Ask for the drive's power."""
+        """Request arming."""
         self.command(common.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196 if force else 0)
 
     def disarm(self) -> None:
-        """Give it back."""
+        """Request disarming."""
         self.command(common.MAV_CMD_COMPONENT_ARM_DISARM, 0)
 
     def emergency_stop(self) -> None:
-        """A forced disarm."""
+        """Request an emergency stop: a forced disarm."""
         self.command(common.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196)
 
     def set_mode(self, mode: Mode) -> None:
-        """Ask for a mode."""
+        """Request a mode."""
         main, sub = mode.value
         self.command(common.MAV_CMD_DO_SET_MODE, common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main, sub)
 
@@ -108,7 +108,7 @@ class MavlinkClient:
         vy_mps: float = 0.0,
         yaw_rad: float = 0.0,
     ) -> None:
-        """A setpoint; `wz_radps` turns to the left, `vy_mps` and `yaw_rad` are as MAVLink has them."""
+        """Send a setpoint; positive `wz_radps` turns left, `vy_mps` and `yaw_rad` follow MAVLink's convention."""
         self.send(
             common.MAVLink_set_position_target_local_ned_message(
                 0, self._target, 1, frame, mask, 0, 0, 0, vx_mps, vy_mps, 0, 0, 0, 0, yaw_rad, -wz_radps
@@ -117,18 +117,18 @@ class MavlinkClient:
 
     @property
     def mode(self) -> Mode | None:
-        """Of the rover, as its last heartbeat says."""
+        """Mode in the rover's last heartbeat."""
         last = self._latest.get("HEARTBEAT")
         return None if last is None else custom_mode_of(last.custom_mode)
 
     @property
     def armed(self) -> bool:
-        """Whether its last heartbeat says so."""
+        """Whether the rover's last heartbeat reports it as armed."""
         last = self._latest.get("HEARTBEAT")
         return last is not None and bool(last.base_mode & common.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def spin(self, seconds: float, vx_mps: float | None = None, wz_radps: float = 0.0) -> None:
-        """Let real time pass with a heartbeat a second, and 20 setpoints a second unless `vx_mps` is None."""
+        """Wait in real time while sending 1 heartbeat a second, and 20 setpoints a second unless `vx_mps` is None."""
         end = time.monotonic() + seconds
         next_heartbeat = next_setpoint = 0.0
         while (now := time.monotonic()) < end:
@@ -142,5 +142,5 @@ class MavlinkClient:
             self.poll()
 
     def close(self) -> None:
-        """Leave without a word."""
+        """Close the socket."""
         self._socket.close()

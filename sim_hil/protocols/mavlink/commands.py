@@ -1,4 +1,4 @@
-"""Commands (COMMAND_LONG and COMMAND_INT): what each does and the MAV_RESULT that its acknowledgement carries."""
+"""Handlers of MAVLink commands (COMMAND_LONG and COMMAND_INT); each returns the MAV_RESULT of the acknowledgement."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Final, Protocol
 from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink.modes import find_mode
-from sim_hil.protocols.mavlink.telemetry import STREAMS, Picture, Schedule, autopilot_version
+from sim_hil.protocols.mavlink.telemetry import STREAMS, Schedule, Snapshot, autopilot_version
 from sim_hil.protocols.mavlink.vehicle import ACCEPTED, DENIED, Station, Vehicle
 from sim_hil.protocols.mavlink.wire import Message
 
-FORCE: Final = 21196  # param2 of an arm or disarm command that overlooks checks: mavlink.io, MAV_CMD 400
+FORCE: Final = 21196  # param2 of an arm or disarm command that skips checks (mavlink.io, MAV_CMD 400)
 UNSUPPORTED: Final = int(common.MAV_RESULT_UNSUPPORTED)
 
 
 @dataclass(frozen=True)
 class Command:
-    """One command as it came; `params` are param1..param7, COMMAND_INT's x and y among them.
+    """One received command; `params` are param1..param7, where COMMAND_INT has x and y.
 
-    A NaN says that a parameter is not used (MAVSDK sends it for all the rest), which is 0 for every command here.
+    NaN marks an unused parameter (MAVSDK sends it); it is read as 0.
     """
 
     number: int
@@ -31,7 +31,7 @@ class Command:
 
     @staticmethod
     def of(message: Message) -> Command:
-        """Of a COMMAND_LONG or COMMAND_INT."""
+        """Read a COMMAND_LONG or COMMAND_INT."""
         params = [message.param1, message.param2, message.param3, message.param4]
         if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_INT:
             params += [message.x, message.y, message.z]
@@ -41,37 +41,37 @@ class Command:
 
     @property
     def is_emergency_stop(self) -> bool:
-        """A disarm that is forced, or a termination."""
+        """Whether the command is a forced disarm or a flight termination."""
         p1, p2 = self.params[:2]
         if self.number == common.MAV_CMD_DO_FLIGHTTERMINATION:
             return p1 >= 0.5
         return self.number == common.MAV_CMD_COMPONENT_ARM_DISARM and p1 == 0 and p2 == FORCE
 
 
-class Commanded(Protocol):
-    """The component that commands act on."""
+class CommandTarget(Protocol):
+    """Component on which commands act."""
 
     vehicle: Vehicle
     schedule: Schedule
 
     @property
     def system(self) -> int:
-        """Its MAVLink number."""
+        """MAVLink system number."""
         ...
 
     def send_after_ack(self, message: Message) -> None:
-        """Send what a command asks for, behind its acknowledgement."""
+        """Send a message that a command requests, after the acknowledgement."""
         ...
 
-    def picture(self) -> Picture:
-        """What reports are made of, as of the latest reading."""
+    def snapshot(self) -> Snapshot:
+        """Return the data for reports, from the latest sensor reading."""
         ...
 
 
-Handler = Callable[[Commanded, Station, Command, float], int]
+Handler = Callable[[CommandTarget, Station, Command, float], int]
 
 
-def _arm_disarm(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _arm_disarm(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     arm, force = command.params[:2]
     if arm not in (0, 1) or force not in (0, FORCE):
         return int(DENIED)
@@ -82,27 +82,27 @@ def _arm_disarm(node: Commanded, station: Station, command: Command, now_s: floa
     return node.vehicle.disarm(station, now_s)
 
 
-def _terminate(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _terminate(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     if command.is_emergency_stop:
         return node.vehicle.emergency_stop(f"termination by station {station.system}")
     return int(DENIED)
 
 
-def _set_mode(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _set_mode(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     base, main, sub = command.params[:3]
     if not all(map(isfinite, (base, main, sub))) or not int(base) & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return node.vehicle.set_mode(station, None, now_s)
     return node.vehicle.set_mode(station, find_mode(int(main), int(sub)), now_s)
 
 
-def _set_interval(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _set_interval(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     number, interval_us = command.params[:2]
     if not (isfinite(number) and isfinite(interval_us)) or not node.vehicle.may_change(station, now_s):
         return int(DENIED)
     return int(ACCEPTED if node.schedule.set_interval(int(number), interval_us, now_s) else DENIED)
 
 
-def _get_interval(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _get_interval(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     number = command.params[0]
     interval_us = node.schedule.interval_us(int(number)) if isfinite(number) else None
     if interval_us is None:
@@ -111,26 +111,26 @@ def _get_interval(node: Commanded, station: Station, command: Command, now_s: fl
     return int(ACCEPTED)
 
 
-def _request(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _request(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     number = command.params[0]
     return _send(node, int(number)) if isfinite(number) else int(DENIED)
 
 
-def _send(node: Commanded, number: int) -> int:
+def _send(node: CommandTarget, number: int) -> int:
     if number == common.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
         node.send_after_ack(autopilot_version(node.system))
     elif number in STREAMS:
-        node.send_after_ack(STREAMS[number].make(node.picture()))
+        node.send_after_ack(STREAMS[number].make(node.snapshot()))
     else:
         return int(DENIED)
     return int(ACCEPTED)
 
 
-def _capabilities(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _capabilities(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     return _send(node, common.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
 
-def _home(node: Commanded, station: Station, command: Command, now_s: float) -> int:
+def _home(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
     return _send(node, common.MAVLINK_MSG_ID_HOME_POSITION)
 
 
@@ -146,10 +146,10 @@ HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
         common.MAV_CMD_GET_HOME_POSITION: _home,
     }
 )
-"""Every other command is acknowledged as unsupported."""
+"""Handlers by command number; every other command is acknowledged as unsupported."""
 
 
-def obey(node: Commanded, station: Station, command: Command, now_s: float) -> int:
-    """Do it; MAV_RESULT."""
+def obey(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
+    """Execute a command and return its MAV_RESULT."""
     handler = HANDLERS.get(command.number)
     return UNSUPPORTED if handler is None else int(handler(node, station, command, now_s))

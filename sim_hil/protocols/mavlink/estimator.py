@@ -1,22 +1,22 @@
-"""Roll and pitch from the IMU: the gyro integrated, pulled towards where the accelerometer sees up. Pure."""
+"""Roll and pitch from the IMU by a complementary filter of gyro and accelerometer. Pure."""
 
 from __future__ import annotations
 
 from math import atan2, cos, exp, hypot, sin, tan
 from typing import Final
 
-_TIME_CONSTANT_S: Final = 1.5  # our choice: longer than the base takes to reach a speed
+_TIME_CONSTANT_S: Final = 1.5  # our choice: longer than the base's acceleration phases
 
 
 class TiltFilter:
-    """A complementary filter in the base's axes, x ahead, y left, z up."""
+    """Complementary filter in the base's axes: x forward, y left, z up."""
 
     def __init__(self) -> None:
         self.roll_rad = self.pitch_rad = 0.0
         self._last_s: float | None = None
 
     def step(self, time_s: float, gyro_radps: tuple[float, ...], accel_mps2: tuple[float, ...]) -> None:
-        """Take a reading at a time that never goes back."""
+        """Add a sensor reading; times must not decrease."""
         ax, ay, az = accel_mps2
         roll, pitch = atan2(ay, az), atan2(-ax, hypot(ay, az))
         if self._last_s is None:

@@ -1,7 +1,7 @@
-"""`edge-hil --protocol mavlink --faults PATH`: the base's red button and a dead radio, switched while it runs.
+"""Fault socket of `edge-hil --protocol mavlink --faults PATH`: emergency stop button and dead radio.
 
-One JSON object a datagram: {"fault": "button"|"mute"|"clear", "on": true|false}. A held button stops the base; with
-"mute" nothing is heard or sent. The answer is {"fault", "on", "effect_ns"} or {"error"}.
+A request is one JSON object per datagram: {"fault": "button"|"mute"|"clear", "on": true|false}. A pressed button stops
+the base; with "mute" nothing is received or sent. The answer is {"fault", "on", "effect_ns"} or {"error"}.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SWITCHES: Final = ("button", "mute")
 
 
 class MavlinkFaults(FaultSocket):
-    """`button` and `mute` are what is asked for now; `poll` takes in what has come. Raises OSError."""
+    """Fault socket whose `button` and `mute` are the active faults; call `poll`. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -1,9 +1,9 @@
-"""MAVLink as a front end of `edge-hil`: the Carter as a rover on UDP, its camera beside it over HTTP.
+"""MAVLink front end of `edge-hil`: the Carter as a rover on UDP, with its camera over HTTP.
 
 --link udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE], for example
-  udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550    the default: heartbeats to where MAVSDK and ground
-                                                                stations listen; whoever answers is told everything
-  udp:127.0.0.1:14580,key=signing.hex    only signed packets are obeyed, all that is sent is signed
+  udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550    the default: heartbeats to the ports of MAVSDK and of
+                                                                ground stations; a station that answers gets all reports
+  udp:127.0.0.1:14580,key=signing.hex    unsigned packets are ignored, all sent packets are signed
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.camera_stream import CameraStream
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.mavlink.commands import Command
 from sim_hil.protocols.mavlink.faults import MavlinkFaults
 from sim_hil.protocols.mavlink.node import COMPONENT, MavlinkNode
@@ -35,12 +35,12 @@ from sim_hil.simulation.physics import Simulation
 CAMERA_PORT: Final = 8090
 DEFAULT_LINK: Final = "udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550"
 
-_NOT_SHOWN: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
+_NOT_TRACED: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
 
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """What `--link` says."""
+    """Parsed value of `--link`."""
 
     bind: Address
     to: tuple[Address, ...] = ()
@@ -56,7 +56,7 @@ class LinkOptions:
 
     @staticmethod
     def parse(text: str | None) -> LinkOptions:
-        """From the command line; None: DEFAULT_LINK. Raises FrontEndError."""
+        """Parse `--link`; None: DEFAULT_LINK. Raises FrontEndError."""
         text = DEFAULT_LINK if text is None else text
         where, *settings = text.split(",")
         given: dict[str, Any] = {}
@@ -88,7 +88,7 @@ def _number(name: str, text: str) -> int:
 
 
 class CommandLog:
-    """What has been commanded, for the result: what was obeyed, in the base's axes."""
+    """Summary of the obeyed commands in the base's axes, for the result."""
 
     def __init__(self) -> None:
         self._commands = 0
@@ -97,7 +97,7 @@ class CommandLog:
         self._at_zero = True
 
     def note(self, name: str, wanted: tuple[float, float] | None, *, moves: bool) -> None:
-        """Count one message; `wanted`: what the base is asked for after it, None: nothing."""
+        """Count one message; `wanted`: resulting command (vx m/s, wz rad/s), None: no command."""
         self._last_command = name
         if moves and wanted is not None:
             self._commands += 1
@@ -105,7 +105,7 @@ class CommandLog:
         self._at_zero = wanted is None or not any(wanted)
 
     def summary(self) -> dict[str, object]:
-        """The `wire` part of the result, without `malformed`."""
+        """Return the `wire` part of the result, without `malformed`."""
         return {
             "commands": self._commands,
             "last_move": None if self._last_move is None else list(self._last_move),
@@ -115,10 +115,10 @@ class CommandLog:
 
 
 class MavlinkFrontEnd:
-    """A simulated Carter answering as a MAVLink rover."""
+    """MAVLink front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
-        """Raises FrontEndError or OSError when port or camera cannot be had."""
+        """Open port and camera. Raises FrontEndError or OSError."""
         ticks = 0 if link.key is None else now_ticks()
         self._reader = Reader(None if link.key is None else Verifier(link.key, ticks))
         self._writer = Writer(link.system, COMPONENT, link.key, ticks)
@@ -151,11 +151,11 @@ class MavlinkFrontEnd:
 
     @property
     def port(self) -> int:
-        """Where it listens, UDP."""
+        """UDP port of the front end."""
         return self._link.port
 
     def where(self) -> str:
-        """Address and camera."""
+        """Return the addresses of rover and camera."""
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"MAVLink udp:{self._host}:{self._link.port}, system {self._node.system}, {camera}"
 
@@ -167,25 +167,26 @@ class MavlinkFrontEnd:
         return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
-        """Until a datagram arrives."""
+        """Wait until a datagram arrives, at most `left_ns`."""
         self._link.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
-        """Obey and answer what has arrived."""
-        heard = []
+    def serve(self) -> list[ReceivedCommand]:
+        """Execute and answer the received commands and return them."""
+        commands: list[ReceivedCommand] = []
         for data, address in self._link.receive():
             if self._muted:
                 continue
             received_ns = time.monotonic_ns()
             messages = self._reader.read(data)
             if messages and self._link.accept(address, self._now_s):
-                heard += [each for message in messages for each in self._hear(message, address, received_ns)]
+                for message in messages:
+                    commands += self._handle(message, address, received_ns)
         self._flush(self._node.answers())
         if self._camera is not None:
             self._camera.poll()
-        return heard
+        return commands
 
-    def _hear(self, message: Message, address: Address, received_ns: int) -> list[Heard]:
+    def _handle(self, message: Message, address: Address, received_ns: int) -> list[ReceivedCommand]:
         station = Station(message.get_srcSystem(), address)
         if not self._node.receive(message, station, self._now_s):
             return []
@@ -198,12 +199,12 @@ class MavlinkFrontEnd:
         content = " ".join(
             f"{key}={value}"
             for key, value in message.to_dict().items()
-            if key not in _NOT_SHOWN and value and value == value  # MAVSDK fills what it does not use with NaN
+            if key not in _NOT_TRACED and value and value == value  # MAVSDK fills unused fields with NaN
         )
-        return [Heard(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
+        return [ReceivedCommand(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
 
     def publish(self, step: int, stamp_s: float) -> None:
-        """Let the rover's clock go on, and send what is due."""
+        """Advance the rover's clock and send the messages that are due."""
         self._now_s = stamp_s
         if self._faults is not None:
             self._faults.poll()
@@ -228,12 +229,12 @@ class MavlinkFrontEnd:
         return self._sensors.read(self._now_s)
 
     def show(self, render_state: NDArray[np.float64]) -> None:
-        """Hand the camera process what it renders from now on."""
+        """Pass the state to render to the camera process."""
         if self._camera is not None:
             self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process, close the sockets."""
+        """End the camera process and close the sockets."""
         if self._faults is not None:
             self._faults.close()
         if self._camera is not None:
@@ -241,7 +242,7 @@ class MavlinkFrontEnd:
         self._link.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Return the counts of received and sent messages."""
         counts, link = self._reader.counts, self._link
         mavlink = {
             "broken": counts.broken,
@@ -262,7 +263,7 @@ class MavlinkFrontEnd:
 
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> MavlinkFrontEnd:
-    """The front end of `--protocol mavlink`. Raises FrontEndError or OSError."""
+    """Open the front end of `--protocol mavlink`. Raises FrontEndError or OSError."""
     robot = simulation.robot
     if not isinstance(robot, Carter):
         raise FrontEndError(f"--protocol mavlink: expected the Carter, found a {type(robot).__name__}")

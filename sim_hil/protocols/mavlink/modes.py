@@ -1,4 +1,4 @@
-"""Flight modes as PX4 numbers them (its px4_custom_mode.h), of which a rover without a mission has three."""
+"""The rover's three modes, with PX4's numbers (px4_custom_mode.h)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SUB_SHIFT: Final = 24
 
 
 class Mode(Enum):
-    """(main mode, sub mode) of PX4."""
+    """Mode of the rover; the value is PX4's (main mode, sub mode)."""
 
     MANUAL = (1, 0)
     HOLD = (4, 3)  # AUTO, LOITER
@@ -20,13 +20,13 @@ class Mode(Enum):
 
     @property
     def custom_mode(self) -> int:
-        """As a heartbeat carries it."""
+        """Value of a heartbeat's `custom_mode`."""
         main, sub = self.value
         return int(main) << _MAIN_SHIFT | int(sub) << _SUB_SHIFT
 
     @property
     def base_flags(self) -> int:
-        """The bits of a heartbeat's base_mode that go with it."""
+        """Bits of a heartbeat's `base_mode` for this mode."""
         flags = {
             Mode.MANUAL: common.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED,
             Mode.HOLD: common.MAV_MODE_FLAG_AUTO_ENABLED | common.MAV_MODE_FLAG_GUIDED_ENABLED,
@@ -36,7 +36,7 @@ class Mode(Enum):
 
 
 def find_mode(main: int, sub: int) -> Mode | None:
-    """The mode of a main and a sub mode; a sub mode of 0 takes the main mode's only one."""
+    """Return the mode of a main and a sub mode; sub mode 0 selects the main mode's only one. None if unknown."""
     for mode in Mode:
         if mode.value[0] == main and sub in (0, mode.value[1]):
             return mode
@@ -44,5 +44,5 @@ def find_mode(main: int, sub: int) -> Mode | None:
 
 
 def custom_mode_of(value: int) -> Mode | None:
-    """The mode of a whole custom_mode word."""
+    """Return the mode of a `custom_mode` value; None if unknown."""
     return find_mode(value >> _MAIN_SHIFT & 0xFF, value >> _SUB_SHIFT & 0xFF)

@@ -1,6 +1,6 @@
-"""The rover's MAVLink component: what every message does and what is answered, and the reports that are due. No wire.
+"""MAVLink component of the rover: handles messages, produces answers and due reports. Pure: no network.
 
-Everything that it sends goes to everybody who listens, as on one radio: an acknowledgement names whom it is for.
+All messages go to all listeners, as on a shared radio; an acknowledgement contains its addressee.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ _TEXT_BYTES: Final = 50
 _FTP_NAK: Final = 129
 _FTP_FILE_NOT_FOUND: Final = 10
 _MAX_WAITING_PARAMETERS: Final = 2 * len(parameters.NAMES)
-_PARAMETERS_A_STEP: Final = 2  # a list is no burst
+_PARAMETERS_A_STEP: Final = 2  # parameters sent per step, so that a list does not become a burst
 
 
 class MavlinkNode:
-    """One rover on one link: `receive` every message, then `step` and `due` after every physics step."""
+    """Component of one rover: call `receive` for every message, then `step` and `due` after every physics step."""
 
     def __init__(
         self, base: Base, read: Callable[[], Sensors], counts: Counts, parameter_values: Parameters | None = None
     ) -> None:
-        """`read` gives the sensors' reading of now; `counts` are the reader's."""
+        """Create the component; `read` returns the current sensor reading, `counts` are the packet reader's."""
         self.parameters = parameter_values or Parameters()
         self.vehicle = Vehicle(base, self.parameters)
         self.schedule = telemetry.Schedule()
@@ -49,24 +49,24 @@ class MavlinkNode:
         self._outbox: list[Message] = []
         self._after_ack: list[Message] = []
         self._waiting: list[str] = []
-        self._told_state: tuple[object, ...] | None = None
-        self._complained: set[str] = set()
+        self._reported_state: tuple[object, ...] | None = None
+        self._reported_errors: set[str] = set()
 
     @property
     def system(self) -> int:
-        """Its MAVLink number."""
+        """MAVLink system number."""
         return int(self.parameters["MAV_SYS_ID"])
 
     def send_after_ack(self, message: Message) -> None:
-        """Send what a command asks for, behind its acknowledgement."""
+        """Send a message that a command requests, after the acknowledgement."""
         self._after_ack.append(message)
 
-    def picture(self) -> telemetry.Picture:
-        """What reports are made of, as of the latest reading."""
+    def snapshot(self) -> telemetry.Snapshot:
+        """Return the data for reports, from the latest sensor reading."""
         if self._sensors is None:
-            self._look(self._now_s)
+            self._read_sensors(self._now_s)
         assert self._sensors is not None
-        return telemetry.Picture(
+        return telemetry.Snapshot(
             self._stamp_s,
             self._sensors,
             self._tilt.roll_rad,
@@ -77,7 +77,7 @@ class MavlinkNode:
         )
 
     def receive(self, message: Message, station: Station, now_s: float) -> bool:
-        """Obey and answer one message; whether it asked for something that has to do with moving."""
+        """Execute and answer one message; return whether it was a request related to motion."""
         handler = HANDLERS.get(message.get_msgId())
         if handler is None:
             return False
@@ -90,21 +90,21 @@ class MavlinkNode:
             return handler(self, message, station, now_s)
         except SetpointError as error:
             self.counts.unusable += 1
-            if str(error) not in self._complained and len(self._complained) < 20:
-                self._complained.add(str(error))  # once: it comes with 20 Hz
-                self.vehicle.say(common.MAV_SEVERITY_WARNING, str(error))
+            if str(error) not in self._reported_errors and len(self._reported_errors) < 20:
+                self._reported_errors.add(str(error))  # only once, because setpoints arrive at 20 Hz
+                self.vehicle.send_text(common.MAV_SEVERITY_WARNING, str(error))
             return False
 
     def step(self, now_s: float) -> None:
-        """Let time pass."""
+        """Advance to `now_s`: read sensors and update the vehicle."""
         self._now_s = now_s
         if now_s >= self._next_read_s:
             self._next_read_s = max(self._next_read_s + READ_S, now_s)
-            self._look(now_s)
+            self._read_sensors(now_s)
             self.vehicle.forget_silent(now_s)
         self.vehicle.step(now_s)
 
-    def _look(self, now_s: float) -> None:
+    def _read_sensors(self, now_s: float) -> None:
         sensors = self._sensors = self._read()
         self._stamp_s = now_s
         self._tilt.step(now_s, sensors.gyro_radps, sensors.accel_mps2)
@@ -112,34 +112,34 @@ class MavlinkNode:
         self.vehicle.health = Health(sensors.charge_percent / 100, tilt, -sensors.T_odom_base.theta_rad)
 
     def due(self, now_s: float) -> list[Message]:
-        """Answers, lines of text and reports to be sent now; a heartbeat at once when its content has changed."""
+        """Return the answers, texts and reports to send now; a change of state triggers a heartbeat at once."""
         made = self.answers()
         numbers = self.schedule.due(now_s)
         state = (self.vehicle.armed, self.vehicle.mode, self.vehicle.estop)
-        if state != self._told_state:
-            self._told_state = state
+        if state != self._reported_state:
+            self._reported_state = state
             numbers.append(common.MAVLINK_MSG_ID_HEARTBEAT)
-        made += [telemetry.STREAMS[number].make(self.picture()) for number in dict.fromkeys(numbers)]
+        made += [telemetry.STREAMS[number].make(self.snapshot()) for number in dict.fromkeys(numbers)]
         for name in self._waiting[:_PARAMETERS_A_STEP]:
             made.append(self.parameters.message(name))
         del self._waiting[:_PARAMETERS_A_STEP]
         return made
 
     def answers(self) -> list[Message]:
-        """What is to be said at once: acknowledgements and lines of text."""
+        """Return the messages to send at once: acknowledgements and texts."""
         made, self._outbox = self._outbox, []
         for severity, text in self.vehicle.take_texts():
             made.append(common.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES]))
         return made
 
     def answer(self, message: Message) -> None:
-        """Send it as soon as possible."""
+        """Send a message as soon as possible."""
         self._outbox.append(message)
 
     # Handlers
 
     def _heartbeat(self, message: Message, station: Station, now_s: float) -> bool:
-        self.vehicle.heartbeat(station, now_s)  # whatever it says that it is: not only ground stations drive
+        self.vehicle.heartbeat(station, now_s)  # of any type, because not only ground stations drive
         return False
 
     def _command(self, message: Message, station: Station, now_s: float) -> bool:
@@ -192,7 +192,7 @@ class MavlinkNode:
         return False
 
     def _wait(self, names: tuple[str, ...]) -> None:
-        """Send these parameters in the next steps; whoever asks without end does not fill the memory."""
+        """Queue parameters for the next steps; the queue is bounded against endless requests."""
         self._waiting = (self._waiting + list(names))[:_MAX_WAITING_PARAMETERS]
 
     def _mission_list(self, message: Message, station: Station, now_s: float) -> bool:
@@ -218,7 +218,7 @@ class MavlinkNode:
         return False
 
     def _file_transfer(self, message: Message, station: Station, now_s: float) -> bool:
-        """There are no files: a refusal at once, instead of a client that waits for its time to run out."""
+        """Refuse at once, because there are no files; otherwise the client would wait for its timeout."""
         number, session, opcode = message.payload[0] | message.payload[1] << 8, message.payload[2], message.payload[3]
         head = ((number + 1) & 0xFFFF).to_bytes(2, "little") + bytes((session, _FTP_NAK, 1, opcode, 0, 0))
         payload = (head + bytes(4) + bytes((_FTP_FILE_NOT_FOUND,))).ljust(251, b"\0")
@@ -230,7 +230,7 @@ class MavlinkNode:
         return False
 
     def _timesync(self, message: Message, station: Station, now_s: float) -> bool:
-        if message.tc1 == 0:  # a question; anything else is an answer
+        if message.tc1 == 0:  # a request; otherwise an answer
             self.answer(common.MAVLink_timesync_message(round(now_s * 1e9), message.ts1))
         return False
 

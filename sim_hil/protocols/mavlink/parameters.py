@@ -1,4 +1,4 @@
-"""The vehicle's parameters: a small table, each with a range, sent as PX4 does (integers bytewise in the float)."""
+"""Parameters of the vehicle: a table with ranges, encoded as in PX4 (integers bytewise in the float)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REAL: Final = common.MAV_PARAM_TYPE_REAL32
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a parameter may be; `integer` decides its type on the wire."""
+    """Default and range of a parameter; `integer` selects its type on the wire."""
 
     default: float
     low: float
@@ -29,19 +29,19 @@ class Parameter:
 
     @property
     def wire_type(self) -> int:
-        """MAV_PARAM_TYPE."""
+        """Value of MAV_PARAM_TYPE."""
         return int(_INT if self.integer else _REAL)
 
 
-# Names are PX4's where it has one of the same meaning.
+# Names are those of PX4 where it has a parameter with the same meaning.
 TABLE: Final[Mapping[str, Parameter]] = MappingProxyType(
     {
-        "BAT_LOW_THR": Parameter(0.10, 0.0, 0.9),  # charge below which it is not armed
-        "COM_ARM_TILT": Parameter(25.0, 5.0, 60.0),  # degrees beyond which it is not armed
-        "COM_DISARM_GCS": Parameter(2.0, 0.0, 60.0),  # s after the loss of the station
-        "COM_DL_LOSS_T": Parameter(3.5, 1.5, 60.0),  # s without the station's heartbeat: three are missed
-        "COM_OF_LOSS_T": Parameter(0.5, 0.1, 1.0),  # s without a setpoint; the drive itself waits for 1 s
-        "MAV_GCS_SYSID": Parameter(0, 0, 255, integer=True),  # the only station that may drive; 0: the first
+        "BAT_LOW_THR": Parameter(0.10, 0.0, 0.9),  # charge (0..1) at or below which arming is denied
+        "COM_ARM_TILT": Parameter(25.0, 5.0, 60.0),  # tilt beyond which arming is denied, degrees
+        "COM_DISARM_GCS": Parameter(2.0, 0.0, 60.0),  # time from the loss of the station to the disarm, s
+        "COM_DL_LOSS_T": Parameter(3.5, 1.5, 60.0),  # timeout of the station's heartbeat, s: three are missed
+        "COM_OF_LOSS_T": Parameter(0.5, 0.1, 1.0),  # timeout of setpoints, s; the drive's own timeout is 1 s
+        "MAV_GCS_SYSID": Parameter(0, 0, 255, integer=True),  # number of the only station that may drive; 0: any
         "MAV_SYS_ID": Parameter(1, 1, 255, integer=True),
         "RO_MAN_SPEED": Parameter(0.6, 0.1, 1.5),  # m/s at full stick
         "RO_MAN_YAW_RATE": Parameter(60.0, 10.0, 115.0),  # degrees/s at full stick
@@ -50,14 +50,14 @@ TABLE: Final[Mapping[str, Parameter]] = MappingProxyType(
     }
 )
 NAMES: Final = tuple(TABLE)
-_READ_ONLY: Final = ("MAV_SYS_ID",)  # a station has learned it; given on the command line
+_READ_ONLY: Final = ("MAV_SYS_ID",)  # stations address the rover by it; set on the command line
 
 
 class Parameters:
-    """The values of one vehicle."""
+    """Parameter values of one vehicle."""
 
     def __init__(self, **given: float) -> None:
-        """`given`: other values than the defaults. Raises ValueError."""
+        """Set the defaults, replaced by `given`. Raises ValueError for an unknown name or a bad value."""
         self._values = {name: parameter.default for name, parameter in TABLE.items()}
         for name, value in given.items():
             if name not in TABLE or not _fits(TABLE[name], value):
@@ -68,7 +68,7 @@ class Parameters:
         return self._values[name]
 
     def set(self, message: Message) -> str | None:
-        """Obey a PARAM_SET; the name, also when the value is refused, None for an unknown one."""
+        """Execute a PARAM_SET; return the name, even if the value is refused; None for an unknown name."""
         name = message.param_id
         if name not in TABLE:
             return None
@@ -79,7 +79,7 @@ class Parameters:
         return str(name)
 
     def message(self, name: str) -> Message:
-        """A PARAM_VALUE."""
+        """Return the PARAM_VALUE message of a parameter."""
         parameter, value = TABLE[name], self._values[name]
         wire = _from_int(round(value)) if parameter.integer else value
         return common.MAVLink_param_value_message(
@@ -96,7 +96,7 @@ def _from_int(value: int) -> float:
 
 
 def decode_value(value: float, wire_type: int) -> float:
-    """The number that a PARAM_SET or PARAM_VALUE carries."""
+    """Decode the value of a PARAM_SET or PARAM_VALUE."""
     if wire_type == _INT:
         return float(struct.unpack("<i", struct.pack("<f", value))[0])
     return value

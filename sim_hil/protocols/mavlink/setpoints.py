@@ -1,6 +1,6 @@
-"""Velocity setpoints of SET_POSITION_TARGET_LOCAL_NED, sticks of a joystick: what they ask of a base with two wheels.
+"""Setpoints of SET_POSITION_TARGET_LOCAL_NED and joystick inputs, converted to commands of a two-wheeled base.
 
-MAVLink's frames have y to the right and z down, and turn to the right for a positive yaw; the base turns to the left.
+In MAVLink's frames y points right, z points down and a positive yaw turns right; the base's positive yaw turns left.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ _IGNORE_ACCELERATION: Final = 64 | 128 | 256
 _FORCE: Final = 512
 _IGNORE_YAW: Final = 1024
 _IGNORE_YAW_RATE: Final = 2048
-# Our choice: turns towards a yaw that is off by a radian with 1.5 rad/s, and drives no faster than the part of the
-# velocity that lies ahead.
+# Our choice: an error of 1 rad commands 1.5 rad/s. The speed is the component of the velocity along the heading.
 _YAW_GAIN_PER_S: Final = 1.5
 _STILL_MPS: Final = 0.02
 
 
 class SetpointError(ValueError):
-    """A setpoint that this base cannot follow; in words for a STATUSTEXT."""
+    """A setpoint that the base cannot follow; the message fits a STATUSTEXT."""
 
 
 @dataclass(frozen=True)
 class Setpoint:
-    """`vx_mps`, `vy_mps`: in the local frame (north, east), or ahead and to the right; at most one of yaw and rate."""
+    """Velocity setpoint in the local frame (north, east) or the body frame (forward, right); at most one yaw input."""
 
     local: bool
     vx_mps: float
@@ -43,14 +42,14 @@ class Setpoint:
     yaw_rate_radps: float | None = None
 
     def command(self, yaw_rad: float) -> tuple[float, float]:
-        """Speed ahead, m/s, and to the left, rad/s, while the base looks along `yaw_rad` of the local frame."""
+        """Return speed (m/s, forward) and yaw rate (rad/s, left) for a base with yaw `yaw_rad` in the local frame."""
         ahead, direction = self.vx_mps, None
         if self.local:
             ahead = self.vx_mps * cos(yaw_rad) + self.vy_mps * sin(yaw_rad)
             if hypot(self.vx_mps, self.vy_mps) > _STILL_MPS:
                 direction = atan2(self.vy_mps, self.vx_mps)
         if self.yaw_rate_radps is not None:
-            return ahead, 0.0 - self.yaw_rate_radps  # no -0.0
+            return ahead, 0.0 - self.yaw_rate_radps  # avoids -0.0
         aim = direction if self.yaw_rad is None else self.yaw_rad
         if aim is None:
             return ahead, 0.0
@@ -58,7 +57,7 @@ class Setpoint:
 
 
 def read_setpoint(message: Message) -> Setpoint:
-    """Of a SET_POSITION_TARGET_LOCAL_NED. Raises SetpointError for anything but a velocity."""
+    """Read a SET_POSITION_TARGET_LOCAL_NED. Raises SetpointError unless it is a velocity setpoint."""
     mask, frame = message.type_mask, message.coordinate_frame
     if frame not in LOCAL_FRAMES + BODY_FRAMES:
         raise SetpointError(f"setpoint: frame {frame}: expected one of {LOCAL_FRAMES + BODY_FRAMES}")
@@ -81,7 +80,7 @@ def read_setpoint(message: Message) -> Setpoint:
 
 @dataclass(frozen=True)
 class Sticks:
-    """Both sticks, -1 to 1: ahead, and to the right."""
+    """Position of both sticks, -1 to 1: forward and right."""
 
     ahead: float = 0.0
     right: float = 0.0
@@ -92,13 +91,13 @@ class Sticks:
 
 
 def manual_sticks(message: Message) -> Sticks:
-    """Of a MANUAL_CONTROL: x is ahead, r turns. Raises SetpointError."""
+    """Read a MANUAL_CONTROL: x drives forward, r turns. Raises SetpointError."""
     x, r = (0 if value == 32767 else value for value in (message.x, message.r))  # 32767: no such axis
     return Sticks(x / 1000, r / 1000)
 
 
 def override_sticks(message: Message) -> Sticks | None:
-    """Of an RC_CHANNELS_OVERRIDE: channel 1 steers, 3 is the throttle, 1000..2000; None when both are released."""
+    """Read an RC_CHANNELS_OVERRIDE: channel 1 steering, 3 throttle, 1000..2000; None if both are released."""
     steering, throttle = message.chan1_raw, message.chan3_raw
     if all(value in (0, 65535) for value in (steering, throttle)):
         return None
@@ -110,5 +109,5 @@ def override_sticks(message: Message) -> Sticks | None:
 
 
 def heading_degrees(yaw_rad: float) -> float:
-    """0 to 360, to the right from north."""
+    """Convert a yaw to a compass heading: 0 to 360 degrees, clockwise from north."""
     return (yaw_rad * 180 / pi) % 360

@@ -1,7 +1,6 @@
-"""Signatures of MAVLink 2 (mavlink.io, "Message Signing"): verified first, and only then remembered.
+"""Signatures of MAVLink 2 (mavlink.io, "Message Signing"): a timestamp is stored only after the signature is verified.
 
-pymavlink's own check stores a packet's timestamp before it looks at the signature, so that a forged packet from the
-future makes the genuine ones look old; this one does not.
+pymavlink's own check stores the timestamp first, so a forged packet from the future makes genuine packets look old.
 """
 
 from __future__ import annotations
@@ -13,14 +12,14 @@ from typing import Final
 
 KEY_BYTES: Final = 32
 BLOCK_BYTES: Final = 13  # link id, timestamp 48 bits, signature 48 bits
-TICKS_PER_S: Final = 100_000  # of the timestamp: 10 us, since 1 January 2015
+TICKS_PER_S: Final = 100_000  # unit of the timestamp: 10 us since 1 January 2015
 EPOCH_UNIX_S: Final = 1_420_070_400
 _NEW_STREAM_BEHIND: Final = 60 * TICKS_PER_S
 _SIGNED_FLAG: Final = 0x01
 
 
 def read_key(path: Path) -> bytes:
-    """The secret key, 64 hexadecimal digits in a file. Raises ValueError or OSError."""
+    """Read the secret key, 64 hexadecimal digits in a file. Raises ValueError or OSError."""
     text = path.read_text(encoding="ascii").strip()
     try:
         key = bytes.fromhex(text)
@@ -32,21 +31,21 @@ def read_key(path: Path) -> bytes:
 
 
 def signature(key: bytes, packet: bytes) -> bytes:
-    """The 6 bytes that end a packet, made of everything before them."""
+    """Return the signature of a packet, its last 6 bytes, computed over everything before them."""
     return hashlib.sha256(key + packet).digest()[:6]
 
 
 class Verifier:
-    """Judges signed packets of all streams; one stream is (link id, system, component)."""
+    """Verifier of signed packets of all streams; a stream is (link id, system, component)."""
 
     def __init__(self, key: bytes, now_ticks: int) -> None:
-        """`now_ticks`: the time by which a new stream is judged, as a timestamp."""
+        """Create a verifier; `now_ticks`: current time as a timestamp, for checking new streams."""
         self._key = key
         self.timestamp = now_ticks
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def accepts(self, packet: bytes) -> bool:
-        """Whether a whole MAVLink 2 packet is signed with our key and newer than the last of its stream."""
+        """Return whether a complete MAVLink 2 packet is signed with the key and newer than the last of its stream."""
         if not packet[2] & _SIGNED_FLAG:
             return False
         block = packet[-BLOCK_BYTES:]

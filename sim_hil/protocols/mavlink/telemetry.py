@@ -1,7 +1,7 @@
-"""What the rover reports, and how often: one maker for each message, rates that a station may change.
+"""Telemetry of the rover: one function per message, and a schedule with rates that a station may change.
 
-The local frame lies where the base was switched on: its "north" is where the base looked then, east is to its right,
-down is down. Latitude and longitude follow from that and an origin that is made up; there is no GPS.
+The local frame is the base's pose at switch-on: "north" is its heading, east is to its right, z points down. There is
+no GPS: latitude and longitude are computed from the local position and an invented origin.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from sim_hil.robots.carter.sensors import Sensors
 from sim_hil.robots.carter.urdf import WHEEL_RADIUS_M
 from sim_hil.robots.carter.wheel_odometry import COUNTS_PER_TURN
 
-MAX_HZ: Final = 50.0  # how often the sensors are read
-# PX4's simulation starts here too: on a map it is a place that nobody takes for the robot's.
+MAX_HZ: Final = 50.0  # rate of sensor readings
+# Same origin as in PX4's simulation, a place that users recognise as simulated.
 ORIGIN_LATITUDE_DEG: Final = 47.397742
 ORIGIN_LONGITUDE_DEG: Final = 8.545594
 ORIGIN_ALTITUDE_M: Final = 488.0
@@ -40,8 +40,8 @@ _SENSORS: Final = (
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Everything that a report is made of, at one instant, angles in the base's axes (x ahead, y left, z up)."""
+class Snapshot:
+    """Data for reports at one instant; angles in the base's axes (x forward, y left, z up)."""
 
     stamp_s: float
     sensors: Sensors
@@ -53,17 +53,17 @@ class Picture:
 
     @property
     def boot_ms(self) -> int:
-        """Time since switching on, as most messages carry it."""
+        """Time since switch-on, ms, in the format of most messages."""
         return round(self.stamp_s * 1e3) & 0xFFFFFFFF
 
     @property
     def boot_us(self) -> int:
-        """The same in microseconds."""
+        """Time since switch-on, us."""
         return round(self.stamp_s * 1e6)
 
     @property
     def yaw_rad(self) -> float:
-        """To the right from the local frame's north."""
+        """Yaw, clockwise from the local frame's north."""
         return -wrap_angle(self.sensors.T_odom_base.theta_rad)
 
     @property
@@ -73,7 +73,7 @@ class Picture:
 
     @property
     def velocity_mps(self) -> tuple[float, float]:
-        """To the north and to the east."""
+        """Velocity (north, east) in the local frame."""
         return self.sensors.v_mps * cos(self.yaw_rad), self.sensors.v_mps * sin(self.yaw_rad)
 
     @property
@@ -84,7 +84,7 @@ class Picture:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """Attitude, w x y z, in MAVLink's axes."""
+        """Attitude quaternion (w, x, y, z) in MAVLink's axes."""
         r, p, y = self.roll_rad / 2, -self.pitch_rad / 2, self.yaw_rad / 2
         return (
             cos(r) * cos(p) * cos(y) + sin(r) * sin(p) * sin(y),
@@ -95,7 +95,7 @@ class Picture:
 
     @property
     def latitude_longitude_deg(self) -> tuple[float, float]:
-        """Where the made-up origin puts it."""
+        """Latitude and longitude relative to the invented origin."""
         north, east = self.north_east_m
         shrink = cos(radians(ORIGIN_LATITUDE_DEG))
         return (
@@ -105,7 +105,7 @@ class Picture:
 
 
 def heartbeat(vehicle: Vehicle) -> Message:
-    """Says PX4, because its modes are what clients know how to ask a rover for."""
+    """Return the heartbeat; it announces PX4, because clients know PX4's modes."""
     base_mode = vehicle.mode.base_flags | (common.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     if vehicle.estop:
         status = common.MAV_STATE_EMERGENCY
@@ -116,13 +116,13 @@ def heartbeat(vehicle: Vehicle) -> Message:
     )
 
 
-def _heartbeat(now: Picture) -> Message:
+def _heartbeat(now: Snapshot) -> Message:
     return heartbeat(now.vehicle)
 
 
-def _sys_status(now: Picture) -> Message:
+def _sys_status(now: Snapshot) -> Message:
     sensors = now.sensors
-    healthy = _SENSORS | common.MAV_SYS_STATUS_GEOFENCE  # MAVProxy calls a fence breached that is not there
+    healthy = _SENSORS | common.MAV_SYS_STATUS_GEOFENCE  # else MAVProxy reports a breach of a fence that does not exist
     if now.vehicle.obstacle_to_arming() is not None:
         healthy &= ~common.MAV_SYS_STATUS_PREARM_CHECK
     return common.MAVLink_sys_status_message(
@@ -132,19 +132,19 @@ def _sys_status(now: Picture) -> Message:
     )  # fmt: skip
 
 
-def _attitude(now: Picture) -> Message:
+def _attitude(now: Snapshot) -> Message:
     return common.MAVLink_attitude_message(now.boot_ms, now.roll_rad, -now.pitch_rad, now.yaw_rad, *now.rates_radps)
 
 
-def _attitude_quaternion(now: Picture) -> Message:
+def _attitude_quaternion(now: Snapshot) -> Message:
     return common.MAVLink_attitude_quaternion_message(now.boot_ms, *now.quaternion, *now.rates_radps)
 
 
-def _local_position(now: Picture) -> Message:
+def _local_position(now: Snapshot) -> Message:
     return common.MAVLink_local_position_ned_message(now.boot_ms, *now.north_east_m, 0.0, *now.velocity_mps, 0.0)
 
 
-def _odometry(now: Picture) -> Message:
+def _odometry(now: Snapshot) -> Message:
     north, east = now.north_east_m
     return common.MAVLink_odometry_message(
         now.boot_us, common.MAV_FRAME_LOCAL_FRD, common.MAV_FRAME_BODY_FRD, north, east, 0.0, now.quaternion,
@@ -153,7 +153,7 @@ def _odometry(now: Picture) -> Message:
     )  # fmt: skip
 
 
-def _global_position(now: Picture) -> Message:
+def _global_position(now: Snapshot) -> Message:
     latitude, longitude = now.latitude_longitude_deg
     vn, ve = now.velocity_mps
     return common.MAVLink_global_position_int_message(
@@ -162,7 +162,7 @@ def _global_position(now: Picture) -> Message:
     )  # fmt: skip
 
 
-def _vfr_hud(now: Picture) -> Message:
+def _vfr_hud(now: Snapshot) -> Message:
     wanted = now.vehicle.wanted()
     throttle = 0 if wanted is None else round(100 * min(1.0, abs(wanted[0]) / 1.5))
     speed = hypot(*now.velocity_mps)
@@ -170,7 +170,7 @@ def _vfr_hud(now: Picture) -> Message:
     return common.MAVLink_vfr_hud_message(speed, speed, heading, throttle, ORIGIN_ALTITUDE_M, 0.0)
 
 
-def _battery(now: Picture) -> Message:
+def _battery(now: Snapshot) -> Message:
     sensors = now.sensors
     volts = [min(65534, round(sensors.voltage_v * 1000))] + [65535] * 9
     low = sensors.charge_percent <= 100 * now.low_charge
@@ -181,20 +181,20 @@ def _battery(now: Picture) -> Message:
     )  # fmt: skip
 
 
-def _extended_sys_state(now: Picture) -> Message:
+def _extended_sys_state(now: Snapshot) -> Message:
     return common.MAVLink_extended_sys_state_message(common.MAV_VTOL_STATE_UNDEFINED, common.MAV_LANDED_STATE_ON_GROUND)
 
 
-def _wheel_distance(now: Picture) -> Message:
-    way = [count * 2 * pi * WHEEL_RADIUS_M / COUNTS_PER_TURN for count in now.sensors.wheel_counts]
-    return common.MAVLink_wheel_distance_message(now.boot_us, 2, way + [0.0] * 14)
+def _wheel_distance(now: Snapshot) -> Message:
+    distances_m = [count * 2 * pi * WHEEL_RADIUS_M / COUNTS_PER_TURN for count in now.sensors.wheel_counts]
+    return common.MAVLink_wheel_distance_message(now.boot_us, 2, distances_m + [0.0] * 14)
 
 
-def _system_time(now: Picture) -> Message:
-    return common.MAVLink_system_time_message(0, now.boot_ms)  # 0: it does not know the time of day
+def _system_time(now: Snapshot) -> Message:
+    return common.MAVLink_system_time_message(0, now.boot_ms)  # 0: time of day unknown
 
 
-def _highres_imu(now: Picture) -> Message:
+def _highres_imu(now: Snapshot) -> Message:
     ax, ay, az = now.sensors.accel_mps2
     gyro_and_accel = 0x3F
     return common.MAVLink_highres_imu_message(
@@ -202,13 +202,13 @@ def _highres_imu(now: Picture) -> Message:
     )
 
 
-def _origin(now: Picture) -> Message:
+def _origin(now: Snapshot) -> Message:
     return common.MAVLink_gps_global_origin_message(
         round(ORIGIN_LATITUDE_DEG * 1e7), round(ORIGIN_LONGITUDE_DEG * 1e7), round(ORIGIN_ALTITUDE_M * 1000), 0
     )
 
 
-def _home(now: Picture) -> Message:
+def _home(now: Snapshot) -> Message:
     return common.MAVLink_home_position_message(
         round(ORIGIN_LATITUDE_DEG * 1e7), round(ORIGIN_LONGITUDE_DEG * 1e7), round(ORIGIN_ALTITUDE_M * 1000),
         0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0), _NAN, _NAN, _NAN, 0,
@@ -216,8 +216,8 @@ def _home(now: Picture) -> Message:
 
 
 def autopilot_version(system: int) -> Message:
-    """What it can do; the version is this protocol's own, 1.0.0."""
-    can = (
+    """Return the rover's capabilities; the version is 1.0.0."""
+    capabilities = (
         common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
         | common.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
         | common.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -225,14 +225,16 @@ def autopilot_version(system: int) -> Message:
         | common.MAV_PROTOCOL_CAPABILITY_FLIGHT_TERMINATION
     )
     version = 1 << 24 | common.FIRMWARE_VERSION_TYPE_OFFICIAL
-    return common.MAVLink_autopilot_version_message(can, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, system)
+    return common.MAVLink_autopilot_version_message(
+        capabilities, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, system
+    )
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Who makes a message, and how often it is sent unless a station asks otherwise, Hz; 0: only when asked for."""
+    """Function that makes a message, and its default rate, Hz; 0: only on request."""
 
-    make: Callable[[Picture], Message]
+    make: Callable[[Snapshot], Message]
     rate_hz: float
 
 
@@ -258,21 +260,24 @@ STREAMS: Final[Mapping[int, Stream]] = MappingProxyType(
 
 
 class Schedule:
-    """When which message is due."""
+    """Schedule of the periodic messages."""
 
     def __init__(self) -> None:
         self._periods_s = {number: 1 / stream.rate_hz for number, stream in STREAMS.items() if stream.rate_hz}
         self._next_s = dict.fromkeys(self._periods_s, 0.0)
 
     def interval_us(self, number: int) -> int | None:
-        """As MESSAGE_INTERVAL says it: -1 is not sent; None: no such message."""
+        """Return the interval in the format of MESSAGE_INTERVAL, us; -1: not sent; None: no such message."""
         if number not in STREAMS:
             return None
         period = self._periods_s.get(number)
         return -1 if period is None else round(period * 1e6)
 
     def set_interval(self, number: int, interval_us: float, now_s: float) -> bool:
-        """0: as usual, -1: never; no faster than MAX_HZ. False when that cannot be: the heartbeat stays as it is."""
+        """Set a message's interval, us, at most MAX_HZ; 0: default, -1: never.
+
+        Returns False for an unknown message, a bad interval and the heartbeat, whose rate is fixed.
+        """
         if number not in STREAMS or number == common.MAVLINK_MSG_ID_HEARTBEAT or not -1 <= interval_us < 1e9:
             return False
         usual = STREAMS[number].rate_hz
@@ -284,9 +289,9 @@ class Schedule:
         return True
 
     def due(self, now_s: float) -> list[int]:
-        """Numbers of the messages to be sent now."""
+        """Return the numbers of the messages to send now."""
         numbers = [number for number, at_s in self._next_s.items() if now_s >= at_s]
         for number in numbers:
-            # From the last date on, so that the rate is kept; not after a standstill, which would bring a burst.
+            # Relative to the last due time, to keep the rate; after a pause relative to now, to avoid a burst.
             self._next_s[number] = max(self._next_s[number] + self._periods_s[number], now_s)
         return numbers

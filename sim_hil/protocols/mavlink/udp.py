@@ -1,4 +1,4 @@
-"""A UDP socket that learns who talks to it: packets go to a few fixed addresses and to those heard of late."""
+"""UDP link that learns its peers: packets go to recent senders, heartbeats also to fixed addresses."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import socket
 from typing import Final
 
 Address = tuple[str, int]
-MAX_LEARNED: Final = 4  # a station, an observer, and either once more from another port after a restart
+MAX_LEARNED: Final = 4  # a station and an observer, each also with a second port after a restart
 FORGET_S: Final = 10.0
 _MAX_BYTES: Final = 2048
 _MAX_A_SERVE: Final = 64
 
 
 def parse_address(text: str) -> Address:
-    """`HOST:PORT`, an IPv4 address. Raises ValueError."""
+    """Parse `HOST:PORT` with an IPv4 address. Raises ValueError."""
     host, colon, port = text.rpartition(":")
     try:
         socket.inet_aton(host)
@@ -28,10 +28,10 @@ def parse_address(text: str) -> Address:
 
 
 class UdpLink:
-    """Datagrams in and out; never waits but in `wait`."""
+    """UDP link; only `wait` blocks."""
 
     def __init__(self, bind: Address, fixed: tuple[Address, ...]) -> None:
-        """`fixed`: who is called without having been heard. Raises OSError with one clear line."""
+        """Bind the socket; `fixed`: addresses that get heartbeats before they send. Raises OSError with one line."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind(bind)
@@ -40,22 +40,22 @@ class UdpLink:
             raise OSError(f"mavlink: {bind[0]}:{bind[1]}: expected a free UDP port, {error.strerror}") from error
         self._socket.setblocking(False)
         self._fixed = fixed
-        self._heard_s: dict[Address, float] = {}
+        self._last_packet_s: dict[Address, float] = {}
         self.turned_away = 0
         self.unsent = 0
         self.sent = 0
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """UDP port of the socket."""
         return int(self._socket.getsockname()[1])
 
     def wait(self, left_ns: int) -> None:
-        """Until something arrives, at most `left_ns`."""
+        """Wait until a datagram arrives, at most `left_ns`."""
         select.select([self._socket], [], [], left_ns / 1e9)
 
     def receive(self) -> list[tuple[bytes, Address]]:
-        """What has arrived, a limited number at once."""
+        """Return the received datagrams and their senders, a limited number per call."""
         arrived = []
         with contextlib.suppress(BlockingIOError, ConnectionError):
             for _ in range(_MAX_A_SERVE):
@@ -64,21 +64,21 @@ class UdpLink:
         return arrived
 
     def accept(self, address: Address, now_s: float) -> bool:
-        """Note that a whole packet came from there; False when too many others are there already."""
-        if address not in self._heard_s and len(self._heard_s) >= MAX_LEARNED:
-            self._heard_s = {who: at_s for who, at_s in self._heard_s.items() if now_s - at_s <= FORGET_S}
-            if len(self._heard_s) >= MAX_LEARNED:
+        """Register the sender of a valid packet; False if there are already MAX_LEARNED other recent senders."""
+        if address not in self._last_packet_s and len(self._last_packet_s) >= MAX_LEARNED:
+            self._last_packet_s = {peer: self._last_packet_s[peer] for peer in self.listeners(now_s)}
+            if len(self._last_packet_s) >= MAX_LEARNED:
                 self.turned_away += 1
                 return False
-        self._heard_s[address] = now_s
+        self._last_packet_s[address] = now_s
         return True
 
     def listeners(self, now_s: float) -> list[Address]:
-        """Who has been heard of late."""
-        return [who for who, at_s in self._heard_s.items() if now_s - at_s <= FORGET_S]
+        """Return the addresses that sent a packet within FORGET_S."""
+        return [peer for peer, at_s in self._last_packet_s.items() if now_s - at_s <= FORGET_S]
 
     def send(self, data: bytes, now_s: float, *, call: bool = False) -> None:
-        """To everybody who was heard of late; with `call` to the fixed addresses too."""
+        """Send to all recent senders; with `call` also to the fixed addresses."""
         addresses = self.listeners(now_s)
         if call:
             addresses += [address for address in self._fixed if address not in addresses]
@@ -86,7 +86,7 @@ class UdpLink:
             try:
                 self._socket.sendto(data, address)
                 self.sent += 1
-            except OSError:  # nobody there, or no room: the next report comes soon
+            except OSError:  # no receiver or no buffer space: the next report follows soon
                 self.unsent += 1
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""The rover: who may drive it, in which mode, what it obeys, when it stops by itself. Pure: no clock, no wire.
+"""State machine of the rover: control by one station, modes, arming, failsafes. Pure: no clock, no network.
 
-Every time is the robot's own clock, s. One station is in control: the first that asks for something that moves the
-base; it stays so until it disarms the base or falls silent. Everybody may watch, and everybody may stop it.
+All times are the robot's own clock, s. One station is in control: the first that sends a request related to motion. It
+stays in control until it disarms the base or falls silent. Every station may receive reports and stop the base.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sim_hil.protocols.mavlink.modes import Mode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
 
-_COMMAND_S: Final = 0.02  # a setpoint in the local frame is turned into the base's own again and again
+_COMMAND_S: Final = 0.02  # period at which a setpoint in the local frame is converted to the base's frame
 _STOP: Final = (0.0, 0.0, 0.0)
 _SEVERITY_STOPPED: Final = common.MAV_SEVERITY_CRITICAL
 _SEVERITY_REFUSED: Final = common.MAV_SEVERITY_WARNING
@@ -29,18 +29,18 @@ _MAX_TEXTS: Final = 20
 
 
 class Base(Protocol):
-    """What the vehicle asks of the robot."""
+    """Interface of the robot to the vehicle."""
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity."""
+        """Set the commanded velocity."""
         ...
 
     def stand(self) -> None:
-        """Power the drive."""
+        """Power the drive on."""
         ...
 
     def rest(self) -> None:
-        """Brake, without power afterwards."""
+        """Brake, then power the drive off."""
         ...
 
     def press_estop(self) -> None:
@@ -48,19 +48,19 @@ class Base(Protocol):
         ...
 
     def release_estop(self) -> None:
-        """Let the drive be powered again."""
+        """Allow the drive to be powered again."""
         ...
 
 
 class Station(NamedTuple):
-    """Who sends: MAVLink's number alone does not tell two ground stations with the same one apart."""
+    """Sender of a message; the address distinguishes two ground stations with the same MAVLink number."""
 
     system: int
     address: tuple[str, int]
 
 
 class Text(NamedTuple):
-    """One line for the operator; `severity` is MAV_SEVERITY."""
+    """One line of text for the operator; `severity` is MAV_SEVERITY."""
 
     severity: int
     text: str
@@ -68,7 +68,7 @@ class Text(NamedTuple):
 
 @dataclass(frozen=True)
 class Health:
-    """What arming depends on: charge 0 to 1, tilt of the base, rad, and its yaw in the local frame, rad."""
+    """State for the arming checks: charge 0..1, tilt of the base, rad; and its yaw in the local frame, rad."""
 
     charge: float = 1.0
     tilt_rad: float = 0.0
@@ -76,7 +76,7 @@ class Health:
 
 
 class Vehicle:
-    """One rover; `step` after every physics step."""
+    """State machine of one rover; call `step` after every physics step."""
 
     def __init__(self, base: Base, parameters: Parameters) -> None:
         self._base = base
@@ -99,31 +99,32 @@ class Vehicle:
         self._texts: list[Text] = []
 
     def take_texts(self) -> list[Text]:
-        """Lines since the last call."""
+        """Return the texts since the last call."""
         texts, self._texts = self._texts, []
         return texts
 
-    def say(self, severity: int, text: str) -> None:
-        """Tell the operator; a flood of lines is cut off."""
+    def send_text(self, severity: int, text: str) -> None:
+        """Queue a text for the operator; the queue is bounded."""
         if len(self._texts) < _MAX_TEXTS:
             self._texts.append(Text(severity, text))
 
-    # Who is there
+    # Stations
 
     def heartbeat(self, station: Station, now_s: float) -> None:
-        """A ground station lives."""
+        """Register a heartbeat of a station."""
         self._heartbeats_s[station] = now_s
         if station == self.controller:
             self._controller_s = now_s
             self._station_lost = False
 
     def forget_silent(self, now_s: float) -> None:
-        """Drop stations that have not been heard for long."""
+        """Remove stations whose heartbeats have timed out."""
         loss_s = self._parameters["COM_DL_LOSS_T"]
-        self._heartbeats_s = {who: at_s for who, at_s in self._heartbeats_s.items() if now_s - at_s <= loss_s}
+        heartbeats = self._heartbeats_s.items()
+        self._heartbeats_s = {station: at_s for station, at_s in heartbeats if now_s - at_s <= loss_s}
 
     def take_control(self, station: Station, now_s: float) -> bool:
-        """Whether `station` is in control, which it becomes when nobody else is."""
+        """Give `station` control if no other station has it; return whether it is in control."""
         only = int(self._parameters["MAV_GCS_SYSID"])
         if only not in (0, station.system):
             return False
@@ -138,16 +139,16 @@ class Vehicle:
         return True
 
     def may_change(self, station: Station, now_s: float) -> bool:
-        """Whether `station` may change what the station in control relies on."""
+        """Return whether `station` may change settings that the station in control relies on."""
         return self.controller in (None, station) or (not self.armed and self._silent(now_s))
 
     def _silent(self, now_s: float) -> bool:
         return now_s - self._controller_s > self._parameters["COM_DL_LOSS_T"]
 
-    # What it is told
+    # Requests
 
     def obstacle_to_arming(self, *, forced: bool = False) -> str | None:
-        """Why it may not be armed, in words; `forced` overlooks battery and tilt, never the emergency stop."""
+        """Return why arming is denied, or None; `forced` skips the checks of battery and tilt."""
         if self.button:
             return "emergency stop button pressed"
         if self.estop:
@@ -161,7 +162,7 @@ class Vehicle:
         return None
 
     def arm(self, station: Station, now_s: float, *, forced: bool = False) -> int:
-        """MAV_RESULT of the request."""
+        """Arm the base; return MAV_RESULT."""
         if not self.take_control(station, now_s):
             return self._refuse("Arming denied: another station is in control", REJECTED)
         if self.armed:
@@ -171,11 +172,11 @@ class Vehicle:
             return self._refuse(f"Arming denied: {obstacle}", FAILED)
         self.armed = True
         self._base.stand()
-        self.say(_SEVERITY_NEWS, "Armed")
+        self.send_text(_SEVERITY_NEWS, "Armed")
         return ACCEPTED
 
     def disarm(self, station: Station, now_s: float) -> int:
-        """MAV_RESULT; also ends an emergency stop that no button holds."""
+        """Disarm the base and release an emergency stop unless the button is pressed; return MAV_RESULT."""
         if not self.take_control(station, now_s):
             return self._refuse("Disarming denied: another station is in control", REJECTED)
         if self.button:
@@ -183,23 +184,23 @@ class Vehicle:
         if self.estop:
             self.estop = False
             self._base.release_estop()
-            self.say(_SEVERITY_NEWS, "Emergency stop released")
+            self.send_text(_SEVERITY_NEWS, "Emergency stop released")
         self._disarm("Disarmed")
         self.controller = None
         return ACCEPTED
 
     def emergency_stop(self, why: str) -> int:
-        """Brake hard and stay so, whoever asks."""
+        """Brake hard and latch the stop, for a request of any station; return MAV_RESULT."""
         if not self.estop:
             self.estop = True
             self._base.press_estop()
-            self.say(common.MAV_SEVERITY_EMERGENCY, f"Emergency stop: {why}")
+            self.send_text(common.MAV_SEVERITY_EMERGENCY, f"Emergency stop: {why}")
         self.armed = False
         self._leave()
         return ACCEPTED
 
     def set_mode(self, station: Station, mode: Mode | None, now_s: float) -> int:
-        """MAV_RESULT; None is a mode that it has not."""
+        """Set the mode, None for an unknown one; return MAV_RESULT."""
         if not self.take_control(station, now_s):
             return self._refuse("Mode denied: another station is in control", REJECTED)
         if mode is None:
@@ -212,12 +213,12 @@ class Vehicle:
             elif self.armed:
                 self._base.command(*_STOP)
             self.mode = mode
-            self.say(_SEVERITY_NEWS, f"Mode {mode.name}")
+            self.send_text(_SEVERITY_NEWS, f"Mode {mode.name}")
         self._next_command_s = now_s
         return ACCEPTED
 
     def setpoint(self, station: Station, setpoint: Setpoint, now_s: float) -> bool:
-        """Take a velocity; whether it came from the station in control."""
+        """Apply a setpoint; return whether it came from the station in control."""
         if not self.take_control(station, now_s):
             self.refused_setpoints += 1
             return False
@@ -226,7 +227,7 @@ class Vehicle:
         return True
 
     def sticks(self, station: Station, sticks: Sticks | None, now_s: float) -> bool:
-        """Take the sticks' position, None when they are let go; whether from the station in control."""
+        """Apply stick positions, None if released; return whether they came from the station in control."""
         if not self.take_control(station, now_s):
             self.refused_setpoints += 1
             return False
@@ -234,10 +235,10 @@ class Vehicle:
         self._drive(now_s)
         return True
 
-    # What it does by itself
+    # Failsafes and driving
 
     def step(self, now_s: float) -> None:
-        """Let time pass."""
+        """Advance to `now_s`: apply button, failsafes and the current command."""
         if self.button and not self.estop:
             self.emergency_stop("button")
         if self.armed:
@@ -265,7 +266,7 @@ class Vehicle:
 
     def _hold(self, why: str) -> None:
         if self.mode is not Mode.HOLD:
-            self.say(_SEVERITY_STOPPED, why)
+            self.send_text(_SEVERITY_STOPPED, why)
         self._leave()
         self._base.command(*_STOP)
 
@@ -278,7 +279,7 @@ class Vehicle:
         if self.armed:
             self.armed = False
             self._base.rest()
-            self.say(severity, why)
+            self.send_text(severity, why)
         self._leave()
 
     def _drive(self, now_s: float) -> None:
@@ -290,7 +291,7 @@ class Vehicle:
             self._base.command(command[0], 0.0, command[1])
 
     def wanted(self) -> tuple[float, float] | None:
-        """Speed ahead, m/s, and to the left, rad/s, that is asked for in this mode; None when nothing is."""
+        """Return the requested speed (m/s, forward) and yaw rate (rad/s, left) in this mode; None if there is none."""
         if self.mode is Mode.OFFBOARD and self._setpoint is not None:
             return self._limited(*self._setpoint.command(self.health.yaw_rad))
         if self.mode is Mode.MANUAL and self._sticks is not None:
@@ -303,5 +304,5 @@ class Vehicle:
         return max(-v_max, min(v_max, v_mps)), max(-w_max, min(w_max, w_radps))
 
     def _refuse(self, why: str, result: int) -> int:
-        self.say(_SEVERITY_REFUSED, why)
+        self.send_text(_SEVERITY_REFUSED, why)
         return int(result)

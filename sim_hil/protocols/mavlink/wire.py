@@ -1,6 +1,6 @@
-"""MAVLink packets in datagrams: bytes to messages and back, everything that is wrong counted. Pure.
+"""MAVLink packets in datagrams: encoding, decoding, and counts of invalid input. Pure.
 
-The dialect is pymavlink's `common` in its version 2; packets of version 1 are understood and answered in version 2.
+The dialect is pymavlink's `common`, version 2; packets of version 1 are accepted and answered in version 2.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ _V1_HEADER: Final = 6
 _V2_HEADER: Final = 10
 _CRC: Final = 2
 _SIGNED_FLAG: Final = 0x01
-# Messages of other dialects are no error of their sender's.
+# Messages of other dialects are valid, so they are counted separately.
 _UNKNOWN: Final = common.MAVLink_unknown
 
 
 @dataclass
 class Counts:
-    """What was received and not obeyed."""
+    """Counts of rejected packets."""
 
-    broken: int = 0  # no packet, cut off, wrong checksum
+    broken: int = 0  # not a packet, truncated, or wrong checksum
     unsigned: int = 0  # signature missing, wrong or old, while a key is set
     unknown: int = 0  # messages of other dialects
-    not_for_us: int = 0
-    unusable: int = 0  # whole, but with values that no correct sender sends
+    not_for_us: int = 0  # messages for another system or component
+    unusable: int = 0  # valid packets with invalid values
 
     @property
     def malformed(self) -> int:
-        """What no correct sender makes."""
+        """Number of invalid packets."""
         return self.broken + self.unsigned + self.unusable
 
 
 def _length(data: bytes, at: int) -> int:
-    """Length of the packet that begins at `at`; 0 when there is none."""
+    """Return the length of the packet that begins at `at`; 0 if there is none."""
     left = len(data) - at
     if left > 3 and data[at] == _V2 and not data[at + 2] & ~_SIGNED_FLAG:
         signed = BLOCK_BYTES if data[at + 2] & _SIGNED_FLAG else 0
@@ -56,16 +56,16 @@ def _length(data: bytes, at: int) -> int:
 
 
 class Reader:
-    """Reads datagrams."""
+    """Decoder of datagrams."""
 
     def __init__(self, verifier: Verifier | None = None) -> None:
-        """`verifier`: only signed packets that it accepts are let through."""
+        """Create a decoder; with a `verifier`, packets that it rejects are dropped."""
         self.counts = Counts()
         self._verifier = verifier
         self._parser = common.MAVLink(None)
 
     def read(self, data: bytes) -> list[Message]:
-        """Messages of one datagram; after something that is no packet the rest of it is left out."""
+        """Return the messages of one datagram; after invalid data the rest is ignored."""
         return [message for packet in self._packets(data) if (message := self._decode(packet)) is not None]
 
     def _packets(self, data: bytes) -> Iterator[bytes]:
@@ -94,7 +94,7 @@ class Reader:
 
 
 class Writer:
-    """Makes the packets of one sender, numbered one after the other, signed when it has a key."""
+    """Encoder of one sender's packets, with sequence numbers and, given a key, signatures."""
 
     def __init__(self, system: int, component: int, key: bytes | None = None, now_ticks: int = 0) -> None:
         self._packer = common.MAVLink(None, srcSystem=system, srcComponent=component)
@@ -104,12 +104,12 @@ class Writer:
             self._packer.signing.timestamp = now_ticks
 
     def pack(self, message: Message) -> bytes:
-        """The message's bytes."""
+        """Return a message as bytes."""
         data = bytes(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
         return data
 
 
 def now_ticks() -> int:
-    """Now as a signature's timestamp: the one place where the protocol asks for the time of day."""
+    """Return the current time as a signature timestamp; the only use of wall-clock time, required by the protocol."""
     return (time.time_ns() - EPOCH_UNIX_S * 1_000_000_000) * TICKS_PER_S // 1_000_000_000

@@ -1,1 +1,1 @@
-"""The Go2 on Unitree's DDS protocol: state topics, camera process, and faults of each."""
+"""Unitree protocol of the Go2 over DDS: services, state topics, camera process, and their faults."""

@@ -1,4 +1,4 @@
-"""A camera that fails: the video service's answers held back, repeated, old, or not the picture they should be."""
+"""Camera faults: answers of the video service that are missing, late, repeated, stale or wrong."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from sim_hil.protocols.unitree.video_service import VideoHub, encode_jpeg
 from sim_hil.simulation.sensor_noise import SensorNoise
 
 _HISTORY_NS: Final = 5_000_000_000
-_NOISE_LEVELS: Final = 4  # grey levels of noise in a covered or blinded picture: its pixels differ every time
+_NOISE_LEVELS: Final = 4  # grey levels of noise in an image of a covered or blinded camera
 _READ_BYTES: Final = 4096
-_CLOCK_SHARE: Final = (0.4, 0.1)  # width and height of a drawn clock, of the picture's
+_CLOCK_SHARE: Final = (0.4, 0.1)  # size of a drawn clock as a share of the image's width and height
 
 
 class FaultyVideoHub(VideoHub):
-    """The video service with faults switched by lines on a descriptor, whose end of file ends the process."""
+    """Video service whose faults are switched by lines on a descriptor; its end of file ends the process."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class FaultyVideoHub(VideoHub):
         size: tuple[int, int],
         commands_fd: int,
     ) -> None:
-        """`size`: (width, height) of a picture, pixels."""
+        """Create the service; `size`: image size (width, height), px; `commands_fd`: descriptor of the commands."""
         super().__init__(server, render, tell)
         self._size = size
         self._fd = commands_fd
@@ -53,7 +53,7 @@ class FaultyVideoHub(VideoHub):
         self._sensor = SensorNoise(*size, seed=0)
 
     def listen(self) -> bool:
-        """Take the commands that have come; False when whoever sent them has gone."""
+        """Read the commands; return False if the sender has closed the descriptor."""
         try:
             data = os.read(self._fd, _READ_BYTES)
         except BlockingIOError:
@@ -77,7 +77,7 @@ class FaultyVideoHub(VideoHub):
             self._on[command.fault] = command
             self._untold.add(command.fault)
             self._thaw()
-            if command.fault == "camera-stop":  # what it does is nothing, from now on
+            if command.fault == "camera-stop":  # takes effect at once: no answer from now on
                 self._took_effect()
         else:
             self._on.pop(command.fault, None)
@@ -152,7 +152,7 @@ class FaultyVideoHub(VideoHub):
         return jpeg
 
     def _next_stale(self, buffers: int) -> bytes:
-        """The oldest of the pictures that come again in turn."""
+        """Return the next of the images that are repeated in turn."""
         if not self._stale:
             self._stale.extend(jpeg for _, jpeg in list(self._history)[-buffers:])
         self._stale.rotate(-1)
@@ -163,14 +163,14 @@ class FaultyVideoHub(VideoHub):
 
 
 def _decoded(jpeg: bytes) -> NDArray[np.uint8]:
-    """RGB [h, w, 3] of a JPEG of our own."""
+    """Decode a JPEG of this process to RGB [h, w, 3]."""
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr is not None  # our own JPEG: it decodes
+    assert bgr is not None  # encoded by this process
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
 
 def _with_clock(rgb: NDArray[np.uint8], now_ns: int) -> NDArray[np.uint8]:
-    """The picture with seconds and hundredths drawn white on black into its upper left corner."""
+    """Draw a clock (seconds and hundredths, white on black) into the upper left corner of an image."""
     height, width = rgb.shape[:2]
     box = (round(_CLOCK_SHARE[0] * width), round(_CLOCK_SHARE[1] * height))
     scale = box[1] / 40

@@ -23,7 +23,7 @@ _POLL_S: Final = 0.02
 
 
 class CameraProcessError(RuntimeError):
-    """The camera process did not start, has died, or talks nonsense."""
+    """The camera process did not start, died, or sent an invalid event."""
 
 
 class CameraProcess:
@@ -65,7 +65,7 @@ class CameraProcess:
         self._pose.write(render_state)
 
     def tell(self, line: bytes) -> None:
-        """Send a fault command to a camera started with `faults`; one that has died is noticed by `events`."""
+        """Send a fault command to a camera started with `faults`; `events` detects a dead process."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(line + b"\n")
@@ -99,7 +99,7 @@ class CameraProcess:
 
     def _fate(self) -> str:
         code = self._process.returncode
-        return "has closed its output, still running" if code is None else f"has died (exit status {code})"
+        return "closed its output but still runs" if code is None else f"died (exit status {code})"
 
     def close(self) -> None:
         """End the process; killed if it does not end by itself."""

@@ -1,4 +1,4 @@
-"""The odometry frame of a Go2 whose legs slip: the pose it reports drifts away from where it is."""
+"""Odometry frame of a Go2 with slipping legs: the reported pose drifts from the true one."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from sim_hil.robots.odometry_noise import OdometryNoise
 
 
 class DriftingOdometry(OdometryFrame):
-    """`OdometryFrame` seen through an `OdometryNoise`; the gyroscope and all else that is no odometry stay true."""
+    """Odometry frame with drift from `OdometryNoise`; gyroscope and other sensors remain exact."""
 
     def __init__(self, start: tuple[float, float, float], noise: OdometryNoise) -> None:
-        """`start`: T_world_odom as (x_m, y_m, theta_rad); the noise starts at the origin."""
+        """Create the frame; `start`: T_world_odom as (x_m, y_m, theta_rad). The noise starts at the origin."""
         super().__init__(start)
         self._noise = noise
         self._true: SE2 | None = None
         self._true_s = 0.0
         self._correction = SE2(0.0, 0.0, 0.0)  # reported pose = correction @ true pose
-        self._error = (0.0, 0.0, 0.0)  # of the body velocity, m/s, m/s, rad/s
+        self._error = (0.0, 0.0, 0.0)  # error of the body velocity, m/s, m/s, rad/s
 
     def update(self, truth: RobotTruth) -> None:
-        """Let the report drift by what the robot has moved since the last update."""
+        """Advance the drift by the robot's motion since the last update."""
         x, y, _ = super().position(truth.position_m)
         now = SE2(x, y, super().rpy(truth.rpy_rad)[2])
         before, self._true = self._true, now
@@ -41,23 +41,23 @@ class DriftingOdometry(OdometryFrame):
         self._error = (vx, vy, wz)
 
     def position(self, position_m: object) -> list[float]:
-        """A world position [3] as reported."""
+        """Return a world position [3] as reported, m."""
         x, y, z = super().position(position_m)
         moved = self._correction @ SE2(x, y, 0.0)
         return [moved.x_m, moved.y_m, z]
 
     def rpy(self, rpy_rad: object) -> list[float]:
-        """Roll, pitch and yaw [3] as reported."""
+        """Return roll, pitch and yaw [3] as reported, rad."""
         roll, pitch, yaw = super().rpy(rpy_rad)
         turned = yaw + self._correction.theta_rad
         return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
 
     def quaternion(self, wxyz: object) -> list[float]:
-        """An orientation (w, x, y, z) as reported."""
+        """Return an orientation (w, x, y, z) as reported."""
         return turned_quaternion(super().quaternion(wxyz), self._correction.theta_rad)
 
     def velocity(self, vector: object) -> list[float]:
-        """A world velocity [3] as reported, in the odometry frame: it fits the pose that is reported."""
+        """Return a world velocity [3] as reported, m/s, in the odometry frame; consistent with the reported pose."""
         x, y, z = super().velocity(vector)
         c, s = math.cos(self._correction.theta_rad), math.sin(self._correction.theta_rad)
         heading = self._noise.pose.theta_rad
@@ -66,5 +66,5 @@ class DriftingOdometry(OdometryFrame):
         return [c * x - s * y + ch * ex - sh * ey, s * x + c * y + sh * ex + ch * ey, z]
 
     def yaw_speed(self, wz_radps: float) -> float:
-        """A yaw rate as reported."""
+        """Return a yaw rate as reported, rad/s."""
         return wz_radps + self._error[2]

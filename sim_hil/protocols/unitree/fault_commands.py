@@ -1,4 +1,4 @@
-"""The faults that `edge-hil --faults` can inject, by name with their parameters, and the lines that ask for them."""
+"""Table of the faults that `edge-hil --faults` can inject, with parameters, and parser of fault requests."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ Range = tuple[float, float]
 
 
 class FaultCommandError(ValueError):
-    """A line that asks for nothing we can inject; one line that says why."""
+    """An invalid fault request; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class FaultKind:
-    """One fault: which part of the robot's side makes it, what it is, and its parameters as (default, range).
+    """One fault: the component that causes it, its description, and its parameters as (default, range).
 
-    A text parameter has the texts it may be instead of a range. `once`: switching it off changes nothing more.
+    A text parameter has a list of allowed texts instead of a range. `once`: switching the fault off has no effect.
     """
 
     where: str
-    says: str
+    description: str
     numbers: Mapping[str, tuple[float, Range]] = field(default_factory=dict)
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # the first is the default
     once: bool = False
@@ -37,50 +37,48 @@ class FaultKind:
 def _kinds() -> dict[str, FaultKind]:
     seconds = (0.0, 60.0)
     return {
-        "camera-stop": FaultKind("camera", "requests for a picture are never answered"),
-        "camera-freeze": FaultKind("camera", "every answer is the first picture since then"),
+        "camera-stop": FaultKind("camera", "requests for an image are never answered"),
+        "camera-freeze": FaultKind("camera", "every answer repeats the first image since then"),
         "camera-stale-buffers": FaultKind(
             "camera",
-            "the newest pictures come again in turn, so many as there are buffers",
+            "the newest images are repeated in turn, as many as there are buffers",
             {"buffers": (2.0, (2, 32))},
         ),
-        "camera-frozen-clock": FaultKind("camera", "the first picture since then with a running clock drawn into it"),
+        "camera-frozen-clock": FaultKind("camera", "the first image since then with a running clock drawn into it"),
         "camera-frozen-noise": FaultKind(
-            "camera", "the first picture since then with new sensor noise, encoded again as JPEG"
+            "camera", "the first image since then with new sensor noise, encoded again as JPEG"
         ),
-        "camera-stale": FaultKind("camera", "every answer is the picture of delay_s ago", {"delay_s": (1.0, seconds)}),
+        "camera-stale": FaultKind("camera", "every answer is the image of delay_s ago", {"delay_s": (1.0, seconds)}),
         "camera-slow": FaultKind("camera", "every answer comes delay_s late", {"delay_s": (1.0, seconds)}),
-        "camera-half-rate": FaultKind(
-            "camera", "pictures come at rate_hz, whoever asks", {"rate_hz": (5.0, (0.1, 60))}
-        ),
+        "camera-half-rate": FaultKind("camera", "images come at rate_hz at most", {"rate_hz": (5.0, (0.1, 60))}),
         "camera-black": FaultKind("camera", "the lens is covered: sensor noise only"),
-        "camera-saturated": FaultKind("camera", "the lens looks into a lamp: white with noise"),
+        "camera-saturated": FaultKind("camera", "the camera is blinded by a lamp: white with noise"),
         "camera-torn": FaultKind(
             "camera", "every JPEG ends after a share of its bytes", {"share": (0.5, (0.01, 0.99))}
         ),
         "camera-wrong-size": FaultKind(
-            "camera", "pictures of another size", {"width": (160.0, (16, 4096)), "height": (160.0, (16, 4096))}
+            "camera", "images of another size", {"width": (160.0, (16, 4096)), "height": (160.0, (16, 4096))}
         ),
         "odometry-jump": FaultKind(
             "state",
-            "the pose moves by a step and stays there",
+            "the pose jumps by a step and keeps that offset",
             {"dx_m": (1.0, (-100, 100)), "dy_m": (0.0, (-100, 100)), "dtheta_rad": (0.0, (-3.2, 3.2))},
             once=True,
         ),
         "odometry-freeze": FaultKind(
             "state",
-            "the pose stays what it is, the velocity too or reads zero, the robot's stamp runs on or not",
+            "the pose freezes; the velocity freezes or reads zero; the robot's stamp continues or freezes",
             {},
             {"velocity": ("held", "zero"), "stamp": ("runs", "frozen")},
         ),
         "odometry-nan": FaultKind(
-            "state", "a field is not a number, or the quaternion zero", {}, {"field": ("position", "velocity", "rpy")}
+            "state", "a field is NaN, or the quaternion is zero", {}, {"field": ("position", "velocity", "rpy")}
         ),
         "odometry-lag": FaultKind("state", "the sport state comes delay_s late", {"delay_s": (0.3, seconds)}),
         "odometry-bias": FaultKind("state", "the velocity reads dv_mps too high", {"dv_mps": (1.0, (-10, 10))}),
         "state-silent": FaultKind("state", "no state is sent on any topic"),
-        "state-loss": FaultKind("state", "a share of the states is lost", {"percent": (50.0, (0, 100))}),
-        "state-reorder": FaultKind("state", "neighbouring sport states change places"),
+        "state-loss": FaultKind("state", "a share of the state messages is lost", {"percent": (50.0, (0, 100))}),
+        "state-reorder": FaultKind("state", "neighbouring sport states are swapped"),
         "state-duplicate": FaultKind("state", "every sport state is sent twice"),
         "tip-over": FaultKind(
             "state", "the attitude reads as tilted", {"roll_rad": (0.0, (-3.2, 3.2)), "pitch_rad": (0.7, (-1.6, 1.6))}
@@ -91,10 +89,13 @@ def _kinds() -> dict[str, FaultKind]:
         "remote-keys": FaultKind("remote", "keys are held down on the remote", {"keys": (float(L2_B), (0, 65535))}),
         "remote-stick": FaultKind("remote", "a stick is pushed on the remote", {"ly": (0.6, (-1, 1))}),
         "stop-unanswered": FaultKind(
-            "sport", "a StopMove is obeyed, answered delay_s later", {"delay_s": (10.0, seconds)}
+            "sport", "a StopMove is obeyed but answered delay_s later", {"delay_s": (10.0, seconds)}
         ),
         "late-move": FaultKind(
-            "sport", "one Move is held until delay_s after the next StopMove", {"delay_s": (0.2, seconds)}, once=True
+            "sport",
+            "one Move is held back until delay_s after the next StopMove",
+            {"delay_s": (0.2, seconds)},
+            once=True,
         ),
         "deaf": FaultKind("sport", "requests of the sport service are lost"),
     }
@@ -105,27 +106,27 @@ KINDS: Final[Mapping[str, FaultKind]] = MappingProxyType(_kinds())
 
 @dataclass(frozen=True)
 class FaultCommand:
-    """One line: switch a fault on or off, every parameter filled in. `CLEAR` switches everything off."""
+    """Parsed request that switches a fault on or off, with all parameters; `CLEAR` switches everything off."""
 
     fault: str
     on: bool
     values: Mapping[str, Value]
 
     def number(self, name: str) -> float:
-        """A parameter that is a number."""
+        """Return a numeric parameter."""
         return float(self.values[name])
 
     def text(self, name: str) -> str:
-        """A parameter that is a text."""
+        """Return a text parameter."""
         return str(self.values[name])
 
     def line(self) -> bytes:
-        """The line that `parse` makes this of."""
+        """Return the line that `parse` turns into this request."""
         return json.dumps({"fault": self.fault, "on": self.on, **self.values}).encode()
 
 
 def parse(line: bytes) -> FaultCommand:
-    """The command of a line such as {"fault": "odometry-lag", "on": true, "delay_s": 0.3}. Raises FaultCommandError."""
+    """Parse a line such as {"fault": "odometry-lag", "on": true, "delay_s": 0.3}. Raises FaultCommandError."""
     if len(line) > MAX_LINE_BYTES:
         raise FaultCommandError(f"expected at most {MAX_LINE_BYTES} bytes, found {len(line)}")
     try:
@@ -150,7 +151,7 @@ def _values(name: str, kind: FaultKind, table: dict[str, object]) -> dict[str, V
     values: dict[str, Value] = {}
     for key, (default, (low, high)) in kind.numbers.items():
         value = table.get(key, default)
-        # Compared, not converted: an integer may be longer than any float, and NaN is within no range.
+        # Compared before conversion: an integer may exceed the range of a float, and NaN lies in no range.
         if not isinstance(value, (int, float)) or isinstance(value, bool) or not low <= value <= high:
             raise FaultCommandError(f"{name}.{key}: expected {low:g} to {high:g}, found {value!r}")
         values[key] = float(value)

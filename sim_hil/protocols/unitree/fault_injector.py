@@ -1,19 +1,14 @@
-"""The local socket that faults are asked for at, and who makes which. One object owns all of `edge-hil --faults`."""
+"""Fault socket of the Unitree front end; it passes each fault to the component that causes it."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
-import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
+from sim_hil.protocols.fault_socket import FaultEndpoint
 from sim_hil.protocols.unitree.fault_commands import (
     CLEAR,
     KINDS,
-    MAX_LINE_BYTES,
     FaultCommand,
     FaultCommandError,
     parse,
@@ -22,41 +17,26 @@ from sim_hil.protocols.unitree.remote import Remote
 from sim_hil.protocols.unitree.request_faults import SportFaults
 from sim_hil.protocols.unitree.state_faults import StateFaults
 
-_MAX_COMMANDS_A_POLL: Final = 16
 
+class FaultInjector(FaultEndpoint):
+    """Owner of all faults of `edge-hil --faults`: accepts requests and passes each to the component that causes it.
 
-class FaultInjector:
-    """Takes one JSON object a datagram; answers {"fault", "on", "effect_ns"} when it has taken effect, or {"error"}.
-
-    Raises OSError when the socket cannot be made at `path`.
+    A request is one JSON object per datagram. The answer is {"fault", "on", "effect_ns"} once the fault has taken
+    effect, or {"error"}. Raises OSError if the socket cannot be created at `path`.
     """
 
     def __init__(self, path: Path, *, remote: Remote, camera: Callable[[bytes], None]) -> None:
-        """`camera` sends a line to the camera process."""
+        """Create the socket; `camera` sends a line to the camera process."""
+        super().__init__(path)
         self.states = StateFaults()
         self.sport = SportFaults()
         self._remote = remote
         self._camera = camera
-        self._path = path
-        self._asked: dict[str, tuple[FaultCommand, str]] = {}  # who waits to hear of a fault's effect
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        umask = os.umask(0o177)
-        try:
-            self._socket.bind(str(path))
-        except OSError as error:
-            self._socket.close()
-            raise OSError(f"--faults {path}: expected a free path for a socket, {error.strerror}") from error
-        finally:
-            os.umask(umask)
-        self._socket.setblocking(False)
+        self._open_requests: dict[str, tuple[FaultCommand, str]] = {}  # by fault: command and sender
 
     def poll(self, now_ns: int) -> None:
-        """Take the commands that have come and tell of the effects since the last poll; never waits."""
-        for _ in range(_MAX_COMMANDS_A_POLL):
-            try:
-                data, sender = self._socket.recvfrom(MAX_LINE_BYTES + 1)
-            except BlockingIOError:
-                break
+        """Handle the requests that have arrived and report effects since the last poll, without waiting."""
+        for data, sender in self._received():
             try:
                 self._switch(parse(data), sender, now_ns)
             except FaultCommandError as error:
@@ -65,27 +45,22 @@ class FaultInjector:
             self.took_effect(name, effect_ns)
 
     def took_effect(self, fault: str, effect_ns: int) -> None:
-        """Tell whoever asked for it."""
-        asked = self._asked.pop(fault, None)
-        if asked is not None:
-            command, sender = asked
+        """Answer the request for a fault that has taken effect."""
+        request = self._open_requests.pop(fault, None)
+        if request is not None:
+            command, sender = request
             self._answer(sender, {"fault": fault, "on": command.on, "effect_ns": effect_ns})
-
-    def close(self) -> None:
-        """Close and remove the socket."""
-        self._socket.close()
-        self._path.unlink(missing_ok=True)
 
     def _switch(self, command: FaultCommand, sender: str, now_ns: int) -> None:
         if command.fault == CLEAR:
-            self._asked.clear()
+            self._open_requests.clear()
             self.states.clear()
             self.sport.clear()
             self._remote.release()
             self._camera(command.line())
             self._answer(sender, {"fault": CLEAR, "on": False, "effect_ns": now_ns})
             return
-        self._asked[command.fault] = (command, sender)
+        self._open_requests[command.fault] = (command, sender)
         where = KINDS[command.fault].where
         if where == "camera":
             self._camera(command.line())
@@ -104,8 +79,3 @@ class FaultInjector:
             self._remote.keys = round(command.number("keys"))
         else:
             self._remote.ly = command.number("ly")
-
-    def _answer(self, sender: str, answer: dict[str, object]) -> None:
-        if sender:  # an unbound socket has no address to answer to
-            with contextlib.suppress(OSError):  # it has gone or does not read
-                self._socket.sendto(json.dumps(answer).encode(), sender)

@@ -1,4 +1,4 @@
-"""The Unitree protocol as a front end of `edge-hil`: services, state topics, and the camera in its own process."""
+"""Unitree front end of `edge-hil`: services, state topics, and the camera in its own process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edge.core.geometry import SE2
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.unitree.camera_process import CameraProcess
 from sim_hil.protocols.unitree.drifting import DriftingOdometry
 from sim_hil.protocols.unitree.remote import Remote
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from sim_hil.protocols.unitree.fault_injector import FaultInjector
 
 
-PILOT_HZ: Final = 20  # how often the surroundings are looked at
+PILOT_HZ: Final = 20  # rate of the obstacle check
 
 
 class UnitreeFrontEnd:
-    """A simulated Go2 answering its maker's protocol. Raises DdsError, OSError or ValueError when it cannot."""
+    """Unitree front end of a simulated Go2. Raises DdsError, OSError or ValueError if it cannot be opened."""
 
     def __init__(self, simulation: Simulation, options: FrontEndOptions, dds: DdsConfig) -> None:
         if not isinstance(simulation.robot, Go2):
@@ -52,7 +52,7 @@ class UnitreeFrontEnd:
         self._faults: FaultInjector | None = None
         self._closed = False
         self.bus = Bus(dds)
-        """The participant: DDS allows a process one in a domain."""
+        """DDS participant; a process may have one per domain."""
         self._camera: CameraProcess | None = None
         try:
             self._open(simulation, options)
@@ -68,7 +68,7 @@ class UnitreeFrontEnd:
         self._odometry = _odometry(options)
         self._range_finder = RangeFinder([box for _, box in options.scene.obstacles()])
         self._pilot = Pilot(self._behaviour.request_move, self._free_m)
-        self._steps_a_look = round(simulation.rate_hz / PILOT_HZ)
+        self._steps_per_check = round(simulation.rate_hz / PILOT_HZ)
         self._open_services()
         remote = Remote()
         if options.faults is not None:
@@ -81,7 +81,7 @@ class UnitreeFrontEnd:
             faults=None if self._faults is None else self._faults.states,
         )
         self._log = CommandLog()
-        self._listened = False
+        self._low_level_active = False
         self._video_frames = 0
         self._video_malformed = 0
 
@@ -115,7 +115,7 @@ class UnitreeFrontEnd:
         return SE2(x, y, self._odometry.rpy((0.0, 0.0, heading_rad))[2])
 
     def _injector(self, path: Path, remote: Remote) -> FaultInjector:
-        # Imported here: without --faults the code that makes anything go wrong is not even loaded.
+        # Imported here, so that without --faults no code that causes faults is loaded.
         from sim_hil.protocols.unitree.fault_injector import FaultInjector
 
         return FaultInjector(path, remote=remote, camera=self._tell_camera)
@@ -125,7 +125,7 @@ class UnitreeFrontEnd:
             self._camera.tell(line)
 
     def where(self) -> str:
-        """Domain and interface."""
+        """Return DDS domain and interface."""
         return f"domain {self._dds.domain} on {self._dds.interface}"
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
@@ -136,21 +136,21 @@ class UnitreeFrontEnd:
         return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
-        """Until a request arrives."""
+        """Wait until a request arrives, at most `left_ns`."""
         self._waitset.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
-        """Answer what is waiting at every service; the camera's are told of by its process."""
+    def serve(self) -> list[ReceivedCommand]:
+        """Answer the requests waiting at every service; the camera process reports its own requests."""
         received = self._serve_sport()
         self._leases.serve_leases()
         for server, handle in self._others:
             received += server.serve(handle)
         self._take_low_command()
         for event in self._camera.events() if self._camera is not None else ():
-            received += self._of_camera(event)
+            received += self._handle_camera_event(event)
         for request in received:
             self._log.note(request)
-        return [_heard(request) for request in received]
+        return [_as_command(request) for request in received]
 
     def _serve_sport(self) -> list[Received]:
         if self._faults is None:
@@ -160,16 +160,16 @@ class UnitreeFrontEnd:
         return self._faults.sport.serve(self._sport, self._sport_service.handle)
 
     def _take_low_command(self) -> None:
-        """The newest low command; what was said while the sport controller had the joints is thrown away."""
+        """Apply the newest low command; commands sent while the sport controller had the joints are discarded."""
         if not self._behaviour.released:
-            self._listened = False
+            self._low_level_active = False
             return
         for command in take_each(self._low_commands):
-            if self._listened:
+            if self._low_level_active:
                 self._behaviour.low_level.take(command, self._behaviour.time_s)
-        self._listened = True
+        self._low_level_active = True
 
-    def _of_camera(self, event: dict[str, object]) -> list[Received]:
+    def _handle_camera_event(self, event: dict[str, object]) -> list[Received]:
         if event["event"] == "frame":
             self._video_frames += 1
         elif event["event"] == "malformed":
@@ -187,8 +187,8 @@ class UnitreeFrontEnd:
         return []
 
     def publish(self, step: int, stamp_s: float) -> None:
-        """Write the state topics that are due, and look out for obstacles."""
-        if step % self._steps_a_look == 0:
+        """Write the state topics that are due, and check for obstacles."""
+        if step % self._steps_per_check == 0:
             self._pilot.step(stamp_s, self._reported_pose)
         due = self._publishers.due(step)
         if due:
@@ -197,12 +197,12 @@ class UnitreeFrontEnd:
             self._publishers.publish(due, truth, stamp_s, self._behaviour.progress)
 
     def show(self, render_state: NDArray[np.float64]) -> None:
-        """Hand the camera process what it renders from now on."""
+        """Pass the state to render to the camera process."""
         if self._camera is not None:
             self._camera.show(render_state)
 
     def close(self) -> None:
-        """End the camera process, remove the faults' socket, leave the bus."""
+        """End the camera process, remove the fault socket, close the DDS participant."""
         if self._faults is not None:
             self._faults.close()
             self._faults = None
@@ -214,7 +214,7 @@ class UnitreeFrontEnd:
             self.bus.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Return the counts of received and sent messages."""
         malformed = self._video_malformed + self._behaviour.low_level.rejected
         malformed += sum(server.malformed for server in self._servers)
         return {
@@ -225,9 +225,9 @@ class UnitreeFrontEnd:
 
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeFrontEnd:
-    """The front end of `--protocol unitree`. Raises FrontEndError, ConfigError, DdsError or OSError."""
+    """Open the front end of `--protocol unitree`. Raises FrontEndError, ConfigError, DdsError or OSError."""
     if options.faults is not None and options.camera_size is None:
-        raise FrontEndError("--faults: expected a camera to inject them into, found --camera none; leave one out")
+        raise FrontEndError("--faults: expected a camera, found --camera none; omit one of the two options")
     peers = ("127.0.0.1",) if options.interface == "lo" else ()
     return UnitreeFrontEnd(simulation, options, DdsConfig(options.domain, options.interface, peers))
 
@@ -253,6 +253,8 @@ def _odometry(options: FrontEndOptions) -> OdometryFrame:
     return DriftingOdometry(start, OdometryNoise(LEVELS[options.odometry_noise], options.seed))
 
 
-def _heard(request: Received) -> Heard:
+def _as_command(request: Received) -> ReceivedCommand:
     name = api_name(request.service, request.api_id)
-    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id)
+    return ReceivedCommand(
+        request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id
+    )

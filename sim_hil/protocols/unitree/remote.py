@@ -1,4 +1,4 @@
-"""The remote control beside a simulated Go2: nobody touches it, unless a fault is injected."""
+"""Remote control of a simulated Go2; it is used only by injected faults."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BYTES: Final = 40
 
 @dataclass
 class Remote:
-    """Sticks in -1..1 and keys as the bits of WirelessController_.keys."""
+    """State of the remote control: sticks in -1..1, keys as the bits of WirelessController_.keys."""
 
     lx: float = 0.0
     ly: float = 0.0
@@ -20,12 +20,12 @@ class Remote:
     keys: int = 0
 
     def release(self) -> None:
-        """Let go of everything."""
+        """Release all sticks and keys."""
         self.lx = self.ly = self.rx = self.ry = 0.0
         self.keys = 0
 
     def as_bytes(self) -> bytes:
-        """LowState_.wireless_remote: keys at byte 2, then lx, rx, ry at 4, 8, 12 and ly at 20 (protocol facts, §2)."""
+        """Encode as LowState_.wireless_remote: keys at byte 2, then lx, rx, ry at 4, 8, 12 and ly at 20."""
         data = bytearray(_BYTES)
         struct.pack_into("<H", data, 2, self.keys)
         struct.pack_into("<3f", data, 4, self.lx, self.rx, self.ry)

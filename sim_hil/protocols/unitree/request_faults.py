@@ -1,4 +1,4 @@
-"""Faults of how the robot takes requests of its sport service: late, unanswered, or not at all."""
+"""Faults of the sport service: requests that are executed late, not answered, or lost."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Handle = Callable[[int, str], Answer]
 
 
 class SportFaults:
-    """Serves the sport service in the place of `ServiceServer.serve`, with the faults in force."""
+    """Replacement of `ServiceServer.serve` for the sport service, with the active faults."""
 
     def __init__(self) -> None:
         self._on: dict[str, FaultCommand] = {}
         self._effects: list[tuple[str, int]] = []
-        self._wants_move: float | None = None  # a late Move is wanted: seconds after the StopMove
+        self._wants_move: float | None = None  # delay after the StopMove for the next Move, s; None: no late Move
         self._late_s = 0.0
         self._held: Received | None = None
         self._release_ns: int | None = None
         self._unanswered: list[tuple[int, Received, Answer]] = []
 
     def set(self, command: FaultCommand, now_ns: int) -> None:
-        """Switch a fault on or off. A late Move takes effect when it reaches the robot."""
+        """Switch a fault on or off; a late Move takes effect when it reaches the robot."""
         if command.fault == "late-move":
             self._wants_move = command.number("delay_s") if command.on else None
             return
@@ -42,12 +42,12 @@ class SportFaults:
         self._wants_move = self._held = self._release_ns = None
 
     def effects(self) -> list[tuple[str, int]]:
-        """(fault, ns) of what has taken effect since the last call."""
+        """Return (fault, time ns) of the faults that have taken effect since the last call."""
         effects, self._effects = self._effects, []
         return effects
 
     def serve(self, server: ServiceServer, handle: Handle) -> list[Received]:
-        """Take what is waiting; returns everything that arrived, obeyed or not."""
+        """Handle the waiting requests; return all of them, obeyed or not."""
         arrived = []
         for request in server.requests():
             arrived.append(request)

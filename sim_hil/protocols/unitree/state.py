@@ -1,7 +1,7 @@
-"""The simulated Go2's state topics: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`.
+"""State topics of the simulated Go2: `rt/sportmodestate` 50 Hz, `rt/lowstate` 500 Hz, both at 20 Hz under `rt/lf/`.
 
-And `rt/wirelesscontroller` at 100 Hz, the remote that nobody touches, and `rt/odommodestate`, the sport state again,
-under the name by which makers' other robots and bindings know the odometry.
+Also `rt/wirelesscontroller` at 100 Hz (the remote control), and `rt/odommodestate`: the sport state under the topic
+name that other robots and bindings use for odometry.
 """
 
 from __future__ import annotations
@@ -27,72 +27,72 @@ from sim_hil.robots.go2.body import RobotTruth
 if TYPE_CHECKING:
     from sim_hil.protocols.unitree.state_faults import StateFaults
 
-WIRELESS_HZ: Final = 100  # the maker's MuJoCo simulator
+WIRELESS_HZ: Final = 100  # as in the maker's MuJoCo simulator
 SPORT_STATE_HZ: Final = 50
 LOW_STATE_HZ: Final = 500
 ODOMETRY_TOPIC: Final = "rt/odommodestate"
-LF_HZ: Final = 20  # the maker names no number; owners report 15 to 20
+LF_HZ: Final = 20  # not documented by the maker; owners report 15 to 20
 _MATCH_CHECK_HZ: Final = 10
 _MOTORS: Final = 20
 _MOTORS_USED: Final = 12
-# LowState_ as CDR: members aligned to their own size, no padding behind a struct. The binding's own serializer takes a
-# quarter of a millisecond for it, which at 500 Hz is an eighth of a core.
+# LowState_ as CDR: members aligned to their own size, no padding after a struct. The binding's own serializer needs
+# 0.25 ms per message, which at 500 Hz is an eighth of a core.
 _CDR_LITTLE_ENDIAN: Final = b"\0\1\0\0"
 _LOW_STATE_CDR: Final = struct.Struct(
     "<4B4IH2x" + "13fB" + "B2x7fB3x3I" + "B3x7fB3x3I" * (_MOTORS - 1) + "4BiH4B15H" + "8hI41B3xf2B2x2f4HII"
 )
-_FOOT_RAISE_M: Final = 0.09  # the maker's sample
+_FOOT_RAISE_M: Final = 0.09  # from the maker's sample
 
 
 class OdometryFrame:
-    """The frame a Go2 reports its pose in: where it stood and which way it looked when it was switched on."""
+    """Frame in which a Go2 reports its pose: position and heading at switch-on."""
 
     def __init__(self, start: tuple[float, float, float]) -> None:
-        """`start`: T_world_odom as (x_m, y_m, theta_rad)."""
+        """Create the frame; `start`: T_world_odom as (x_m, y_m, theta_rad)."""
         self._x_m, self._y_m, self._theta_rad = start
         self._cos, self._sin = math.cos(start[2]), math.sin(start[2])
 
     def rotate(self, vector: Any) -> list[float]:
-        """A world vector [3] in the odometry frame."""
+        """Rotate a world vector [3] into the odometry frame."""
         x, y, z = (float(v) for v in vector)
         return [self._cos * x + self._sin * y, self._cos * y - self._sin * x, z]
 
     def position(self, position_m: Any) -> list[float]:
-        """A world position [3] in the odometry frame."""
+        """Transform a world position [3], m, into the odometry frame."""
         x, y, z = (float(v) for v in position_m)
         return self.rotate((x - self._x_m, y - self._y_m, z))
 
     def rpy(self, rpy_rad: Any) -> list[float]:
-        """Roll, pitch and yaw [3], yaw from the odometry frame in (-pi, pi]."""
+        """Transform roll, pitch and yaw [3], rad, into the odometry frame; yaw in (-pi, pi]."""
         roll, pitch, yaw = (float(v) for v in rpy_rad)
         turned = yaw - self._theta_rad
         return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
 
     def quaternion(self, wxyz: Any) -> list[float]:
-        """An orientation (w, x, y, z) in the odometry frame."""
+        """Transform an orientation (w, x, y, z) into the odometry frame."""
         return turned_quaternion([float(v) for v in wxyz], -self._theta_rad)
 
     def velocity(self, vector: object) -> list[float]:
-        """A world velocity [3] as the robot reports it, in the odometry frame."""
+        """Return a world velocity [3] as the robot reports it, m/s, in the odometry frame."""
         return self.rotate(vector)
 
     def yaw_speed(self, wz_radps: float) -> float:
-        """A yaw rate as the robot reports it."""
+        """Return a yaw rate as the robot reports it, rad/s."""
         return wz_radps
 
     def update(self, truth: RobotTruth) -> None:
-        """Called once before the messages of an instant are made; an exact odometry has nothing to do."""
+        """Advance to a new instant, before its messages are made; exact odometry does nothing."""
 
 
 def turned_quaternion(wxyz: list[float], yaw_rad: float) -> list[float]:
-    """An orientation turned by a yaw angle about the frame's z axis."""
+    """Rotate an orientation (w, x, y, z) by a yaw angle about the frame's z axis."""
     w, x, y, z = wxyz
     c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
     return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
 
 
 def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
-    """The IMU part of both messages."""
+    """Return the IMU part of both state messages."""
     return IMUState_(
         odometry.quaternion(truth.quaternion_wxyz),
         truth.gyro_radps.tolist(),
@@ -103,7 +103,7 @@ def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
 
 
 def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame, progress: float = 0.0) -> SportModeState_:
-    """`rt/sportmodestate`: position and velocity in the odometry frame, as the maker's MuJoCo simulator has them."""
+    """Return the message of `rt/sportmodestate`; position and velocity in the odometry frame, as in MuJoCo."""
     seconds = int(truth.time_s)
     return SportModeState_(
         stamp=TimeSpec_(seconds, int((truth.time_s - seconds) * 1e9)),
@@ -117,7 +117,7 @@ def sport_mode_state(truth: RobotTruth, odometry: OdometryFrame, progress: float
         body_height=truth.body_height_m,
         velocity=odometry.velocity(truth.velocity_world_mps),
         yaw_speed=odometry.yaw_speed(float(truth.gyro_radps[2])),
-        range_obstacle=[0.0] * 4,  # this robot has no range sensor; zero is what the maker's simulator sends
+        range_obstacle=[0.0] * 4,  # no range sensor; the maker's simulator sends zero
         foot_force=_foot_force(truth),
         foot_position_body=truth.foot_position_body_m.ravel().tolist(),
         foot_speed_body=truth.foot_velocity_body_mps.ravel().tolist(),
@@ -130,7 +130,7 @@ def _foot_force(truth: RobotTruth) -> list[int]:
 
 
 class LowStateMessage:
-    """One LowState, refilled for every step: building 20 motors anew 500 times a second would cost too much."""
+    """Reusable LowState message: creating 20 motor entries 500 times a second would cost too much."""
 
     def __init__(self) -> None:
         motors = [
@@ -172,7 +172,7 @@ class LowStateMessage:
         )
 
     def charge(self, reading: BatteryReading) -> None:
-        """Report this battery from the next message on; the current is below zero while it is being emptied."""
+        """Set the reported battery state; the current is negative while discharging."""
         message, battery = self.message, self.message.bms_state
         battery.soc = round(reading.soc_percent)
         battery.current = -round(1000 * reading.current_a)  # mA
@@ -180,19 +180,19 @@ class LowStateMessage:
         message.power_v, message.power_a = reading.voltage_v, reading.current_a
 
     def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
-        """The message for this instant, checksum included."""
+        """Fill and return the message for this instant, with checksum."""
         message = self.update(truth, odometry)
         message.crc = low_state_crc(message)
         return message
 
     def encode(self) -> bytes:
-        """The message as it goes over the wire, with a fresh checksum: what `serialize` makes of it, much faster."""
+        """Encode the message with a new checksum; same bytes as `serialize`, but much faster."""
         values = low_state_values(self.message)
         self.message.crc = crc_of_words(LOW_STATE_LAYOUT.pack(*values))
         return _CDR_LITTLE_ENDIAN + _LOW_STATE_CDR.pack(*values, self.message.crc)
 
     def update(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
-        """The message for this instant, without its checksum."""
+        """Fill and return the message for this instant, without checksum."""
         message = self.message
         message.imu_state = imu_state(truth, odometry)
         rows = zip(truth.joint_q_rad.tolist(), truth.joint_dq_radps.tolist(), truth.joint_tau_nm.tolist(), strict=True)
@@ -206,7 +206,7 @@ class LowStateMessage:
 
 
 class _Periodic:
-    """A writer that fires every `every` steps while somebody reads, looked up ten times a second."""
+    """Writer that sends every `every` steps while there is a reader; readers are checked 10 times a second."""
 
     def __init__(self, writer: DataWriter[Any], every: int, steps_per_s: int, *, always: bool) -> None:
         self._writer = writer
@@ -231,13 +231,13 @@ class _Periodic:
         self.sent += 1
 
     def write_encoded(self, data: bytes) -> None:
-        """What `DataWriter.write` does once it has serialized a message; data is a multiple of 4 bytes long."""
+        """Write serialized data, as `DataWriter.write` does; its length is a multiple of 4 bytes."""
         if ddspy_write(self._writer._ref, data) >= 0:
             self.sent += 1
 
 
 class StatePublishers:
-    """Publishes what is due at each physics step; all but the sport state is computed for a reader only."""
+    """Publisher of all state topics; everything but the sport state is computed only if there is a reader."""
 
     def __init__(
         self,
@@ -268,11 +268,11 @@ class StatePublishers:
         self._wireless = periodic(ids.REMOTE_TOPIC, WirelessController_, WIRELESS_HZ)
 
     def due(self, step: int) -> list[_Periodic]:
-        """Which topics want a sample after this physics step; hand the list to `publish`."""
+        """Return the topics that are due after this physics step, for `publish`."""
         return [topic for topic in (*self._sport, *self._low, self._wireless) if topic.due(step)]
 
     def publish(self, due: list[_Periodic], truth: RobotTruth, stamp_s: float, progress: float = 0.0) -> None:
-        """Write one instant to the topics that are due; `stamp_s` is the robot's own clock, `progress` of a show."""
+        """Write one instant to the due topics; `stamp_s`: robot's clock, s; `progress`: of a show, 0 or 1."""
         truth = replace(truth, time_s=stamp_s)
         sport = [topic for topic in due if topic in self._sport]
         if sport:
@@ -287,7 +287,7 @@ class StatePublishers:
             self._wireless.write(WirelessController_(remote.lx, remote.ly, remote.rx, remote.ry, remote.keys))
 
     def overdue(self) -> None:
-        """Write what faults have held back until now."""
+        """Write the messages that faults have delayed until now."""
         if self._faults is not None:
             for late in self._faults.due(time.monotonic_ns()):
                 self._sport[0].write(late)
@@ -318,5 +318,5 @@ class StatePublishers:
 
     @property
     def sport_states_sent(self) -> int:
-        """Samples written to `rt/sportmodestate`."""
+        """Number of samples written to `rt/sportmodestate`."""
         return self._sport[0].sent

@@ -1,6 +1,6 @@
-"""Faults of what the robot reports: wrong values in a message, and messages that are lost, late, doubled or swapped.
+"""Faults of the state messages: wrong values, and messages that are lost, late, duplicated or swapped.
 
-Pure: messages and `now_ns` in, messages out. A fault's effect is the first message that it touched or withheld.
+Pure: messages and `now_ns` in, messages out. A fault takes effect with the first message that it changes or withholds.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sim_hil.protocols.unitree.fault_commands import FaultCommand
 from sim_hil.robots.battery import CELLS, open_circuit_v
 
 _NAN: Final = math.nan
-# Taking effect with the next sport state; the others do at once.
+# Faults that take effect with the next sport state; the others take effect at once.
 _IN_A_STATE: Final = frozenset(
     {"odometry-jump", "odometry-freeze", "odometry-nan", "odometry-bias", "tip-over", "error-code", "wrong-mode",
      "state-reorder", "state-duplicate"}
@@ -23,7 +23,7 @@ _IN_A_STATE: Final = frozenset(
 
 
 def quaternion_of(roll_rad: float, pitch_rad: float, yaw_rad: float) -> list[float]:
-    """(w, x, y, z) of roll, pitch and yaw, applied in the order yaw, pitch, roll."""
+    """Return the quaternion (w, x, y, z) of roll, pitch and yaw, applied in the order yaw, pitch, roll."""
     cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
     cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
     cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -36,11 +36,11 @@ def quaternion_of(roll_rad: float, pitch_rad: float, yaw_rad: float) -> list[flo
 
 
 class StateFaults:
-    """The faults in force on the state topics, and when each took effect."""
+    """Active faults of the state topics, and the times at which they took effect."""
 
     def __init__(self, seed: int = 0) -> None:
         self._on: dict[str, FaultCommand] = {}
-        self._waiting: set[str] = set()  # switched on, not yet seen in a message
+        self._waiting: set[str] = set()  # switched on, but not yet applied to a message
         self._effects: list[tuple[str, int]] = []
         self._rng = np.random.default_rng(seed)
         self._jump = (0.0, 0.0, 0.0)
@@ -70,18 +70,18 @@ class StateFaults:
             self._effects.append((name, now_ns))
 
     def clear(self) -> None:
-        """Switch everything off; a jump that has happened stays."""
+        """Switch everything off; the offset of a past jump remains."""
         self._on.clear()
         self._waiting.clear()
         self._frozen = None
 
     def effects(self) -> list[tuple[str, int]]:
-        """(fault, ns) of what has taken effect since the last call."""
+        """Return (fault, time ns) of the faults that have taken effect since the last call."""
         effects, self._effects = self._effects, []
         return effects
 
     def deliver(self, message: object, now_ns: int) -> list[Any]:
-        """What goes out now in place of a fresh sport state; the message itself is altered."""
+        """Return the messages to send instead of a new sport state; modifies the message."""
         self._alter(message)
         out = self._delivered(message, now_ns)
         self._effects += [(name, now_ns) for name in self._waiting]
@@ -89,12 +89,12 @@ class StateFaults:
         return out
 
     def beside(self, message: object) -> list[Any]:
-        """What goes out now on a slower topic, between two states of the main one; the message itself is altered."""
+        """Return the messages to send on a slower topic; modifies the message."""
         self._alter(message)
         return [] if "state-silent" in self._on else [message]
 
     def due(self, now_ns: int) -> list[Any]:
-        """Sport states whose delay is over, and what was held back by a fault that is off again."""
+        """Return the sport states whose delay is over, and those withheld by a fault that is now off."""
         out = []
         if self._swapped is not None and "state-reorder" not in self._on:
             out.append(self._swapped)
@@ -104,7 +104,7 @@ class StateFaults:
         return out
 
     def alter_low(self, message: Any) -> bool:
-        """Alter a low state; False when it is not to be sent at all. The caller renews its checksum."""
+        """Modify a low state; return False if it must not be sent. The caller updates the checksum."""
         if "tip-over" in self._on:
             self._tip(message.imu_state)
         if "low-battery" in self._on:

@@ -1,4 +1,4 @@
-"""The video service `videohub`: answers GetImageSample with a JPEG rendered at that moment."""
+"""Video service `videohub`: answers GetImageSample with a newly rendered JPEG."""
 
 from __future__ import annotations
 

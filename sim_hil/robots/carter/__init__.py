@@ -1,1 +1,1 @@
-"""The simulated Carter: a wheeled base with its drive, sensors, odometry and battery."""
+"""Simulated Carter: a wheeled base with drive, sensors, odometry and battery."""

@@ -1,4 +1,4 @@
-"""The simulated Carter's battery: 36 V and 1033 Wh (NVIDIA's figures), drawn down by electronics and motors. Pure."""
+"""Battery of the simulated Carter: 36 V and 1033 Wh (NVIDIA), discharged by electronics and motors. Pure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MEAN_S: Final = 0.1  # of the reported current
 
 
 def load_w(left_nm: float, left_radps: float, right_nm: float, right_radps: float) -> float:
-    """What electronics and both motors draw, W; braking gives nothing back."""
+    """Return the power drawn by electronics and both motors, W; braking recovers no energy."""
     work_w = max(left_nm * left_radps, 0.0) + max(right_nm * right_radps, 0.0)
     return ELECTRONICS_W + work_w / MOTOR_EFFICIENCY
 
@@ -36,7 +36,7 @@ class CarterBattery:
         self._load_w = ELECTRONICS_W
 
     def draw(self, power_w: float, dt_s: float) -> None:
-        """Take `power_w` for `dt_s`; an empty battery stays empty."""
+        """Discharge by `power_w` for `dt_s`; an empty battery stays empty."""
         self._charge_c = max(self._charge_c - power_w * dt_s / self._open_v(), 0.0)
         self._used_j += power_w * dt_s
         self._used_s += dt_s
@@ -48,7 +48,7 @@ class CarterBattery:
         return CELLS * (CELL_EMPTY_V + self._charge_c / _CAPACITY_C * (CELL_FULL_V - CELL_EMPTY_V))
 
     def read(self) -> BatteryReading:
-        """The state now; the current is the mean one of the last whole MEAN_S."""
+        """Return the current state; the reported current is the mean over the last full MEAN_S."""
         open_v = self._open_v()
         current_a = self._load_w / open_v
         return BatteryReading(100.0 * self._charge_c / _CAPACITY_C, open_v - current_a * PACK_OHM, current_a)

@@ -1,4 +1,4 @@
-"""The Carter in PyBullet: two driven wheels and casters under physics; only wheel torques move it."""
+"""Carter in PyBullet: two driven wheels and casters; only wheel torques move it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Bumpers:
 
 @dataclass(frozen=True)
 class CarterTruth(BaseTruth):
-    """Ground truth plus what the base measures itself: left and right wheel's angle, speed and torque, odometry."""
+    """Ground truth plus the base's own measurements: angle, speed and torque of both wheels, odometry."""
 
     wheel_q_rad: tuple[float, float]
     wheel_dq_radps: tuple[float, float]
@@ -71,7 +71,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 def _rotate(quaternion_xyzw: Quaternion, v: Vec3) -> Vec3:
-    """A vector of the base frame in the world. Plain floats: this runs every step, and numpy is slow on three."""
+    """Transform a vector from the base frame to the world; plain floats, because numpy is slow for three numbers."""
     x, y, z, w = quaternion_xyzw
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return (
@@ -82,7 +82,7 @@ def _rotate(quaternion_xyzw: Quaternion, v: Vec3) -> Vec3:
 
 
 def _unrotate(quaternion_xyzw: Quaternion, v: Vec3) -> Vec3:
-    """A vector of the world in the base frame."""
+    """Transform a vector from the world to the base frame."""
     x, y, z, w = quaternion_xyzw
     return _rotate((-x, -y, -z, w), v)
 
@@ -106,7 +106,7 @@ def load_carter(
 
 
 def place_carter(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Put a loaded Carter into the pose of a render state."""
+    """Set a loaded Carter to the pose of a render state."""
     x, y, z, qx, qy, qz, qw = (float(value) for value in state[:7])
     ax, ay, az = _rotate((qx, qy, qz, qw), BODY_COM_M)
     pybullet.resetBasePositionAndOrientation(body, (x + ax, y + ay, z + az), (qx, qy, qz, qw), physicsClientId=client)
@@ -133,8 +133,8 @@ class Carter:
         calibration: WheelCalibration | None = None,
         soc: float = 1.0,
     ) -> None:
-        """`start`: x m, y m, heading rad; `ground_m`: height of the ground there; `calibration`: odometry's idea of
-        the wheels; `soc`: the battery's charge, 0 to 1.
+        """Load the robot. `start`: x m, y m, heading rad; `ground_m`: height of the ground there; `calibration`:
+        wheel dimensions assumed by odometry; `soc`: the battery's charge, 0 to 1.
         """
         self._client = client
         self._dt_s = dt_s
@@ -170,7 +170,7 @@ class Carter:
         if self._base is None:
             (x, y, z), quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
             (vx, vy, vz), angular = pybullet.getBaseVelocity(self.body, physicsClientId=self._client)
-            # PyBullet speaks of the centre of mass of the base.
+            # PyBullet's pose is that of the base's centre of mass.
             ax, ay, az = _rotate(quaternion, BODY_COM_M)
             wx, wy, wz = angular
             velocity = (vx - (wy * az - wz * ay), vy - (wz * ax - wx * az), vz - (wx * ay - wy * ax))
@@ -179,11 +179,11 @@ class Carter:
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity command would be obeyed now."""
+        """Whether the base would obey a velocity command now."""
         return self.controller.ready
 
     def drive(self) -> None:
-        """Set the wheels' torques for the step that follows."""
+        """Set the wheel torques for the next step."""
         self._torques = self.controller.step(*self._dq)
         pybullet.setJointMotorControlArray(
             self.body, self._wheels, pybullet.TORQUE_CONTROL, forces=self._torques, physicsClientId=self._client
@@ -213,7 +213,7 @@ class Carter:
                 self._bump(_unrotate(quaternion, contact[7]))
 
     def _bump(self, normal: Vec3) -> None:
-        """Note a push along `normal`, in the base frame; one from below is no bumper's business."""
+        """Register a push along `normal` in the base frame; pushes from below do not trigger a bumper."""
         x, y, z = normal
         if abs(z) > max(abs(x), abs(y)):
             return
@@ -237,32 +237,32 @@ class Carter:
         return 1 - 2 * (x * x + y * y)
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity, kept for 1 s; it cannot move sideways. Raises ValueError when a number is not finite."""
+        """Command a velocity, valid for 1 s; `vy` is ignored. Raises ValueError for a non-finite number."""
         self.controller.command(vx_mps, wz_radps)
 
     def stand(self) -> None:
-        """Power the drive; an emergency stop has to be released first."""
+        """Power the drive on; an emergency stop must be released first."""
         self.controller.powered = not self.controller.estop
 
     def rest(self) -> None:
-        """Brake and take the drive's power away: commands are ignored until `stand`."""
+        """Brake and power the drive off; commands are ignored until `stand`."""
         self.controller.powered = False
 
     def press_estop(self) -> None:
-        """Brake as hard as the drive may; in force until released, and then the drive is without power."""
+        """Brake at full torque until `release_estop`; afterwards the drive is off."""
         self.controller.estop = True
         self.controller.powered = False
 
     def release_estop(self) -> None:
-        """Let `stand` power the drive again."""
+        """Allow `stand` to power the drive again."""
         self.controller.estop = False
 
     def odometry(self) -> OdometrySample:
-        """What the wheels make of the way."""
+        """Current wheel odometry."""
         return self._odometry.sample(*self._dq)
 
     def truth(self, time_s: float) -> CarterTruth:
-        """Snapshot of now, stamped `time_s`."""
+        """Return the current ground truth, stamped `time_s`."""
         position, quaternion, velocity, angular = self._read_base()
         x, y, z, w = quaternion
         pitch = asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))

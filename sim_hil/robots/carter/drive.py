@@ -1,8 +1,7 @@
-"""The Carter's drive electronics: a velocity command in, the torque of two wheels out. Pure: no clock, no physics.
+"""Drive electronics of the Carter: a velocity command in, two wheel torques out. Pure: no clock, no physics.
 
-A reference velocity follows the command within limits of acceleration; a torque that suits the mass pushes the wheels
-towards it and a PI controller for each wheel corrects. The motors have a torque limit that falls off near their top
-speed. A command is obeyed for 1 s; without a fresh one the base brakes.
+A reference velocity follows the command within acceleration limits. A feed-forward torque and a PI controller per wheel
+track it. The motors' torque limit decreases near their top speed. A command is valid for 1 s; then the base brakes.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _TURN_INERTIA_KGM2: Final = 3.0
 
 @dataclass(frozen=True)
 class DriveLimits:
-    """What a command is clipped to, and how fast the reference may change; braking has a limit of its own."""
+    """Limits of commands and of the reference's acceleration; braking has its own limit."""
 
     v_max_mps: float = 1.5
     w_max_radps: float = 2.0
@@ -42,7 +41,7 @@ class DriveLimits:
 
 
 def _towards(now: float, target: float, up: float, down: float) -> float:
-    """`now` moved towards `target`: by at most `up` away from zero, by at most `down` towards it, never across it."""
+    """Move `now` towards `target`: at most `up` away from zero, at most `down` towards zero, never across it."""
     if now * target < 0 or abs(target) < abs(now):
         low = max(abs(now) - down, abs(target) if now * target > 0 else 0.0)
         return low if now > 0 else -low
@@ -51,7 +50,7 @@ def _towards(now: float, target: float, up: float, down: float) -> float:
 
 
 class DriveController:
-    """Two wheels' controller; `step` once a physics step."""
+    """Controller of both wheels; call `step` once per physics step."""
 
     def __init__(self, dt_s: float, limits: DriveLimits | None = None) -> None:
         """`dt_s`: time between two calls of `step`."""
@@ -67,7 +66,7 @@ class DriveController:
         self.saturated = False
 
     def command(self, v_mps: float, w_radps: float) -> None:
-        """Take a velocity, clipped to the limits; ignored while unpowered or stopped. Raises ValueError on NaN."""
+        """Command a velocity, clipped to the limits; ignored while unpowered or stopped. Raises ValueError on NaN."""
         if not (isfinite(v_mps) and isfinite(w_radps)):
             raise ValueError(f"drive: expected finite velocities, found {v_mps}, {w_radps}")
         if not self.ready:
@@ -78,7 +77,7 @@ class DriveController:
 
     @property
     def ready(self) -> bool:
-        """Whether a command would be obeyed."""
+        """Whether the drive would obey a command."""
         return self.powered and not self.estop
 
     @property
@@ -88,11 +87,11 @@ class DriveController:
 
     @property
     def reference(self) -> tuple[float, float]:
-        """Where the ramp is now, m/s and rad/s."""
+        """Current reference velocity, m/s and rad/s."""
         return self._v, self._w
 
     def step(self, left_radps: float, right_radps: float) -> tuple[float, float]:
-        """Torques of the left and the right wheel, N.m, from their measured speeds."""
+        """Return the torques of the left and the right wheel, N.m, for their measured speeds."""
         v_target, w_target = self.commanded
         if self._left_steps > 0:
             self._left_steps -= 1
@@ -124,7 +123,7 @@ class DriveController:
 
 
 def _within(torque_nm: float, speed_radps: float) -> float:
-    """What a motor delivers: braking at full torque, driving less and less above two thirds of its top speed."""
+    """Limit a motor's torque: full for braking, decreasing for driving above two thirds of its top speed."""
     share = min(1.0, max(0.0, 3.0 * (1.0 - abs(speed_radps) / NO_LOAD_RADPS)))
     driving = MAX_TORQUE_NM * share
     up = driving if speed_radps > 0 else MAX_TORQUE_NM

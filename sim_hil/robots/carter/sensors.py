@@ -1,4 +1,4 @@
-"""What the Carter's own sensors report, whatever the protocol: wheel odometry, IMU, battery, bumpers."""
+"""Sensors of the Carter, independent of the protocol: wheel odometry, IMU, battery, bumpers."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class _Robot(Protocol):
 
 
 class CarterSensors:
-    """Reads a robot; the same seed and the same calls give the same readings."""
+    """Sensors of one robot; the same seed and the same calls give the same readings."""
 
     def __init__(self, robot: _Robot, *, odometry_noise: str = "none", seed: int = 0) -> None:
-        """`odometry_noise`: a name of `LEVELS`, on top of what the wheels slip."""
+        """Create the sensors; `odometry_noise`: a name of `LEVELS`, in addition to the wheels' slip."""
         self._robot = robot
         self._noise = None if odometry_noise == "none" else OdometryNoise(LEVELS[odometry_noise], seed)
         self._rng = np.random.default_rng((seed, 0x1A0))
@@ -59,7 +59,7 @@ class CarterSensors:
         self._error = (0.0, 0.0)  # of the reported velocity, m/s and rad/s
 
     def read(self, time_s: float) -> Sensors:
-        """The reading at a time, s, that never goes back."""
+        """Return the reading at a time, s; times must not decrease."""
         truth = self._robot.truth(time_s)
         odometry, battery, bumpers = truth.odometry, truth.battery, truth.bumpers
         pose = self._drifted(odometry.T_odom_base, time_s)

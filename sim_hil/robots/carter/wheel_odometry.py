@@ -1,7 +1,6 @@
-"""Wheel odometry of a differential base: what its encoders and its idea of its own wheels make of the way. Pure.
+"""Wheel odometry of a differential base, from its encoders and its calibration of the wheels. Pure.
 
-It counts wheel turns, whether they moved the base or not: it slips with the tyres and drifts with whatever the base
-believes wrongly about its wheels. Nothing of the ground truth enters.
+It integrates wheel rotations, so it includes slip of the tyres and errors of the calibration. It uses no ground truth.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _TRACK_SIGMA: Final = 0.01
 
 @dataclass(frozen=True)
 class WheelCalibration:
-    """What the odometry believes about the wheels, m."""
+    """Assumed dimensions of the wheels, m."""
 
     left_radius_m: float = WHEEL_RADIUS_M
     right_radius_m: float = WHEEL_RADIUS_M
@@ -38,7 +37,7 @@ class WheelCalibration:
 
     @staticmethod
     def drawn(seed: int) -> WheelCalibration:
-        """A robot that was measured with ordinary care; the same seed gives the same robot."""
+        """Return a calibration with typical errors; deterministic per seed."""
         rng = np.random.default_rng((seed, 0x0D0))
         scale, mismatch, track = (float(value) for value in rng.standard_normal(3))
         radius = WHEEL_RADIUS_M * (1 + _SCALE_SIGMA * scale)
@@ -48,7 +47,7 @@ class WheelCalibration:
 
 @dataclass(frozen=True)
 class OdometrySample:
-    """`T_odom_base`, the body velocity that the wheels' speeds make, the way travelled, and the encoders' counts."""
+    """Odometry report: `T_odom_base`, body velocity from the wheel speeds, distance travelled, encoder counts."""
 
     T_odom_base: SE2
     v_mps: float
@@ -63,7 +62,7 @@ def _counts(angle_rad: float) -> int:
 
 
 class WheelOdometry:
-    """Integrates encoder counts from the origin on; `step` after every physics step."""
+    """Integrator of encoder counts, starting at the origin; call `step` after every physics step."""
 
     def __init__(self, calibration: WheelCalibration | None = None) -> None:
         calibration = calibration or WheelCalibration()
@@ -74,7 +73,7 @@ class WheelOdometry:
         self._x = self._y = self._theta = self._way = 0.0
 
     def step(self, left_rad: float, right_rad: float) -> None:
-        """Take the wheels' angles."""
+        """Add the wheels' angles."""
         left, right = _counts(left_rad), _counts(right_rad)
         left_m, right_m = (left - self._left) * self._left_m, (right - self._right) * self._right_m
         self._left, self._right = left, right
@@ -87,7 +86,7 @@ class WheelOdometry:
         self._way += abs(moved)
 
     def sample(self, left_radps: float, right_radps: float) -> OdometrySample:
-        """The report now; speeds come from the motors, because counts of one step are too coarse for them."""
+        """Return the report; speeds come from the motors, because the counts of one step are too coarse."""
         wheels = self._calibration
         left, right = left_radps * wheels.left_radius_m, right_radps * wheels.right_radius_m
         pose = SE2(self._x, self._y, self._theta)

@@ -1,1 +1,1 @@
-"""The simulated Go2: body, legs, gait and sport controller."""
+"""Simulated Go2: body, legs, gait and sport controller."""

@@ -1,4 +1,4 @@
-"""The Go2 in PyBullet: loads the body, reads it, applies torques; the behaviour is in sim_hil/robots/go2/sport.py."""
+"""Go2 in PyBullet: loads the body, reads its state, applies torques; sim_hil/robots/go2/sport.py has the behaviour."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Go2:
         states = pybullet.getJointStates(self.body, self._joints, physicsClientId=client)
         self._q = tuple([state[0] for state in states])
         self._dq = tuple([state[1] for state in states])
-        # PyBullet speaks of the base's centre of mass; everybody else means the base frame between the hips.
+        # PyBullet's pose is that of the base's centre of mass; here the base frame lies between the hips.
         com, self._quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=client)
         velocity, self._angular = pybullet.getBaseVelocity(self.body, physicsClientId=client)
         x, y, z, w = self._quaternion
@@ -152,7 +152,7 @@ class Go2:
         return (vx + wy * az - wz * ay, vy + wz * ax - wx * az, vz + wx * ay - wy * ax)
 
     def measured(self) -> Measured:
-        """What the controller sees: joints, attitude, and velocities in the level frame along the heading."""
+        """Inputs of the controller: joints, attitude, and velocities in the level frame along the heading."""
         if self._measured is not None:
             return self._measured
         fx, fy, fz = self._forward
@@ -182,7 +182,7 @@ class Go2:
         return self._torques
 
     def drive(self) -> None:
-        """Let the sport controller set this step's torques."""
+        """Apply the sport controller's torques for this step."""
         sport = self.sport
         self._torques = forces = sport.step(self.measured())
         if sport.trotting != self._trotting:
@@ -209,7 +209,7 @@ class Go2:
         )
 
     def observe(self) -> None:
-        """Read the body after the step; accelerometer: how the velocity of its place changes, low-passed at 40 Hz."""
+        """Read the body after the step; accelerometer: change of velocity, low-pass filtered at 40 Hz."""
         self._read()
         vx, vy, vz = velocity = self._imu_velocity()
         was_x, was_y, was_z = self._last_imu_velocity
@@ -241,17 +241,17 @@ class Go2:
         return self._upward[2]
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity of the body frame, kept for 1 s; without effect unless `ready`."""
+        """Command a velocity in the body frame, valid for 1 s; ignored unless `ready`."""
         self.sport.request_move(vx_mps, vy_mps, wz_radps)
 
     def stand(self) -> None:
-        """Get up and balance, turning over first where it must (about 2 s from lying); may be repeated."""
+        """Stand up and balance, turning over first if necessary (about 2 s from lying); may be repeated."""
         if self.sport.request(SportAction.BALANCE_STAND) != 0:
             self.sport.request(SportAction.RECOVERY_STAND)
 
     @property
     def ready(self) -> bool:
-        """Whether it stands balanced, so that a velocity would be obeyed."""
+        """Whether the robot stands balanced and would obey a velocity."""
         return self.sport.ready
 
     def render_state(self) -> tuple[float, ...]:
@@ -259,7 +259,7 @@ class Go2:
         return (*self._position, *self._quaternion, *self._q)
 
     def truth(self, time_s: float) -> RobotTruth:
-        """Snapshot of everything the robot's services report."""
+        """Return the ground truth that the robot's services report."""
         measured = self.measured()
         forces = [0.0] * 4
         for contact in pybullet.getContactPoints(bodyA=self.body, physicsClientId=self._client):
@@ -290,7 +290,7 @@ class Go2:
 
 
 def place_go2(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Put a loaded Go2 into the pose of a render state (base frame, not centre of mass; then the joints)."""
+    """Set a loaded Go2 to the pose of a render state (base frame, not centre of mass; then the joints)."""
     position, quaternion = tuple(float(v) for v in state[:3]), tuple(float(v) for v in state[3:7])
     arm = rotation_matrix(quaternion) @ BASE_COM_M
     centre = [position[axis] + float(arm[axis]) for axis in range(3)]

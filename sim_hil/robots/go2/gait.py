@@ -1,4 +1,4 @@
-"""The trot: phase, commanded and measured motion -> foot targets; pure, one call per control step.
+"""Trot: foot targets from phase, commanded and measured motion; pure, one call per control step.
 
 Diagonal pairs swing in turn. A stance foot is carried backwards under the body at the wanted velocity; a swing foot
 lands where the body will be half a stance later (Raibert, "Legged Robots That Balance", 1986: foot placement at
@@ -87,7 +87,7 @@ class GaitConfig:
 
 
 class BodyMotion(NamedTuple):
-    """What the gait knows of the body: attitude, rates and velocity in the level frame that turns with the heading."""
+    """Measured motion of the body: attitude, rates and velocity in the level frame that turns with the heading."""
 
     yaw_rad: float
     roll_rad: float
@@ -100,7 +100,7 @@ class BodyMotion(NamedTuple):
 
 
 class GaitState(NamedTuple):
-    """Everything the gait remembers between steps."""
+    """State of the gait between steps."""
 
     walking: bool
     phase: float

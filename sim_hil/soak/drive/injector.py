@@ -1,4 +1,4 @@
-"""Makes the scheduled faults happen in a running stack, one at a time, and writes down what was asked and when."""
+"""Injector of the scheduled faults into a running stack, one at a time, with a record of each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CLEAR_S = 2.0
 
 
 class Injector:
-    """`step` often; `note` takes events."""
+    """Injector of scheduled faults; call `step` often. `note` records events."""
 
     def __init__(self, stack: Stack, schedule: FaultSchedule, note: Callable[..., None]) -> None:
         self._stack = stack
@@ -26,16 +26,16 @@ class Injector:
         self._end_ns: int | None = None
         self._number = 0
         self.newest: Injection | None = None
-        """What was injected last, and `newest_ns`, until when it was in force."""
+        """The last injection; `newest_ns` is the time until which it was active."""
         self.newest_ns = 0
 
     @property
     def active(self) -> str | None:
-        """Name of the fault in force."""
+        """Name of the active fault; None if there is none."""
         return self._next.fault.name if self._end_ns is not None else None
 
     def step(self, now_ns: int) -> None:
-        """Switch on and off what is due; only while the robot is driven. Raises FaultError when nobody listens."""
+        """Switch faults on and off when due; call only while the robot is driven. Raises FaultError on a failure."""
         for answer in self._stack.faults.answers() if self._stack.faults is not None else ():
             self._take(answer)
         if self._end_ns is not None:
@@ -48,12 +48,12 @@ class Injector:
             self._on(now_ns)
 
     def clear(self) -> None:
-        """The runner has ended: everything off, and the next gap begins when the robot is driven again."""
+        """Switch everything off after the end of a runner; the next gap begins when the robot is driven again."""
         if self._end_ns is not None:
-            self._off(time.monotonic_ns(), tell=False)
+            self._off(time.monotonic_ns(), send=False)
         self._due_ns = None
         if self._stack.faults is not None:
-            with suppress(FaultError):  # the robot's side has gone: that is found elsewhere
+            with suppress(FaultError):  # the robot's side has ended, which the leg detects itself
                 self._stack.faults.inject("clear", timeout_s=CLEAR_S)
 
     def _on(self, now_ns: int) -> None:
@@ -71,16 +71,16 @@ class Injector:
         if child is not None and child.running:
             child.process.send_signal(fault.signal())
 
-    def _off(self, now_ns: int, *, tell: bool = True) -> None:
+    def _off(self, now_ns: int, *, send: bool = True) -> None:
         fault = self._next.fault
         self._note("fault_off", number=self._number, name=fault.name)
-        if tell and not fault.once:
+        if send and not fault.once:
             assert self._stack.faults is not None
             self._stack.faults.ask(fault.inject, on=False)
         self._next, self._end_ns, self._due_ns = self._schedule.next(), None, None
 
     def _take(self, answer: dict[str, Any]) -> None:
         if "error" in answer:
-            raise FaultError(f"the robot's side has refused a fault: {answer['error']}")
+            raise FaultError(f"the robot's side refused a fault: {answer['error']}")
         if answer.get("on"):
             self._note("fault_effect", number=self._number, name=answer["fault"], effect_ns=answer["effect_ns"])

@@ -1,4 +1,4 @@
-"""The tasks of a soak: from wherever the robot is to a landmark of the scene, told in words. Seeded."""
+"""Tasks of a soak: from the robot's current pose to a landmark of the scene, with an instruction. Seeded."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from sim_hil.scene.scene import Scene, SceneObject, Vec2, Vec3
 THRESHOLD_M: Final = 1.5  # paper, equation 6
 LENGTH_M: Final = (4.0, 40.0)
 LONGEST_S: Final = 60.0
-"""At full speed: a slow robot gets shorter ways, or it would be on a single one for a whole leg."""
+"""Longest task at full speed, s: a slow robot gets shorter routes, so that a leg contains several tasks."""
 TRIES: Final = 24
-_SLOW: Final = 0.6  # of the speed limit: a robot among people does not drive at it all the time
+_SLOW: Final = 0.6  # mean speed among people as a share of the speed limit
 
 
 @dataclass(frozen=True)
 class SoakTask:
-    """Go to `goal_xy` (m) as told; `shortest_m` is the shortest feasible path from `start` (x m, y m, heading rad)."""
+    """Task to drive from `start` (x m, y m, heading rad) to `goal_xy` (m); `shortest_m`: shortest feasible path."""
 
     number: int
     instruction: str
@@ -37,12 +37,12 @@ class SoakTask:
     timeout_s: float
 
     def as_json(self) -> dict[str, Any]:
-        """For the events."""
+        """Return the task as JSON values for the event log."""
         return dict(self.__dict__)
 
 
 class Journey:
-    """Draws task after task in one scene. Raises ValueError for a scene without room or landmarks."""
+    """Random sequence of tasks in one scene. Raises ValueError for a scene without free space or landmarks."""
 
     def __init__(self, scene: Scene, seed: int, leg: int, speed_mps: float) -> None:
         self.scene = scene
@@ -53,7 +53,7 @@ class Journey:
         self._count = 0
 
     def begin(self) -> Vec3:
-        """A pose to begin a leg at, from which there is a task. Raises ValueError."""
+        """Return a start pose for a leg from which a task exists. Raises ValueError."""
         for _ in range(TRIES):
             try:
                 return sample_task(self.scene, self._grid, self._rng, length_m=self._length_m).start
@@ -62,9 +62,9 @@ class Journey:
         raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
 
     def next(self, at: Vec3) -> SoakTask | None:
-        """A task from here; None where there is no way to any landmark.
+        """Return a task from pose `at`; None if no landmark can be reached.
 
-        Where no way can be told unmistakably (a robot in a corner), a plain "Go to the ..." takes its place.
+        If no route can be described unambiguously (such as from a corner), the instruction is a plain "Go to the ...".
         """
         things = goals(self.scene)
         order = [things[int(index)] for index in self._rng.permutation(len(things))]

@@ -1,4 +1,4 @@
-"""A file of JSON lines that is whole up to its last line whatever ends the process: each one is flushed."""
+"""File of JSON lines that stays complete if the process is killed: every line is flushed."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 
 class LineFile:
-    """Appends objects to a file; raises OSError."""
+    """Writer that appends JSON objects to a file. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("a", encoding="utf-8")
 
     def add(self, content: dict[str, Any]) -> None:
-        """Append one."""
+        """Append one object."""
         self._file.write(json.dumps(content) + "\n")
         self._file.flush()
 

@@ -1,7 +1,7 @@
-"""One leg of a soak: one stack in one scene, tasks one after the other without a restart, faults, a sample a second.
+"""One leg of a soak: one stack in one scene, consecutive tasks without a restart, faults, and a sample every second.
 
-A runner that ends (a stop for good, a killed process) is counted and started again with its bridge; a robot that got
-stuck ends the leg. Everything that happens goes to the leg's folder at once, so that a killed soak loses nothing.
+A runner that ends (permanent stop or killed process) is counted and restarted with its bridge. A stuck robot ends the
+leg. All events are written to the leg's folder at once, so that a killed soak loses nothing.
 """
 
 from __future__ import annotations
@@ -28,25 +28,26 @@ from sim_hil.soak.drive.task_run import TaskRun
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
 ARM_TIMEOUT_S: Final = 90.0
-TELL_AGAIN_NS: Final = 1_000_000_000
+RETRY_NS: Final = 1_000_000_000
+"""Pause before an instruction is sent again."""
 FAULT_AFTER_NS: Final = 3_000_000_000
-"""A stop so soon after a fault's end, or after a contact, is put down to it."""
+"""A stop within this time after a fault's end or a contact is attributed to it."""
 STUCK_LIVES: Final = 3
-"""So many runners in a row that have ended within STUCK_M of each other: the robot does not get away."""
+"""Number of consecutive runners that end within STUCK_M of each other for the robot to count as stuck."""
 STUCK_M: Final = 0.5
 CONTACT: Final = "contact"
 CONTACT_STOPS: Final = frozenset(("odometry-stays-frozen", "odometry-speed-mismatch", "tipped-over"))
-"""What a robot that has walked into something is stopped for."""
+"""Faults that stop a robot after a contact."""
 SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
 
 
 class _StoppedError(Exception):
-    """Somebody asked for the end."""
+    """The user requested the end."""
 
 
 @dataclass(frozen=True)
 class LegOptions:
-    """What a leg is: its number from 1 on, its stack and how long it drives."""
+    """Options of a leg: its number from 1, its stack and its duration."""
 
     number: int
     seed: int
@@ -56,7 +57,7 @@ class LegOptions:
 
 
 class Leg:
-    """Runs one leg; `tell` gets a line about what is going on, a few times a second."""
+    """One leg; `show_status` gets a status line every second."""
 
     def __init__(
         self,
@@ -65,14 +66,14 @@ class Leg:
         menu: FaultMenu | None,
         *,
         stopped: Callable[[], bool],
-        tell: Callable[[str], None],
+        show_status: Callable[[str], None],
         commands: Mapping[str, Sequence[str]] = COMMANDS,
     ) -> None:
         self._options = options
         self._journey = journey
         self._menu = menu
         self._stopped = stopped
-        self._tell = tell
+        self._show_status = show_status
         self._stack = Stack(options.stack, commands)
         self._truth = TruthTail(self._stack.trace)
         self._sampler = ProcessSampler()
@@ -87,7 +88,10 @@ class Leg:
         self.tasks = self.reached = self.stops = 0
 
     def run(self) -> str:
-        """Run it and return why it ended: duration, stopped, stuck, no-task. Raises StepError, OSError, FaultError."""
+        """Run the leg; return why it ended: duration, stopped, stuck, no-task.
+
+        Raises StepError, OSError or FaultError.
+        """
         folder = self._options.stack.folder
         stack = asdict(self._options.stack)
         about = {
@@ -147,14 +151,14 @@ class Leg:
             self._note("armed", run=self._stack.runs)
 
     def _drive(self) -> str | None:
-        """Until the runner or the bridge ends (None) or the leg does (why)."""
+        """Drive until the runner or the bridge ends (returns None) or the leg ends (returns why)."""
         runner, bridge = self._stack.runner, self._stack.bridge
         assert runner is not None and bridge is not None
-        untold: SoakTask | None = None
-        tell_ns = 0
+        pending: SoakTask | None = None
+        send_ns = 0
         while runner.running and bridge.running:
             self._wait()
-            end = self._look()
+            end = self._read_truth()
             now_ns = time.monotonic_ns()
             if self._injector is not None:
                 self._injector.step(now_ns)
@@ -162,35 +166,35 @@ class Leg:
                 return "duration"
             if end is not None:
                 self._end_task(end)
-                untold, tell_ns = self._next_task(), now_ns
-                if untold is None:
+                pending, send_ns = self._next_task(), now_ns
+                if pending is None:
                     return "no-task"
-            if untold is not None and now_ns >= tell_ns:
-                if self._hand_over(untold):
-                    self._begin_task(untold)
-                    untold = None
-                tell_ns = time.monotonic_ns() + TELL_AGAIN_NS  # one that is too busy to answer drives on
+            if pending is not None and now_ns >= send_ns:
+                if self._send_instruction(pending):
+                    self._begin_task(pending)
+                    pending = None
+                send_ns = time.monotonic_ns() + RETRY_NS  # a runner too busy to answer keeps driving
             time.sleep(POLL_S)
         return None
 
-    def _hand_over(self, task: SoakTask) -> bool:
+    def _send_instruction(self, task: SoakTask) -> bool:
         try:
             say(self._stack.instructions, task.instruction)
         except (SayError, OSError) as error:
-            # If it is ending: what it ended by is found by whoever looks at its process.
+            # If the runner is ending, the check of its process finds out why.
             self._note("not_told", why=str(error))
             return False
         return True
 
     def _life_over(self) -> bool:
-        """Count a runner that has ended by itself; True when the robot has got stuck."""
-        self._look()
+        """Record a runner that ended by itself; return whether the robot is stuck."""
+        self._read_truth()
         explained = self._explanation()
         during = None if self._injector is None else self._injector.active
         self._end_task("stopped")
         bridge = self._stack.bridge
         bridge_died = bridge is not None and not bridge.running
-        code = self._stack.end_runner()  # it may take a moment longer when its bridge was killed
+        code = self._stack.end_runner()  # takes a little longer if the bridge was killed
         self._stack.end_bridge()
         cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
         if explained == CONTACT and not raised & CONTACT_STOPS:
@@ -208,7 +212,7 @@ class Leg:
         return len(last) == STUCK_LIVES and all(hypot(x - last[-1][0], y - last[-1][1]) < STUCK_M for x, y in last)
 
     def _explanation(self) -> str:
-        """What a stop is put down to: a fault that should end the run, a contact, or nothing ("")."""
+        """Return the cause of a stop: a fault that should end the run, a contact, or "" if unexplained."""
         now_ns, injector = time.monotonic_ns(), self._injector
         newest = None if injector is None else injector.newest
         stops = newest is not None and newest.fault.expect == "stop"
@@ -218,10 +222,10 @@ class Leg:
 
     def _next_task(self) -> SoakTask | None:
         while self._truth.newest is None:
-            self._look()
+            self._read_truth()
             self._wait()
             time.sleep(POLL_S)
-        self._look()
+        self._read_truth()
         pose = self._truth.newest
         return self._journey.next((pose.x_m, pose.y_m, pose.theta_rad))
 
@@ -239,8 +243,8 @@ class Leg:
             self.tasks += 1
             self.reached += outcome.success
 
-    def _look(self) -> str | None:
-        """Take the new ground truth; why the task is over, if it is."""
+    def _read_truth(self) -> str | None:
+        """Read the new ground truth; return why the task is over, None if it is not."""
         end: str | None = None
         for pose in self._truth.update():
             if pose.touching:
@@ -250,19 +254,20 @@ class Leg:
         return end
 
     def _wait(self) -> None:
-        """One turn of any wait: an end that was asked for, the health of the robot's side, a sample when it is due."""
+        """Check for a requested end and for the health of the robot's side, and take a sample when due."""
         if self._stopped():
             raise _StoppedError
         robot = self._stack.robot
         if robot is not None and not robot.running:
-            raise StepError(f"the robot's side has ended with exit code {robot.process.returncode}, see {robot.log}")
+            raise StepError(f"the robot's side ended with exit code {robot.process.returncode}, see {robot.log}")
         now_ns = time.monotonic_ns()
         if now_ns - self._sampled_ns >= SAMPLE_NS:
             self._sampled_ns = max(self._sampled_ns + SAMPLE_NS, now_ns - SAMPLE_NS // 2)
             self._sample(now_ns)
 
     def _sample(self, now_ns: int) -> None:
-        self._look_for_sample()
+        if self._task is None:  # otherwise _drive reads the ground truth
+            self._read_truth()
         pose = self._truth.newest
         sample: dict[str, Any] = {
             "t_ns": now_ns,
@@ -275,28 +280,23 @@ class Leg:
             "processes": self._sampler.sample(self._stack.processes()),
         }
         self._samples.add(sample)
-        self._tell(
+        self._show_status(
             f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
             f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
             + (f" · {sample['fault']}" if sample["fault"] else "")
         )
 
     def _left_s(self, now_ns: int) -> float:
-        """A leg's time begins when its first runner drives: how long that takes is the machine's affair."""
+        """Return the remaining time, s; a leg's time begins when its first runner drives."""
         begun_ns = now_ns if self._driven_ns is None else self._driven_ns
         return self._options.duration_s - (now_ns - begun_ns) / 1e9
-
-    def _look_for_sample(self) -> None:
-        """While nothing is driven nobody else looks at the ground truth."""
-        if self._task is None:
-            self._look()
 
     def _note(self, kind: str, **fields: Any) -> None:
         self._events.add({"t_ns": time.monotonic_ns(), "kind": kind, **fields})
 
 
 def _end_of_run(result: Path) -> tuple[str, set[str]]:
-    """What the runner itself says it ended by, and all faults that it has raised; nothing when it was killed."""
+    """Return the runner's own reason for its end and all faults that it raised; empty if it was killed."""
     try:
         content = json.loads(result.read_text(encoding="utf-8"))
         faults, raised = content["faults"], set(content["control"]["faults"])

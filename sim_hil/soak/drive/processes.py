@@ -1,4 +1,4 @@
-"""What the processes of a stack take from the machine: CPU, memory, descriptors, threads; read once a second."""
+"""Resource use of a stack's processes: CPU, memory, descriptors, threads; sampled once a second."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any, Final
 import psutil
 
 PSS_EVERY: Final = 10
-"""The kernel adds up a process's share of shared pages one by one: milliseconds, so only every tenth time."""
+"""Samples between two readings of PSS, which takes milliseconds because the kernel sums it page by page."""
 
 
 class ProcessSampler:
-    """Samples processes by name; one that has gone is left out."""
+    """Sampler of processes by name; ended processes are left out."""
 
     def __init__(self) -> None:
         self._known: dict[int, psutil.Process] = {}
         self._count = 0
 
     def sample(self, pids: Mapping[str, int]) -> dict[str, dict[str, Any]]:
-        """{name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, and now and then pss_bytes}."""
+        """Return by name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, sometimes pss_bytes."""
         self._count += 1
         found: dict[str, dict[str, Any]] = {}
         for name, pid in pids.items():
@@ -33,7 +33,7 @@ class ProcessSampler:
         process = self._known.get(pid)
         if process is None:
             process = self._known[pid] = psutil.Process(pid)
-            process.cpu_percent()  # the first one has nothing to compare with
+            process.cpu_percent()  # the first call only sets the reference
         with process.oneshot():
             values: dict[str, Any] = {
                 "pid": pid,

@@ -30,12 +30,12 @@ FORMAT: Final = 1
 
 
 class SoakInputError(ValueError):
-    """A file or an argument that a soak cannot use; one line: what, expected, found."""
+    """An invalid file or argument of a soak; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
 class SoakFault:
-    """One kind of fault; `inject` and `expect` as the default file says, `for_s` the range of its length, s."""
+    """One kind of fault; `inject` and `expect` as in the default file, `for_s`: range of its duration, s."""
 
     name: str
     inject: str
@@ -50,7 +50,7 @@ class SoakFault:
         low, high = self.for_s
         if not self.name or not 0 < low <= high <= LONGEST_S:
             raise SoakInputError(
-                f"{what}: expected for_s of two rising seconds up to {LONGEST_S:g}, found {self.for_s}"
+                f"{what}: expected for_s of two ascending times up to {LONGEST_S:g} s, found {self.for_s}"
             )
         if not 0 < self.weight < math.inf:
             raise SoakInputError(f"{what}: expected a weight above 0, found {self.weight}")
@@ -74,7 +74,7 @@ class SoakFault:
 
     @property
     def process(self) -> tuple[str, str] | None:
-        """(process, signal) of a fault that ends one; None for one of the robot's side."""
+        """(process, signal) of a fault that ends a process; None for a fault of the robot's side."""
         kind, _, rest = self.inject.partition(":")
         if kind != "process":
             return None
@@ -83,18 +83,18 @@ class SoakFault:
 
     @property
     def once(self) -> bool:
-        """Whether there is nothing to switch off."""
+        """Whether the fault need not be switched off."""
         return self.process is not None or KINDS[self.inject].once
 
     def signal(self) -> signal.Signals:
-        """The signal of one that ends a process."""
+        """Return the signal of a fault that ends a process."""
         assert self.process is not None
         return signal.Signals[self.process[1]]
 
 
 @dataclass(frozen=True)
 class FaultMenu:
-    """What may happen, and the range of the time between two, s."""
+    """The faults that may occur, and the range of the gap between two, s."""
 
     gap_s: tuple[float, float]
     faults: tuple[SoakFault, ...]
@@ -102,15 +102,15 @@ class FaultMenu:
     def __post_init__(self) -> None:
         low, high = self.gap_s
         if not 0 < low <= high <= 3600.0:
-            raise SoakInputError(f"gap_s: expected two rising seconds of more than 0, found {self.gap_s}")
+            raise SoakInputError(f"gap_s: expected two ascending times above 0 s, found {self.gap_s}")
         names = [fault.name for fault in self.faults]
         if not names or len(set(names)) != len(names):
-            raise SoakInputError("faults: expected one or more, each with a name of its own")
+            raise SoakInputError("faults: expected one or more, with different names")
 
 
 @dataclass(frozen=True)
 class Injection:
-    """A fault that comes `gap_s` after the end of the one before and lasts `for_s`."""
+    """A fault that begins `gap_s` after the end of the previous one and lasts `for_s`."""
 
     fault: SoakFault
     gap_s: float
@@ -118,7 +118,7 @@ class Injection:
 
 
 class FaultSchedule:
-    """An endless sequence of injections, one after the other; the same seed and leg give the same sequence."""
+    """Endless random sequence of injections; the same seed and leg give the same sequence."""
 
     def __init__(self, menu: FaultMenu, seed: int, leg: int) -> None:
         self._menu = menu
@@ -127,17 +127,17 @@ class FaultSchedule:
         self._shares = weights / weights.sum()
 
     def next(self) -> Injection:
-        """The injection after the one before."""
+        """Return the next injection."""
         gap_s = float(self._rng.uniform(*self._menu.gap_s))
         fault = self._menu.faults[int(self._rng.choice(len(self._shares), p=self._shares))]
         return Injection(fault, gap_s, float(self._rng.uniform(*fault.for_s)))
 
 
 def load_menu(path: Path) -> FaultMenu:
-    """A menu from a TOML file; raises SoakInputError."""
+    """Read a menu from a TOML file. Raises SoakInputError."""
     table = read_toml(path)
     try:
-        known(table, {"format", "gap_s", "faults"}, "the file")
+        check_keys(table, {"format", "gap_s", "faults"}, "the file")
         if table["format"] != FORMAT:
             raise SoakInputError(f"format: expected {FORMAT}, found {table['format']!r}")
         faults = [_fault(item) for item in table["faults"]]
@@ -149,7 +149,7 @@ def load_menu(path: Path) -> FaultMenu:
 
 
 def _fault(item: dict[str, Any]) -> SoakFault:
-    known(item, {"name", "inject", "for_s", "weight", "fault", "expect", "values"}, f"fault {item.get('name')!r}")
+    check_keys(item, {"name", "inject", "for_s", "weight", "fault", "expect", "values"}, f"fault {item.get('name')!r}")
     return SoakFault(**{**item, "for_s": _range(item["for_s"])})
 
 
@@ -158,15 +158,15 @@ def _range(value: Any) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def known(table: Mapping[str, object], keys: set[str], what: str) -> None:
-    """Raises SoakInputError for a key that nobody reads."""
-    strange = sorted(set(table) - keys)
-    if strange:
-        raise SoakInputError(f"{what}: unknown key {strange[0]!r}, expected {', '.join(sorted(keys))}")
+def check_keys(table: Mapping[str, object], keys: set[str], what: str) -> None:
+    """Check that a table has no unknown keys. Raises SoakInputError."""
+    unknown = sorted(set(table) - keys)
+    if unknown:
+        raise SoakInputError(f"{what}: unknown key {unknown[0]!r}, expected {', '.join(sorted(keys))}")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file; raises SoakInputError."""
+    """Read a TOML file. Raises SoakInputError."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -1,4 +1,4 @@
-"""One task while it is driven: distance, contacts and the end, by ground truth. Pure: poses in, outcome out."""
+"""Progress of one task by ground truth: distance, contacts and the end. Pure: poses in, outcome out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim_hil.soak.drive.journey import THRESHOLD_M, SoakTask
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """How a task ended: reached, timeout, stopped (the runner ended) or cut (the leg did). `spl` in percent."""
+    """Outcome of a task; `end`: reached, timeout, stopped (runner ended) or cut (leg ended); `spl` in percent."""
 
     number: int
     end: str
@@ -28,12 +28,12 @@ class TaskOutcome:
     instruction: str
 
     def as_json(self) -> dict[str, Any]:
-        """For the events."""
+        """Return the outcome as JSON values for the event log."""
         return {**self.__dict__, "collisions": list(self.collisions)}
 
 
 class TaskRun:
-    """Follows the poses of one task from `started_ns` on."""
+    """Tracker of one task's poses from `started_ns` on."""
 
     def __init__(self, task: SoakTask, started_ns: int) -> None:
         self.task = task
@@ -44,7 +44,7 @@ class TaskRun:
         self._touched: set[str] = set()
 
     def add(self, pose: TruePose) -> str | None:
-        """Take a pose; "reached" or "timeout" when the task is over with it."""
+        """Add a pose; return "reached" or "timeout" if it ends the task, else None."""
         if pose.t_ns < self.started_ns:
             return None
         if self._last is not None:
@@ -57,7 +57,7 @@ class TaskRun:
         return "timeout" if (pose.t_ns - self.started_ns) / 1e9 >= self.task.timeout_s else None
 
     def outcome(self, end: str) -> TaskOutcome:
-        """Its figures so far."""
+        """Return the outcome with the numbers so far."""
         reached = end == "reached"
         last_ns = self.started_ns if self._last is None else self._last.t_ns
         return TaskOutcome(

@@ -1,1 +1,1 @@
-"""What a soak has measured, and whether it stays within its budget."""
+"""Measures of a soak, and their judgement against a budget."""

@@ -1,7 +1,7 @@
-"""What a leg's files say: timing and power of each runner from its flight log, the wire and the truth from the trace.
+"""Analysis of a leg's files: timing and power from the flight logs, commands and ground truth from the trace.
 
-All stamps are monotonic ns of one machine, so that the runner's ticks and the simulated robot's truth share one axis.
-Works on the files of a leg that was killed as well: what is cut off is left out.
+All stamps are monotonic ns of one machine, so the runner's ticks and the ground truth share one time axis. The analysis
+also works for a killed leg; incomplete lines are ignored.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ Array = NDArray[np.float64]
 ANALYSIS: Final = "analysis.json"
 TRACE: Final = "trace.jsonl"
 SEGMENT_S: Final = 10.0
-"""Drift is compared over so much time, in which the robot must have moved by SEGMENT_M."""
+"""Duration of a drift segment, s; the robot must have moved by SEGMENT_M in it."""
 SEGMENT_M: Final = 0.5
 ODOMETRY_HZ: Final = 2.0
-"""Of the flight log's odometry, as much is kept."""
+"""Rate at which the flight log's odometry is kept, Hz."""
 _WIRE_GAP_NS: Final = 500_000_000
-"""Commands further apart than this are not of one run of the bridge: nothing was to be sent between them."""
+"""Largest gap between two commands of one run of the bridge; across a longer gap the bridge was not armed."""
 _REPEAT_NS: Final = 20_000_000
 
 
 @dataclass
 class LifeData:
-    """One runner: what it logged, as plain numbers."""
+    """Numbers from the flight log of one runner process."""
 
     run: int
     ticks: int = 0
@@ -59,7 +59,7 @@ class LifeData:
 
 
 def read_life(path: Path, result: Path, run: int) -> LifeData | None:
-    """One runner's numbers; None when it never drove (no log)."""
+    """Read one runner's flight log and result; None if it never drove (no log)."""
     life = LifeData(run)
     period_ns, deadline_ns, kept_ns = 100_000_000, None, 0
     try:
@@ -96,7 +96,7 @@ def read_life(path: Path, result: Path, run: int) -> LifeData | None:
         life.delay_error_ms_max = content["delay_error_ms"]["max"]
         life.dropped = sum(content.get("recorder", {}).get("dropped", {}).values())
     except (OSError, ValueError, KeyError, AttributeError):
-        pass  # it was killed: its result was never written
+        pass  # the runner was killed before it wrote a result
     return life
 
 
@@ -106,7 +106,7 @@ def _rounded(value: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class TraceData:
-    """Ground truth of a leg: pose_ns [n], pose [n, 3] (m, m, rad), and the gaps between the bridge's commands, ms."""
+    """Ground truth of a leg: pose_ns [n], pose [n, 3] (m, m, rad); gaps between the bridge's commands, ms."""
 
     pose_ns: NDArray[np.int64]
     pose: Array
@@ -114,12 +114,12 @@ class TraceData:
     command_ns: NDArray[np.int64]
     people_gap_m: list[tuple[int, float]]
     contacts: list[tuple[int, str]]
-    """When the robot began to touch what."""
+    """Start of each contact, ns, and the label of the touched object."""
     end: dict[str, Any]
 
 
 def read_trace(path: Path) -> TraceData:
-    """A leg's trace, empty where the robot's side was not started any more; raises OSError."""
+    """Read a leg's trace; empty if the robot's side never started. Raises OSError."""
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     sent: list[int] = []
@@ -135,7 +135,7 @@ def read_trace(path: Path) -> TraceData:
             contacts += [(line["t_ns"], label) for label in line["touching"] if label not in touched]
             touched = set(line["touching"])
         elif kind == "wire" and line["name"] in ("Move", "StopMove") and line["service"] == "sport":
-            # Stamped by the bridge as it sends: when this side has time to look is not its doing.
+            # The bridge's own send time; the receive time includes delays of the simulator.
             sent.append(int(line["request_id"]))
         elif kind == "people" and poses and line["poses"]:
             x, y = poses[-1][:2]
@@ -159,9 +159,9 @@ def read_trace(path: Path) -> TraceData:
 def drift_segments(
     odometry: list[tuple[int, float, float, float]], trace: TraceData, disturbed: list[tuple[int, int]]
 ) -> list[tuple[float, float]]:
-    """(position error m, true path m) of consecutive SEGMENT_S of one life, each beginning without error.
+    """Return (position error m, true path m) of consecutive segments of one runner life, each starting without error.
 
-    Segments in which odometry was made wrong by a fault (`disturbed`, ns) are left out.
+    Segments that overlap `disturbed` (spans in ns in which a fault falsified odometry) are left out.
     """
     if len(odometry) < 2 or len(trace.pose_ns) < 2:
         return []
@@ -188,7 +188,7 @@ def drift_segments(
 
 
 def disturbed_spans(events: list[dict[str, Any]]) -> list[tuple[int, int]]:
-    """Spans, ns, in which a fault made the robot's state wrong or late."""
+    """Return the spans (ns) in which a fault falsified or delayed the robot's state."""
     spans: list[tuple[int, int]] = []
     begun: int | None = None
     for event in events:
@@ -201,9 +201,9 @@ def disturbed_spans(events: list[dict[str, Any]]) -> list[tuple[int, int]]:
 
 
 def faults_of(events: list[dict[str, Any]], lives: list[LifeData], trace: TraceData) -> list[dict[str, Any]]:
-    """Each injection with what came of it: its effect, the fault that the runner should raise, any fault it raised.
+    """Return each injection with its effect time, the expected fault, and the faults that the runner raised.
 
-    `moved_m`: the robot's true path meanwhile; a picture that freezes before a robot that stands looks right.
+    `moved_m`: true path during the fault; for a standing robot, a frozen image cannot be detected.
     """
     raised = sorted(entry for life in lives for entry in life.raised)
     found: dict[int, dict[str, Any]] = {}
@@ -232,7 +232,7 @@ def _path_m(trace: TraceData, begin_ns: int, end_ns: int) -> float:
 
 
 def analyse(folder: Path) -> dict[str, Any]:
-    """Everything a report needs of one leg, also written to its folder as JSON. Raises OSError."""
+    """Analyse a leg's folder for the report, write the analysis as JSON and return it. Raises OSError."""
     about = json.loads((folder / LEG).read_text(encoding="utf-8"))
     events = list(read_lines(folder / EVENTS))
     samples = list(read_lines(folder / SAMPLES))

@@ -1,4 +1,4 @@
-"""What a soak is judged by: lines of a TOML file against what was measured. Pure."""
+"""Budget of a soak: limits from a TOML file, and their comparison with the measures. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sim_hil.soak.drive.schedule import SoakInputError, known, read_toml
+from sim_hil.soak.drive.schedule import SoakInputError, check_keys, read_toml
 
 DEFAULT: Final = Path(__file__).with_name("budget.toml")
 FORMAT: Final = 1
@@ -18,7 +18,7 @@ FAULTS_UNANSWERED: Final = "faults_unanswered"
 
 @dataclass(frozen=True)
 class Measure:
-    """One number that a soak has measured; `low` and `high` its 95 % interval where it has one, `count` its samples."""
+    """One measured number; `low` and `high`: its 95 % interval if known, `count`: number of samples."""
 
     value: float | None
     unit: str
@@ -29,14 +29,14 @@ class Measure:
     note: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """For the result."""
+        """Return the measure as JSON values for the result."""
         always = ("value", "unit")
         return {name: value for name, value in self.__dict__.items() if value not in (None, "") or name in always}
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One limit, on one side."""
+    """One limit on a measure, either `max` or `min`."""
 
     measure: str
     source: str
@@ -53,7 +53,7 @@ class BudgetLine:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A line and what came of it; `why` says what an undecided one lacks."""
+    """Verdict on a budget line; `why` explains an undecided one."""
 
     line: BudgetLine
     measure: Measure
@@ -61,16 +61,16 @@ class Judgement:
     why: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """For the result."""
+        """Return the judgement as JSON values for the result."""
         line = {key: value for key, value in self.line.__dict__.items() if value is not None}
         why = {"why": self.why} if self.why else {}
         return {**line, "verdict": self.verdict, **why, "found": self.measure.as_json()}
 
 
 def judge_line(line: BudgetLine, measure: Measure) -> Judgement:
-    """One line's verdict.
+    """Judge one line.
 
-    A value beyond its limit fails, but for one whose interval reaches back to it: that is as likely noise, undecided.
+    A value beyond the limit fails. If its interval includes the limit, it may be noise, so the line is undecided.
     """
     if measure.value is None:
         return Judgement(line, measure, UNDECIDED, measure.note or "not measured")
@@ -83,37 +83,37 @@ def judge_line(line: BudgetLine, measure: Measure) -> Judgement:
         return Judgement(line, measure, PASS)
     if sure:
         return Judgement(line, measure, FAIL)
-    return Judgement(line, measure, UNDECIDED, "its interval reaches the limit: run longer")
+    return Judgement(line, measure, UNDECIDED, "the interval includes the limit: run longer")
 
 
 def judge(lines: Sequence[BudgetLine], measures: Mapping[str, Measure]) -> list[Judgement]:
-    """Every line's verdict; raises SoakInputError for a line about something that is not measured."""
+    """Judge every line. Raises SoakInputError for a line about an unknown measure."""
     check_names(lines, measures)
     return [judge_line(line, measures[line.measure]) for line in lines]
 
 
-def that_apply(lines: tuple[BudgetLine, ...], *, faults: bool) -> tuple[BudgetLine, ...]:
-    """The lines to judge by: a soak that is asked to inject no fault has no answers to faults."""
+def applicable(lines: tuple[BudgetLine, ...], *, faults: bool) -> tuple[BudgetLine, ...]:
+    """Return the lines that apply: without injected faults, there are no answers to faults to judge."""
     return tuple(line for line in lines if faults or line.measure != FAULTS_UNANSWERED)
 
 
 def check_names(lines: Sequence[BudgetLine], names: Mapping[str, object] | Sequence[str]) -> None:
-    """Raises SoakInputError for a line about something that is not measured."""
+    """Check that every line names a known measure. Raises SoakInputError."""
     for line in lines:
         if line.measure not in names:
             raise SoakInputError(f"budget: no measure {line.measure!r}, expected one of {', '.join(sorted(names))}")
 
 
 def load_budget(path: Path) -> tuple[BudgetLine, ...]:
-    """Lines of a TOML file; raises SoakInputError."""
+    """Read the lines of a TOML file. Raises SoakInputError."""
     table = read_toml(path)
     try:
-        known(table, {"format", "budget"}, "the file")
+        check_keys(table, {"format", "budget"}, "the file")
         if table["format"] != FORMAT:
             raise SoakInputError(f"format: expected {FORMAT}, found {table['format']!r}")
         lines = []
         for item in table["budget"]:
-            known(item, {"measure", "max", "min", "source"}, f"budget {item.get('measure')!r}")
+            check_keys(item, {"measure", "max", "min", "source"}, f"budget {item.get('measure')!r}")
             limits = {key: float(item[key]) for key in ("max", "min") if key in item}
             lines.append(BudgetLine(str(item["measure"]), str(item["source"]), **limits))
         return tuple(lines)

@@ -1,4 +1,4 @@
-"""The numbers of a soak, from the analyses and samples of its legs; their names are what a budget can limit. Pure."""
+"""Measures of a soak, computed from the analyses and samples of its legs; a budget limits them by name. Pure."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sim_hil.soak.verdict.budget import Measure
 from sim_hil.soak.verdict.slopes import SHORTEST_S, WARM_UP_S, slope
 
 PROCESSES: Final = ("edge-run", "edge-bridge", "edge-hil")
-BRIDGE_PERIOD_MS: Final = 20.0  # rate_hz = 50 of the simulated robot's file
+BRIDGE_PERIOD_MS: Final = 20.0  # rate_hz = 50 in the simulated robot's file
 MOVED_M: Final = 0.1
-"""A fault during which the robot has moved less is not counted among those that the runner must answer."""
+"""Least motion during a fault, m, for it to count among the faults that the runner must detect."""
 MIB: Final = 2.0**20
 
 Analysis = Mapping[str, Any]
@@ -23,7 +23,10 @@ Samples = Sequence[Mapping[str, Any]]
 
 
 def slopes(samples: Sequence[Samples], name: str, key: str, unit: float) -> list[tuple[float, float, float, float]]:
-    """(per hour, low, high, seconds) of each life of a process that was long enough; one list of samples a leg."""
+    """Return (slope per hour, low, high, seconds) of each sufficiently long life of a process.
+
+    `samples`: one list per leg.
+    """
     found = []
     for leg in samples:
         lives: dict[int, list[tuple[float, float]]] = {}
@@ -39,7 +42,7 @@ def slopes(samples: Sequence[Samples], name: str, key: str, unit: float) -> list
 
 
 def measures(legs: Sequence[Analysis], samples: Sequence[Samples]) -> dict[str, Measure]:
-    """Every measure by name."""
+    """Return every measure by name."""
     found: dict[str, Measure] = {}
     for name in PROCESSES:
         found[f"memory_slope_mib_per_h.{name}"] = _slope(samples, name, "rss_bytes", MIB, "MiB/h")
@@ -71,18 +74,16 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples]) -> dict[str, 
 
 
 def names() -> list[str]:
-    """The names of all measures."""
+    """Return the names of all measures."""
     return list(measures([], []))
 
 
 def _slope(samples: Sequence[Samples], name: str, key: str, unit: float, of: str) -> Measure:
-    """The fastest growth of all lives that were long enough."""
+    """Return the fastest growth of all sufficiently long lives."""
     found = slopes(samples, name, key, unit)
     if not found:
         least_s = WARM_UP_S + SHORTEST_S
-        return Measure(
-            None, of, 0, note=f"no process lived for {least_s:.0f} s, of which the first {WARM_UP_S:.0f} warm"
-        )
+        return Measure(None, of, 0, note=f"no process ran for {least_s:.0f} s, including {WARM_UP_S:.0f} s of warm-up")
     per_h, low, high, _ = max(found, key=lambda one: one[1])
     return Measure(round(per_h, 3), of, len(found), round(low, 3), round(high, 3), note="the worst life")
 
@@ -126,7 +127,7 @@ def _stops(found: dict[str, Measure], legs: Sequence[Analysis]) -> None:
     ran = bool(ends) or any(leg["lives"] for leg in legs)
     unexplained = sum(not end["explained"] for end in ends) if ran else None
     found["stops_unexplained"] = Measure(unexplained, "", len(ends), note="" if ran else "no runner has driven")
-    # Before a robot that stands, a picture that stays the same is right.
+    # For a standing robot, an unchanged image is normal.
     faults = [
         fault
         for leg in legs
@@ -145,7 +146,7 @@ def _drift(found: dict[str, Measure], segments: Sequence[Sequence[float]]) -> No
 
 
 def _power(found: dict[str, Measure], lives: Sequence[Mapping[str, Any]]) -> None:
-    """Mean power and energy, s between two samples of one life; energy of what was not sampled is left out."""
+    """Add mean power and energy, by the trapezoidal rule between samples of one life; gaps of 10 s are left out."""
     energy_j, seconds, tags = 0.0, 0.0, set()
     for life in lives:
         rows = life["power"]

@@ -1,4 +1,4 @@
-"""The worst moments of a leg as small moving pictures of what the robot saw, before its flight logs are deleted."""
+"""Worst moments of a leg as small animations of the robot's camera, made before the flight logs are deleted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BAR_PX: Final = 16
 
 @dataclass(frozen=True)
 class Moment:
-    """Something worth looking at; the higher `rank`, the worse, among moments of one kind."""
+    """A remarkable moment; a higher `rank` is worse among moments of one kind."""
 
     kind: str
     t_ns: int
@@ -35,7 +35,7 @@ class Moment:
 
 
 def worst(analysis: Mapping[str, Any]) -> list[Moment]:
-    """The worst tick, stop, collision and near miss of a leg, as far as there were any."""
+    """Return the worst tick, stop, collision and near miss of a leg, if any."""
     found: list[Moment] = []
     ticks = [
         (ms, t_ns) for life in analysis["lives"] for t_ns, ms in zip(life["tick_ns"], life["tick_ms"], strict=True)
@@ -45,7 +45,7 @@ def worst(analysis: Mapping[str, Any]) -> list[Moment]:
         found.append(Moment("worst tick", t_ns, ms, f"{ms:.1f} ms from its deadline to its command"))
     stops = [end for end in analysis["life_ends"] if end["cause"] != "leg"]
     if stops:
-        # What nobody asked for first, then what a contact did, then what was injected.
+        # Unexplained stops rank first, then those after a contact, then those after an injected fault.
         rank = {"": 2.0, "contact": 1.0}
         end = max(stops, key=lambda end: rank.get(end["explained"], 0.0))
         why = end["cause"] or f"ended with code {end['code']}"
@@ -56,12 +56,12 @@ def worst(analysis: Mapping[str, Any]) -> list[Moment]:
         found.append(Moment("collision", t_ns, 1.0 if label == "person" else 0.0, f"touched {label}"))
     if analysis["nearest_person"] is not None:
         t_ns, gap_m = analysis["nearest_person"]
-        found.append(Moment("nearest person", t_ns, -gap_m, f"{gap_m:.2f} m from a person's middle"))
+        found.append(Moment("nearest person", t_ns, -gap_m, f"{gap_m:.2f} m from a person's centre"))
     return found
 
 
 def keep_moments(folder: Path, analysis: Mapping[str, object]) -> None:
-    """Write the worst moments' pictures into the leg's folder; raises OSError."""
+    """Write the animations of the worst moments into the leg's folder. Raises OSError."""
     kept = []
     for moment in worst(analysis):
         frames = _frames(folder, moment.t_ns)
@@ -73,7 +73,7 @@ def keep_moments(folder: Path, analysis: Mapping[str, object]) -> None:
 
 
 def read_moments(folder: Path) -> list[Moment]:
-    """What `keep_moments` has written; none where a leg was killed before."""
+    """Read the moments written by `keep_moments`; empty if the leg was killed before."""
     try:
         return [Moment(**row) for row in json.loads((folder / MOMENTS).read_text(encoding="utf-8"))]
     except (OSError, ValueError, TypeError):
@@ -81,7 +81,7 @@ def read_moments(folder: Path) -> list[Moment]:
 
 
 def _frames(folder: Path, t_ns: int) -> list[tuple[float, bytes]]:
-    """(seconds from the moment, JPEG) of the pictures around it, from whichever flight log holds them."""
+    """Return (time relative to the moment s, JPEG) of the images around it, from the leg's flight logs."""
     low_ns, high_ns = t_ns - round(BEFORE_S * 1e9), t_ns + round(AFTER_S * 1e9)
     found: list[tuple[float, bytes]] = []
     for log in sorted(folder.glob("flight-*.mcap")):
@@ -90,7 +90,7 @@ def _frames(folder: Path, t_ns: int) -> list[tuple[float, bytes]]:
                 if topic == "/camera" and low_ns <= stamp_ns <= high_ns:
                     found.append(((stamp_ns - t_ns) / 1e9, jpeg_bytes(payload)))
         except (OSError, RecordingError, ValueError):
-            continue  # killed before its first byte
+            continue  # the runner was killed before it wrote data
     kept: list[tuple[float, bytes]] = []
     for at_s, jpeg in sorted(found, key=lambda frame: frame[0]):
         if not kept or at_s - kept[-1][0] >= 0.9 / FPS:
@@ -104,7 +104,7 @@ def _write(path: Path, frames: list[tuple[float, bytes]], moment: Moment) -> Non
         try:
             eye = Image.open(io.BytesIO(jpeg)).convert("RGB").resize(_SIZE)
         except (UnidentifiedImageError, OSError):
-            continue  # torn by a fault: the robot had no picture either
+            continue  # an invalid image, caused by an injected fault
         picture = Image.new("RGB", (_SIZE[0], _SIZE[1] + _BAR_PX), (250, 250, 248))
         picture.paste(eye, (0, _BAR_PX))
         line = f"{moment.kind}  {at_s:+.1f} s"

@@ -1,7 +1,7 @@
-"""Whether something grows: slope of samples over time by Theil and Sen, which steps and spikes do not move. Pure.
+"""Slope of samples over time by the Theil-Sen estimator, which is robust to steps and spikes. Pure.
 
-Samples that follow each other within seconds tell the same thing twice, and an interval from all of them would be too
-narrow: they are reduced to the median of each block first.
+Samples within seconds of each other are correlated, so an interval from all of them would be too narrow. Therefore they
+are first reduced to the median of each block.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from scipy.stats import theilslopes
 Array = NDArray[np.float64]
 
 WARM_UP_S: Final = 300.0
-"""Of a process's life: caches, histories and arenas fill (nano, 2 cores: of the runner's 279 MiB after five minutes,
-12 came in the first of them, 4 in the next four, the last of them 0.2)."""
+"""Warm-up of a process, s, in which caches, histories and arenas fill (nano, 2 cores: of the runner's 279 MiB after
+5 min, 12 MiB came in the first minute, 4 MiB in the next four, 0.2 MiB in the last)."""
 SHORTEST_S: Final = 240.0
-"""After the warm-up; over less time a slope per hour says nothing."""
+"""Least time after the warm-up for a meaningful slope per hour, s."""
 BLOCK_S: Final = 10.0
+"""Length of a block of samples that is reduced to its median, s."""
 
 
 @dataclass(frozen=True)
 class Slope:
-    """Growth per hour with its 95 % interval, of a process's life from the warm-up on (`seconds` of it)."""
+    """Growth per hour with its 95 % interval, over the `seconds` of a process's life after the warm-up."""
 
     per_h: float
     low: float
@@ -37,7 +38,7 @@ class Slope:
 def slope(
     times_s: Sequence[float], values: Sequence[float], warm_up_s: float = WARM_UP_S, shortest_s: float = SHORTEST_S
 ) -> Slope | None:
-    """Slope of `values` [n] over `times_s` [n] since the process began; None where it lived too short a time."""
+    """Return the slope of `values` [n] over `times_s` [n], s since the process began; None if it ran too shortly."""
     times, found = np.asarray(times_s, float), np.asarray(values, float)
     kept = times >= warm_up_s
     times, found = times[kept], found[kept]

@@ -1,1 +1,1 @@
-"""Tools to draw with: meshes, textures, printed pictures, surfaces, and the stage that shows them."""
+"""Drawing tools: meshes, textures, prints, surfaces, and the stage that shows them."""

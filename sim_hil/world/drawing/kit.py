@@ -1,4 +1,4 @@
-"""Tools to build one object: parts in fractions of its size, pictures drawn once for all objects that look alike."""
+"""Tools for building one object's mesh: parts in fractions of its size, textures shared by equal objects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ON_FLOOR_M = 1e-3
 
 
 class Kit:
-    """Builds `thing` into `mesh`, in the object's frame: x to the front, y to its left, z up from its underside.
+    """Builder of an object's mesh in the object's frame: x forward, y left, z up from its underside.
 
     Spans and points are fractions of depth, width and height: -0.5 to 0.5 across, 0 to 1 up; radii are in m.
     """
@@ -37,23 +37,23 @@ class Kit:
         self._low = thing.position_m[2] < _ON_FLOOR_M
 
     def paint(self, brightness: float = 1.0) -> Colour:
-        """The object's own colour, lighter or darker."""
+        """Return the object's colour, lighter or darker."""
         return rgb(self.thing.colour, brightness)
 
     def rng(self) -> np.random.Generator:
-        """Random numbers of this object: the same whenever and wherever it is built."""
+        """Return a random generator that is always the same for this object."""
         return np.random.default_rng(zlib.crc32(self.thing.label.encode()))
 
     def at(self, x: float, y: float, z: float) -> Vec3:
-        """A point in m of the object's frame."""
+        """Convert fractions to a point in the object's frame, m."""
         return (x * self.depth, y * self.width, z * self.height)
 
     def world(self, x: float, y: float, z: float) -> Vec3:
-        """A point in the world, m."""
+        """Convert fractions to a point in the world, m."""
         return self.frame.point(self.at(x, y, z))
 
     def picture(self, drawing: Drawing) -> str:
-        """The name of a picture of this object, drawn by a function of its size, colour and text alone."""
+        """Return the name of a texture for this object, drawn by a function of its size, colour and text."""
         thing = self.thing
         image = _drawn(drawing, thing.kind, thing.size_m, thing.colour, thing.text)
         return self.mesh.picture(f"{getattr(drawing, '__name__', 'picture')} {id(image)}", image)
@@ -62,54 +62,54 @@ class Kit:
         self, x: Span, y: Span, z: Span, colour: Colour,
         front: str = "", sides: str = "", back: str = "", top: str = "",
     ) -> None:  # fmt: skip
-        """A box between two points."""
+        """Add a box between two points."""
         centre = self.at(sum(x) / 2, sum(y) / 2, sum(z) / 2)
         size = self.at(x[1] - x[0], y[1] - y[0], z[1] - z[0])
         hidden = self._low and z[0] <= 0
         self.mesh.box(self.frame, centre, size, colour, front, sides, back, top, bottom=not hidden)
 
     def whole(self, colour: Colour, front: str = "", sides: str = "", back: str = "", top: str = "") -> None:
-        """A box as large as the object."""
+        """Add a box of the object's size."""
         self.part((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0), colour, front, sides, back, top)
 
     def post(self, x: float, y: float, z: Span, radius_m: float, colour: Colour, sides: int = 6) -> None:
-        """An upright round post."""
+        """Add an upright round post."""
         rings = tuple((self.at(x, y, level), radius_m, radius_m) for level in z)
         self.mesh.prism(self.frame, rings, colour, sides)
 
     def rings(self, levels: tuple[tuple[float, float], ...], colour: Colour, sides: int = 12) -> None:
-        """A turned body about the object's axis: (height, radius) in fractions of height and of depth."""
+        """Add a body of revolution about the object's axis: (height, radius) in fractions of height and depth."""
         shaped = tuple(((0.0, 0.0, z * self.height), r * self.depth, r * self.width) for z, r in levels)
         self.mesh.prism(self.frame, shaped, colour, sides)
 
     def wheel(
         self, x: float, y: float, radius_m: float, width_m: float, colour: Colour = BLACK, up_m: float = 0.0
     ) -> None:
-        """A wheel that stands on the floor, or `up_m` above it."""
+        """Add a wheel on the floor or `up_m` above it."""
         self.mesh.wheel(self.frame, (x * self.depth, y * self.width, radius_m + up_m), radius_m, width_m, colour)
 
     def ball(
         self, x: float, y: float, z: float, radii_m: Vec3, colour: Colour, sides: int = 8, levels: int = 6
     ) -> None:  # fmt: skip
-        """An ellipsoid."""
+        """Add an ellipsoid."""
         self.mesh.ball(self.frame, self.at(x, y, z), radii_m, colour, sides, levels)
 
     def face(self, colour: Colour, *corners: Vec3) -> None:
-        """A plain face through points given as fractions, counter-clockwise as its viewer sees them."""
+        """Add a plain face through points given as fractions, counter-clockwise for the viewer."""
         self.mesh.face(colour, [self.world(*corner) for corner in corners])
 
     def both(self, colour: Colour, under: Colour, *corners: Vec3) -> None:
-        """A thin face that is seen from both sides."""
+        """Add a thin face that is visible from both sides."""
         points = [self.world(*corner) for corner in corners]
         self.mesh.face(colour, points)
         self.mesh.face(under, points[::-1])
 
     def print(self, drawing: Drawing, *corners: Vec3) -> None:
-        """A picture on a quad through points given as fractions: bottom left, bottom right, top right, top left."""
+        """Add a textured quad through points given as fractions: bottom left, bottom right, top right, top left."""
         self.mesh.quad(self.picture(drawing), [self.world(*corner) for corner in corners])
 
     def legs(self, z: Span, inset: float, thick: Span, colour: Colour) -> None:
-        """Four legs; `thick` in fractions of depth and width."""
+        """Add four legs; `thick` in fractions of depth and width."""
         (tx, ty), edge = thick, 0.5 - inset
         for sx in (-1, 1):
             for sy in (-1, 1):

@@ -1,6 +1,6 @@
-"""Triangle meshes gathered by texture: quads, boxes, prisms and balls, as few surfaces as there are textures.
+"""Triangle meshes grouped by texture: quads, boxes, prisms and ellipsoids, with one surface per texture.
 
-Faces are seen from their outer side only. Nothing here knows a renderer: a stage (world_stage) draws the surfaces.
+Faces are visible from their outer side only. This module is independent of the renderer; a stage draws the surfaces.
 """
 
 from __future__ import annotations
@@ -20,47 +20,47 @@ Vec2 = tuple[float, float]
 
 
 class Frame:
-    """A pose to build in: x forward (front), y left, z up of an upright thing, in the parent's coordinates."""
+    """Upright frame to build in (x forward, y left, z up), given in the parent's coordinates."""
 
     def __init__(self, origin: Vec3 = (0.0, 0.0, 0.0), heading_rad: float = 0.0) -> None:
         self.origin, self.heading_rad = origin, heading_rad
         self._c, self._s = cos(heading_rad), sin(heading_rad)
 
     def point(self, p: Sequence[float]) -> Vec3:
-        """Parent coordinates of a point of this frame."""
+        """Return the parent coordinates of a point."""
         (x, y, z), (u, v, w) = self.origin, p
         return (x + self._c * u - self._s * v, y + self._s * u + self._c * v, z + w)
 
     def direction(self, d: Sequence[float]) -> Vec3:
-        """A direction of this frame as the parent sees it."""
+        """Return a direction in parent coordinates."""
         u, v, w = d
         return (self._c * u - self._s * v, self._s * u + self._c * v, w)
 
     def at(self, p: Sequence[float], heading_rad: float = 0.0) -> Frame:
-        """A frame within this one: its origin at `p`, turned by `heading_rad`."""
+        """Return a child frame with origin `p`, rotated by `heading_rad`."""
         return Frame(self.point(p), self.heading_rad + heading_rad)
 
 
 @dataclass
 class Surface:
-    """Triangles that share a picture; of a plain surface (no picture) every vertex has a colour."""
+    """Triangles that share a texture; a plain surface has no texture, but a colour per vertex."""
 
     image: Image | None
     vertices: list[Vec3] = field(default_factory=list)
     indices: list[int] = field(default_factory=list)
-    uvs: list[Vec2] = field(default_factory=list)  # in pictures: 1 is one repetition; unused without one
+    uvs: list[Vec2] = field(default_factory=list)  # in units of texture repetitions; unused for a plain surface
     normals: list[Vec3] = field(default_factory=list)
-    colours: list[Colour] = field(default_factory=list)  # of a plain surface only
+    colours: list[Colour] = field(default_factory=list)  # for a plain surface only
 
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32], NDArray[np.float32]]:
-        """Vertices [n, 3], indices [3 m], uvs [n, 2] and normals [n, 3]."""
+        """Return vertices [n, 3], indices [3 m], uvs [n, 2] and normals [n, 3]."""
         shapes = ((self.vertices, 3), (self.uvs, 2), (self.normals, 3))
         vertices, uvs, normals = (np.array(values, np.float32).reshape(-1, size) for values, size in shapes)
         return vertices, np.array(self.indices, np.uint32), uvs, normals
 
 
 class MeshBuilder:
-    """Collects faces by picture. `detail` below 1 makes round things of fewer sides: for what is seen from afar."""
+    """Mesh that collects faces by texture; `detail` below 1 gives round parts fewer sides, for distant objects."""
 
     def __init__(self, detail: float = 1.0) -> None:
         self._detail = detail
@@ -69,37 +69,37 @@ class MeshBuilder:
         self._plain = Surface(None)
 
     def picture(self, name: str, image: Image) -> str:
-        """Register a picture under a name, to be used as `texture`."""
+        """Register an image under a name, to be used as `texture`."""
         self._pictures[name] = image
         return name
 
     def has_picture(self, name: str) -> bool:
-        """Whether a picture of that name is there already."""
+        """Return whether an image with that name is registered."""
         return name in self._pictures
 
     def surfaces(self) -> Iterator[Surface]:
-        """What was built: the plain faces first, then a surface a picture."""
+        """Return the surfaces: first the plain faces, then one surface per texture."""
         if self._plain.indices:
             yield self._plain
         yield from self._textured.values()
 
     def empty(self) -> bool:
-        """Whether nothing was built yet."""
+        """Whether the mesh has no faces."""
         return not self._plain.indices and not self._textured
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Extent along x and y: x0, y0, x1, y1, m; raises ValueError when nothing was built."""
+        """Return the extent (x0, y0, x1, y1), m. Raises ValueError for an empty mesh."""
         corners = np.concatenate([np.array(surface.vertices) for surface in self.surfaces()])
         (x0, y0), (x1, y1) = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
         return (float(x0), float(y0), float(x1), float(y1))
 
     def quad(self, texture: str, corners: Sequence[Vec3], repeat: Vec2 = (1.0, 1.0), origin: Vec2 = (0.0, 0.0)) -> None:
-        """A textured quad; corners as its viewer sees them: bottom left, bottom right, top right, top left."""
+        """Add a textured quad; corners for the viewer: bottom left, bottom right, top right, top left."""
         (u, v), (a, b) = repeat, origin
         self.patch(texture, corners, ((a, b), (a + u, b), (a + u, b + v), (a, b + v)))
 
     def patch(self, texture: str, corners: Sequence[Vec3], uvs: Sequence[Vec2]) -> None:
-        """A textured convex face, corners counter-clockwise as its viewer sees them."""
+        """Add a textured convex face, corners counter-clockwise for the viewer."""
         surface = self._textured.get(texture)
         if surface is None:
             surface = self._textured[texture] = Surface(self._pictures[texture])
@@ -107,7 +107,7 @@ class MeshBuilder:
         _fan(surface, corners, (_normal(corners),) * len(corners))
 
     def face(self, colour: Colour, corners: Sequence[Vec3], normals: Sequence[Vec3] | None = None) -> None:
-        """A plain convex face, corners counter-clockwise as its viewer sees them."""
+        """Add a plain convex face, corners counter-clockwise for the viewer."""
         self._plain.colours.extend((colour,) * len(corners))
         self._plain.uvs.extend(((0.0, 0.0),) * len(corners))
         _fan(self._plain, corners, normals if normals is not None else (_normal(corners),) * len(corners))
@@ -124,7 +124,7 @@ class MeshBuilder:
         top: str = "",
         bottom: bool = True,
     ) -> None:
-        """A box in a frame; its faces may show pictures: front is +x, sides are +y and -y. `bottom`: whether seen."""
+        """Add a box in a frame; faces may be textured (front +x, sides +y and -y). `bottom`: include that face."""
         (x, y, z), (a, b, c) = centre, (extent / 2 for extent in size)
 
         def at(i: int, j: int, k: int) -> Vec3:
@@ -148,7 +148,7 @@ class MeshBuilder:
     def wheel(
         self, frame: Frame, centre: Sequence[float], radius: float, width: float, colour: Colour, sides: int = 10
     ) -> None:
-        """A disc that stands upright, its axis along y."""
+        """Add an upright disc with its axis along y."""
         sides = max(round(sides * self._detail), 5)
         (x, y, z), turns = centre, [2 * pi * (k + 0.5) / sides for k in range(sides)]
         right, left = (
@@ -164,9 +164,8 @@ class MeshBuilder:
     def prism(
         self, frame: Frame, rings: Sequence[tuple[Sequence[float], float, float]], colour: Colour, sides: int = 8
     ) -> None:
-        """A tube through elliptic rings ((x, y, z) of the middle, radius along x, radius along y), closed at both ends.
-
-        Rings go upwards; a limb, a torso, a bottle or a pot is a few of them.
+        """Add a closed tube through elliptic rings: (x, y, z) of the centre, radius along x, radius along y.
+        Rings are ordered upwards; a limb, a torso, a bottle or a pot consists of a few rings.
         """
         sides = max(round(sides * self._detail), 4)
         around = [(cos(t), sin(t)) for t in (2 * pi * (k + 0.5) / sides for k in range(sides))]
@@ -189,7 +188,7 @@ class MeshBuilder:
         sides: int = 8,
         levels: int = 6,
     ) -> None:
-        """An ellipsoid as a stack of rings."""
+        """Add an ellipsoid as a stack of rings."""
         rings = []
         levels = max(round(levels * self._detail), 3)
         for level in range(levels):

@@ -1,4 +1,4 @@
-"""What is printed on things: fronts, screens, signs and facades, each a function of an object's size, colour, text."""
+"""Prints on objects: fronts, screens, signs and facades, as functions of an object's size, colour and text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where meshes are shown and moved: the camera's renderer is one stage, PyBullet's window the other."""
+"""Stages, which show and move meshes: the camera's renderer is one, PyBullet's window the other."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ _AWAY: Vec3 = (0.0, 0.0, -1000.0)
 
 
 class Stage(Protocol):
-    """Shows meshes; a mesh once added is moved by its handle."""
+    """Interface of a stage; an added mesh is moved by its handle."""
 
     def add(self, mesh: MeshBuilder) -> int:
         """Show a mesh as it was built, and return its handle."""
         ...
 
     def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
-        """Put a mesh's origin there, turned so; shows it again when it was hidden."""
+        """Set a mesh's pose; shows it again if it was hidden."""
         ...
 
     def hide(self, handle: int) -> None:
-        """Take a mesh out of every picture until it is placed."""
+        """Hide a mesh until it is placed again."""
         ...
 
 
 class BulletStage:
-    """A stage in a PyBullet client: bodies without collision. Pictures pass through PNG files in `folder`."""
+    """Stage in a PyBullet client: bodies without collision; textures pass through PNG files in `folder`."""
 
     def __init__(self, client: int, folder: Path) -> None:
         self._client, self._folder = client, folder
@@ -46,12 +46,12 @@ class BulletStage:
         return len(self._made) - 1
 
     def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
-        """Put a mesh's origin there, turned so."""
+        """Set a mesh's pose."""
         for body in self._made[handle]:
             pybullet.resetBasePositionAndOrientation(body, position_m, quaternion_xyzw, physicsClientId=self._client)
 
     def hide(self, handle: int) -> None:
-        """Take a mesh out of sight until it is placed."""
+        """Hide a mesh until it is placed again."""
         self.place(handle, _AWAY, (0.0, 0.0, 0.0, 1.0))
 
     def _body(self, surface: Surface) -> int:

@@ -1,6 +1,6 @@
-"""Pictures of floors, walls and ceilings that repeat: one function each, and how many metres one repetition covers.
+"""Repeating textures of floors, walls and ceilings: one function each, and the size of one repetition.
 
-A floor's picture has its width along the heading of the floor (or patch of floor) that it covers.
+A floor texture's width runs along the heading of the floor patch that it covers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim_hil.world.drawing.textures import Colour, Image, fill, grain, plain
 
 @dataclass(frozen=True)
 class Tiling:
-    """How to draw a surface; one picture covers `width_m` x `height_m` (0: a wall's whole height)."""
+    """Texture function of a surface; one repetition covers `width_m` x `height_m` (0: a wall's whole height)."""
 
     draw: Callable[[], Image]
     width_m: float
@@ -325,5 +325,5 @@ SURFACES: dict[str, Tiling] = {
 
 @cache
 def surface_picture(name: str) -> Image:
-    """The picture of a texture; drawn once, so do not write into it. Raises KeyError."""
+    """Return the image of a texture (cached, read-only). Raises KeyError."""
     return SURFACES[name].draw()

@@ -1,7 +1,7 @@
-"""Procedural pictures: how to draw them, and the fronts of a corridor's things. Numpy and OpenCV, RGB uint8.
+"""Procedural textures: drawing functions, and the fronts of a corridor's objects. Numpy and OpenCV, RGB uint8.
 
-No binary assets: what the camera sees can be read, reviewed and changed as code; the same for the same arguments. A
-robot's camera sees few pixels of most things, so the pictures keep to broad shapes and large letters.
+There are no binary assets, so all textures can be reviewed as code; equal arguments give equal images. A robot's camera
+shows most objects with few pixels, so the textures have broad shapes and large letters.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ _CANS: tuple[Colour, ...] = (
 
 
 def plain(width: int, height: int, colour: Colour) -> Image:
-    """A picture of one colour; size in pixels."""
+    """Return an image of one colour; size in pixels."""
     return np.full((height, width, 3), colour, np.uint8)
 
 
 def rgb(colour: tuple[float, float, float], brightness: float = 1.0) -> Colour:
-    """A colour given as 0..1 in 0..255, scaled in brightness."""
+    """Convert a colour from 0..1 to 0..255, scaled in brightness."""
     red, green, blue = (min(max(round(255 * channel * brightness), 0), 255) for channel in colour)
     return (red, green, blue)
 
 
 def fill(image: Image, x0: float, y0: float, x1: float, y1: float, colour: Colour) -> None:
-    """Fill a rectangle given in fractions of the picture, y downwards."""
+    """Fill a rectangle given in fractions of the image, y downwards."""
     height, width = image.shape[:2]
     a, b = (round(x0 * width), round(y0 * height)), (round(x1 * width) - 1, round(y1 * height) - 1)
     cv2.rectangle(image, a, b, colour, -1)
 
 
 def write(image: Image, text: str, x0: float, y0: float, x1: float, y1: float, colour: Colour) -> None:
-    """Write one line as large as it fits, centred in a rectangle given in fractions of the picture."""
+    """Write one line as large as it fits, centred in a rectangle given in fractions of the image."""
     if not text:
         return
     height, width = image.shape[:2]
@@ -59,13 +59,13 @@ def write(image: Image, text: str, x0: float, y0: float, x1: float, y1: float, c
 
 
 def canvas(width_m: float, height_m: float, colour: Colour) -> Image:
-    """A picture of a surface of that size, m; large surfaces in fewer pixels a metre."""
+    """Return an image for a surface of that size, m; large surfaces get fewer pixels per metre."""
     scale = min(PIXELS_PER_M, _MAX_PX / max(width_m, height_m))
     return plain(max(round(width_m * scale), 8), max(round(height_m * scale), 8), colour)
 
 
 def grain(image: Image, seed: int, strength: float, cell: int) -> Image:
-    """Soft blotches, so that a plain surface has something to hold on to for optical flow."""
+    """Add soft blotches to a plain surface, as texture for optical flow."""
     height, width = image.shape[:2]
     noise = np.random.default_rng(seed).normal(0, strength, (max(height // cell, 1), max(width // cell, 1)))
     smooth = cv2.resize(noise.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
@@ -209,7 +209,7 @@ def cabinet_front(thing: SceneObject) -> Image:
 
 
 def palette(colours: list[Colour]) -> Image:
-    """One 4 x 4 cell a colour in a row: lets many plain surfaces share one mesh."""
+    """Return an image with one 4 x 4 cell per colour, so that many plain surfaces share one mesh."""
     image = np.zeros((4, 4 * max(len(colours), 1), 3), np.uint8)
     for index, colour in enumerate(colours):
         image[:, 4 * index : 4 * index + 4] = colour
@@ -217,7 +217,7 @@ def palette(colours: list[Colour]) -> Image:
 
 
 def png_bytes(image: Image) -> bytes:
-    """An RGB picture as PNG (OpenCV wants BGR); raises OSError when that fails."""
+    """Encode an RGB image as PNG. Raises OSError on failure."""
     done, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not done:
         raise OSError("the picture could not be encoded as PNG")
@@ -225,6 +225,6 @@ def png_bytes(image: Image) -> bytes:
 
 
 def write_png(image: Image, path: Path) -> Path:
-    """Write an RGB picture of the simulation's own; raises OSError when that fails."""
+    """Write an RGB image to a file. Raises OSError on failure."""
     path.write_bytes(png_bytes(image))
     return path

@@ -96,23 +96,21 @@ def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
 
 @pytest.mark.parametrize("error", [MeterError("gone"), OSError("i2c"), ValueError("nonsense")])
 def test_a_meter_that_raises_is_asked_again_and_its_error_is_kept(error: Exception) -> None:
-    count = 0
+    answers: list[Exception | None] = [error, error, None]
 
     def read(now_ns: int) -> PowerSample:
-        nonlocal count
-        count += 1
-        if count < 4:
-            raise error
+        if (failure := answers.pop(0)) is not None:
+            raise failure
         return PowerSample(now_ns, 20.0, source="fake")
 
-    errors: list[str | None] = []
-    running = monitor(FakeMeter(read), on_sample=lambda *_: errors.append(running.snapshot().meter_error))
-    running.start()
-    try:
-        assert until(lambda: running.snapshot().sample is not None)
-    finally:
-        running.close()
-    assert any(line is not None and str(error) in line for line in errors)
+    running = monitor(FakeMeter(read), clock=lambda: SECOND)
+    for _ in range(2):
+        running.read()
+        snapshot = running.step(SECOND)
+        assert snapshot.sample is None and str(error) in (snapshot.meter_error or "")
+    running.read()
+    snapshot = running.step(SECOND)
+    assert snapshot.sample is not None and snapshot.meter_error is None
 
 
 def test_a_sample_that_is_old_counts_as_none() -> None:

@@ -72,7 +72,9 @@ class Rig:
             monkeypatch.setattr(module, name, fake)
 
     def run(self, robot: Any = ROBOT, record: Path | None = None) -> dict[str, Any]:
-        runtime = SimpleNamespace(tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0))
+        runtime = SimpleNamespace(
+            tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0), decoding="constrained", recovery="on"
+        )
         artifacts: Any = SimpleNamespace(runtime=runtime, guided_by_waypoints=False, directory=Path("a"))
         options = RunOptions("go", Mode.ASYNC, None, ReleaseDelay(0.0, 0.0, 0), record)
         self.session = RunSession(artifacts, robot, options, lambda _line: None)

@@ -22,7 +22,7 @@ from export.model.tokenizers.nano import FARTHEST_M, NANO_TOKENIZER, train, word
 from export.target.file import list_targets, load_target
 from sim_hil.benchmark.language.instruction_words import AREAS, NOUNS, ORDINALS
 from sim_hil.benchmark.language.instructions import wordings
-from sim_hil.benchmark.language.route import COLOUR_WORDS, Passed, Step, Told
+from sim_hil.benchmark.language.route import COLOUR_WORDS, Passed, RouteDescription, Step
 from sim_hil.benchmark.suite.episode import load_suite
 from sim_hil.scene.scene import load_scene, scene_names
 from tools.train.scenes import trace_sentences as trace_words
@@ -63,7 +63,7 @@ WAYS = (
 )  # fmt: skip
 
 
-def tolds() -> Iterator[Told]:
+def tolds() -> Iterator[RouteDescription]:
     """Ways with every kind of step, on either side, counted, at an end and at a landmark, and with none."""
     near, past = (Passed("bench 1", "blue bench", "left"),), (Passed("sofa 1", "sofa", "right"),)
     for (kind, name), side, (ordinal, at_end, by) in itertools.product(
@@ -73,10 +73,10 @@ def tolds() -> Iterator[Told]:
             continue
         step = Step(side, kind, name, ordinal, at_end, by, past, "corridor", "corridor", 9.0, (0.0, 0.0))
         end = ("desk 1", "red desk", "desk", "left", True, kind, name, 9.0, past)
-        yield Told((step,), *end, leaves_room=False, length_m=30.0)
-    yield Told((), *end, leaves_room=False, length_m=9.0)
+        yield RouteDescription((step,), *end, leaves_room=False, length_m=30.0)
+    yield RouteDescription((), *end, leaves_room=False, length_m=9.0)
     leaving = Step("left", "corridor", "corridor", 0, False, (), (), "room", "office", 3.0, (0.0, 0.0))
-    yield Told((leaving,), *end, leaves_room=True, length_m=9.0)
+    yield RouteDescription((leaving,), *end, leaves_room=True, length_m=9.0)
 
 
 def test_every_word_of_the_grammar_of_training_is_one_token() -> None:

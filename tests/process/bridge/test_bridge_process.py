@@ -402,11 +402,11 @@ def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
 
 
 def test_the_status_of_a_running_bridge_is_json_on_request(
-    bridge: Running, socket_path: Path, capsys: pytest.CaptureFixture[str]
+    bridge: Running, socket_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     command = ["status", "--robot", str(GO2_SIM), "--socket", str(socket_path), "--json", "-"]
     assert bridge_main(command) == 0
-    assert json.loads(capsys.readouterr().out)["state"] == "disarmed"
+    assert json.loads(capfd.readouterr().out)["state"] == "disarmed"
 
 
 def test_an_idle_operator_connection_is_not_in_the_way_of_a_stop(bridge: Running, socket_path: Path) -> None:

@@ -77,6 +77,7 @@ def test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms(rig:
         assert repetitions == number + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"\xff\x00garbage", None], ids=["empty", "garbage", "a folder"])
 def test_a_latch_file_that_says_nothing_readable_is_a_latch(rig: Rig, content: bytes | None) -> None:
     if content is None:
@@ -87,8 +88,12 @@ def test_a_latch_file_that_says_nothing_readable_is_a_latch(rig: Rig, content: b
         is_not_driven_until_an_operator_arms(rig)
 
 
+@pytest.mark.slow
 def test_a_latch_file_that_cannot_be_written_delays_nothing_and_is_told_in_one_line(rig: Rig) -> None:
-    with rig.bridge("bridge", "--latch", rig.folder / "missing folder" / "latch") as bridge, HostStall() as host:
+    folder = rig.folder / "removed later"
+    folder.mkdir()
+    with rig.bridge("bridge", "--latch", folder / "latch") as bridge, HostStall() as host:
+        folder.rmdir()
         with rig.driving():
             since_ns = time.monotonic_ns()
             assert rig.operate("stop")[0] == 0

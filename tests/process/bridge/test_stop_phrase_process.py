@@ -185,6 +185,7 @@ def test_the_runners_bridge_is_stopped_as_by_an_operator_and_its_run_ends(stack:
     assert operate("status", stack.bridge)[1]["blocked_by"] == "estop"
 
 
+@pytest.mark.slow
 def test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_itself(stack: Stack) -> None:
     Path(f"{stack.bridge}{OPERATOR_SUFFIX}").unlink()
     with HostStall() as host, stack.drive() as runner:

@@ -72,14 +72,14 @@ class TestExitCodes:
     @pytest.mark.parametrize(
         ("text", "arguments", "complaint"),
         [
-            ("", ["run", "no-such-file"], "expected a file"),
+            ("", ["run", "no-such-file"], "expected a readable file"),
             ("x = " + "[" * 5000, ["run", "FILE"], "expected TOML"),
             (UDP.replace('"udp"', "[1]"), ["run", "FILE"], "kind: expected"),
             (UDP.replace("127.0.0.1:0", "a..b:0"), ["run", "FILE"], "."),
             (UDP, ["run", "FILE", "--duration", "nan"], "--duration: expected"),
             (UDP, ["run", "FILE", "--control", "x" * 200], "--control .+: expected .+ too long"),
             (UDP, ["run", "FILE", "--json", "/"], "--json .+: expected"),
-            (UDP, ["between", "FILE", *COMMANDS], "exactly one link, of kind frames"),
+            (UDP, ["between", "FILE", *COMMANDS], "exactly one link of kind frames"),
             (FRAMES, ["between", "FILE", "--left", "sh 'x", "--right", "true"], "--left: expected"),
             (FRAMES, ["between", "FILE", "--left", "true", "--right", ""], "--right: expected"),
         ],
@@ -106,7 +106,7 @@ class TestExitCodes:
         monkeypatch.setenv("PATH", str(programs))
         assert main(["between", str(path), *COMMANDS]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert ("install util-linux" if missing else "(root): unshare: Operation not permitted") in line
+        assert ("install util-linux" if missing else "run as root: unshare: Operation not permitted") in line
 
     def test_a_relay_that_fails_is_1_and_what_it_has_carried_is_written(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -119,7 +119,7 @@ class TestExitCodes:
 
         monkeypatch.setattr(Relay, "turn", fail)
         assert main(["run", str(path), "--json", str(result)]) == 1
-        assert capsys.readouterr().err.splitlines()[1:] == ["network: the relay has failed: gone"]
+        assert capsys.readouterr().err.splitlines()[1:] == ["network: the relay failed: gone"]
         assert json.loads(result.read_text())["links"]["l"]["there"]["packets"] == 0
 
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])

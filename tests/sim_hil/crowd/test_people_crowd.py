@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim_hil.crowd.people import GESTURES, RENDER_FIELDS, UPDATE_HZ, People
-from sim_hil.crowd.state import Doing
+from sim_hil.crowd.state import Activity
 from sim_hil.crowd.steering import Nearby, choose
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Place, Scene, Terrain, Wall, load_scene
@@ -213,4 +213,5 @@ def test_what_is_behind_changes_nothing(hall: Scene) -> None:
 
 def test_everybody_does_something_known(hospital: Scene) -> None:
     people = People(hospital, 30, 9)
-    assert set(people._crowd.doing.tolist()) <= {Doing.WALK, Doing.FOLLOW, Doing.HOLD, Doing.QUEUE, Doing.SIT}
+    known = {Activity.WALK, Activity.FOLLOW, Activity.HOLD, Activity.QUEUE, Activity.SIT}
+    assert set(people._crowd.activity.tolist()) <= known

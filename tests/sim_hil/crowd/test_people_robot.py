@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim_hil.crowd.people import UPDATE_HZ, People
-from sim_hil.crowd.senses import RobotSeen, notice
+from sim_hil.crowd.senses import ObservedRobot, notice
 from sim_hil.crowd.state import Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Place, Scene, Wall, load_scene
@@ -36,11 +36,11 @@ def _one(heading: float, *, inattentive: bool = False) -> Crowd:
     return crowd
 
 
-def _robot(x: float, y: float = 0.0, vx: float = 0.0) -> RobotSeen:
-    return RobotSeen(x, y, -1.0, 0.0, vx, 0.0, 0.22)
+def _robot(x: float, y: float = 0.0, vx: float = 0.0) -> ObservedRobot:
+    return ObservedRobot(x, y, -1.0, 0.0, vx, 0.0, 0.22)
 
 
-def _noticed_after_s(crowd: Crowd, ways: CrowdMap, robot: RobotSeen) -> float:
+def _noticed_after_s(crowd: Crowd, ways: CrowdMap, robot: ObservedRobot) -> float:
     for tick in range(1, 40):
         notice(crowd, ways, robot, DT)
         if crowd.aware[0]:

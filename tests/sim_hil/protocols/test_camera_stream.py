@@ -140,7 +140,7 @@ def test_the_process_shows_the_world_at_the_pose_it_was_given(state: np.ndarray)
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(state: np.ndarray) -> None:
-    with listen(0) as taken, pytest.raises(OSError, match=r"^camera: port \d+: expected a free one, .+$"):
+    with listen(0) as taken, pytest.raises(OSError, match=r"^camera: port \d+: expected a free port, .+$"):
         _stream(state, taken.getsockname()[1])
 
 

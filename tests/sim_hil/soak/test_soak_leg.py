@@ -50,7 +50,7 @@ def test_a_runner_that_is_too_busy_to_answer_is_told_again(tmp_path: Path, monke
     monkeypatch.setattr(soak_leg, "Stack", lambda *_: stack)
     options = StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1)
     journey: Any = SimpleNamespace(next=lambda _at: TASK)
-    leg = Leg(LegOptions(1, 0, 15.0, 0.8, options), journey, None, stopped=lambda: False, tell=lambda _: None)
+    leg = Leg(LegOptions(1, 0, 15.0, 0.8, options), journey, None, stopped=lambda: False, show_status=lambda _: None)
     leg._truth = SimpleNamespace(  # type: ignore[assignment]
         newest=TruePose(0, 0, 0, 0, ()), update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())]
     )

@@ -110,9 +110,9 @@ def test_a_budget_without_lines_decides_nothing() -> None:
 
 def test_a_soak_without_faults_is_not_judged_by_the_answers_to_them() -> None:
     lines = load_budget(budget.DEFAULT)
-    left = budget.that_apply(lines, faults=False)
+    left = budget.applicable(lines, faults=False)
     assert {line.measure for line in lines} - {line.measure for line in left} == {"faults_unanswered"}
-    assert budget.that_apply(lines, faults=True) == lines
+    assert budget.applicable(lines, faults=True) == lines
 
 
 def empty_soak(tmp_path: Path) -> tuple[int, dict[str, Any], str]:

@@ -21,10 +21,9 @@ from tools.train.config.imitate import ImitateConfig, ImitateEvalConfig, SampleC
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, Dataset, Drive
-from tools.train.drives.futures import label_futures
-from tools.train.drives.windows import relative
+from tools.train.drives.futures import label_futures, relative
 from tools.train.imitate.imitate import fit
-from tools.train.imitate.trainable_policies import ExpertPupil
+from tools.train.imitate.trainable_policies import ActionExpertPolicy
 from tools.train.run.distributed import leave, ranks_of_environment
 from tools.train.run.job import StageJob
 from tools.train.run.run_dir import RunDir
@@ -118,8 +117,8 @@ def trained(dataset: Dataset, job: StageJob) -> tuple[TicVla, dict[str, Any]]:
     """The network after `fit`, and its result."""
     network = build(job.recipe.model, 1)
     assert job.recipe.imitate is not None
-    pupil = ExpertPupil(network.action, job.recipe.imitate.loss)
-    return network, fit(job, pupil, dataset, MadeUpTokens(), SideStates(dataset), of="test")
+    policy = ActionExpertPolicy(network.action, job.recipe.imitate.loss)
+    return network, fit(job, policy, dataset, MadeUpTokens(), SideStates(dataset), of="test")
 
 
 def main() -> None:

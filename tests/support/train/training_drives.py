@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, About, Dataset, Drive, Entry
-from tools.train.drives.futures import label_futures
-from tools.train.drives.windows import relative
+from tools.train.drives.futures import label_futures, relative
 
 TURN_RADPS, SPEED_MPS = 0.2, 0.8
 

@@ -1,1 +1,1 @@
-"""Records drives: the expert's, rounds of DAgger, and tours for the language model."""
+"""Recording of drives: the expert's, DAgger rounds, and tours for the language model."""

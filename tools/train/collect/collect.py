@@ -1,4 +1,4 @@
-"""The first stage: the expert drives through training scenes, and every frame is recorded with what it did next."""
+"""The first stage: the expert drives through training scenes; every frame is recorded with the expert's next motion."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ PREFIX = "e"
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """What is to be done: drives, by the throughput of all processes together."""
+    """Return (description, number, key of the throughput of all processes together) of this stage's work."""
     return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "drive")]
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Record the recipe's drives into `collect/`; goes on where a run before was ended. Raises CollectError."""
+    """Record the recipe's drives into `collect/`, or continue an interrupted recording. Raises CollectError."""
     config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
     if job.ranks.world > 1:
-        raise CollectError("collect starts processes of its own (collect.jobs): run it without torchrun")
+        raise CollectError("collect starts its own processes (collect.jobs): run it without torchrun")
     collection = Collection(PREFIX, config.episodes, job.seed, 0, config)
     with DatasetWriter(job.run_dir.stage("collect")) as writer:
         fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)

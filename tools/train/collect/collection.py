@@ -1,4 +1,4 @@
-"""Drives of many scenarios, recorded by worker processes into one data set: what `collect` and `dagger` share."""
+"""Recording of many drives by worker processes into one data set, for `collect`, `dagger` and tours."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from tools.train.scenes.scenarios import KEPT_SEEDS, MAX_SEED
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
 _TAG: Final = 0xC0
-_MOST_DROPPED: Final = 0.5  # of the drives: with more, something is wrong that no further drive mends
+_MOST_DROPPED: Final = 0.5
+"""Share of unusable drives above which the recording fails: the cause lies outside single drives."""
 
 
 class CollectError(Exception):
-    """A collection that cannot begin; one line: what, and what to do."""
+    """A collection that cannot start; one line."""
 
 
 class CollectFailedError(StageFailedError):
-    """A collection that cannot go on; one line: what."""
+    """A collection that cannot continue; one line."""
 
 
 @dataclass(frozen=True)
 class Collection:
-    """`count` drives, their ids beginning with `prefix`; `seed` of the run's stage, `turn` of the collection in it."""
+    """Description of `count` drives with ids that begin with `prefix`; `turn` separates the collections of one seed."""
 
     prefix: str
     count: int
@@ -48,16 +49,16 @@ class Collection:
     tour: TourConfig | None = None
 
     def orders(self, folder: Path, has: Callable[[str], bool]) -> list[Order]:
-        """One order a layout, of those that lack a drive."""
+        """Return one order for each layout that lacks a drive; `has` tells which drives are done."""
         rng = np.random.default_rng((self.seed, self.turn, _TAG))
         scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
         if scenario_seed in KEPT_SEEDS:
             scenario_seed -= len(KEPT_SEEDS)
-        # Jobs are no part of an order: it must not matter how many there are.
+        # An order does not contain `jobs`: their number must not change the drives.
         config = replace(self.config, jobs=0)
         orders, size = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
         for start in range(0, self.count, size):
-            # A whole layout always, so that the same tasks are found in it whatever the count.
+            # Always a whole layout, so that its tasks do not depend on the count.
             order = Order(
                 str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy, self.tour
             )
@@ -77,7 +78,7 @@ def fill(
     stopped: Callable[[], bool] = lambda: False,
     command: Sequence[str] = WORKER,
 ) -> None:
-    """Record what the data set lacks. Raises CollectFailedError, OSError, and KeyboardInterrupt when `stopped`."""
+    """Record the drives that the data set lacks. Raises CollectFailedError, OSError, KeyboardInterrupt if `stopped`."""
     waiting = deque(collection.orders(writer.folder, writer.has))
     under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
     logs = writer.folder / "logs"
@@ -136,10 +137,10 @@ def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: d
 
 
 def job_count(asked: int) -> int:
-    """Processes to run at a time: as asked, or one a core that this process may use."""
+    """Return the number of parallel processes: `asked`, or one per available core if it is 0."""
     return asked if asked else len(os.sched_getaffinity(0))
 
 
 def result_of(writer: DatasetWriter, prefix: str) -> dict[str, Any]:
-    """Counts of a collection and the hash of the whole data set."""
+    """Return the counts of a collection and the hash of the whole data set."""
     return {**writer.summary(prefix), "sha256": writer.finish().sha256}

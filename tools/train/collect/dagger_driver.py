@@ -1,4 +1,4 @@
-"""A policy that drives while the expert looks on: exported artifacts, in the very code that drives on a robot."""
+"""The policy of a DAgger drive: exported artifacts, run by the robot's code."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.suite.episode import Episode
-from tools.train.collect.steering import Shared, Velocity
+from tools.train.collect.steering import SharedControl, Velocity
 from tools.train.drives.drive import POLICY_DRIVER
 
-SHORTEST_S: Final = 0.5  # no generation is faster
+SHORTEST_S: Final = 0.5
+"""Shortest latency of a generation, s."""
 LONGEST_S: Final = 6.0
-_TIMES: Final = 16  # of one drive's profile
-_SPREAD: Final = 0.25  # they lie so near their mean
+"""Longest mean latency of a drive, s."""
+_TIMES: Final = 16  # latencies in one drive's profile
+_SPREAD: Final = 0.25  # largest relative deviation of a latency from the drive's mean
 
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Which artifacts drive, how often the expert steers instead, and how long their generations take on average."""
+    """Artifacts that drive, share `beta` of the expert's commands, and mean latency of generations, s."""
 
     artifacts: str
     manifest_sha256: str
@@ -38,7 +40,7 @@ class PolicyOptions:
 
 
 def draw_latency(mean_s: float, rng: np.random.Generator) -> LatencyProfile:
-    """Times of one drive: a mean of its own, from 0.5 s up to twice `mean_s` (6 s at most), and times about that."""
+    """Draw the latencies of one drive around its own mean, which lies between 0.5 s and 2 `mean_s` (6 s at most)."""
     longest_s = min(max(2 * mean_s, SHORTEST_S), LONGEST_S)
     own_s = float(rng.uniform(SHORTEST_S, longest_s))
     times = tuple(round(float(own_s * share), 3) for share in rng.uniform(1 - _SPREAD, 1 + _SPREAD, _TIMES))
@@ -46,7 +48,7 @@ def draw_latency(mean_s: float, rng: np.random.Generator) -> LatencyProfile:
 
 
 class PolicyDriver:
-    """One drive of the artifacts; raises ArtifactError, InstructionError."""
+    """The artifacts' policy in one drive. Raises ArtifactError, InstructionError."""
 
     def __init__(self, options: PolicyOptions, episode: Episode, rng: np.random.Generator) -> None:
         latency = draw_latency(options.latency_mean_s, rng)
@@ -55,12 +57,15 @@ class PolicyDriver:
         if self._policy.manifest_sha256 != options.manifest_sha256:
             raise ArtifactError(f"{directory}: not the artifacts that this round was started with")
         self.name = f"{POLICY_DRIVER}{options.manifest_sha256[:12]}"
-        self._shared = Shared(rng, options.beta)
+        self._shared = SharedControl(rng, options.beta)
         instruction = episode.instructions[int(rng.integers(len(episode.instructions)))]
         self._policy.reset(episode, instruction, None, episode.seed)
 
     def steer(self, observation: Observation, wanted: Velocity) -> tuple[Velocity, int]:
-        """What is commanded: the policy's, or in the expert's stretches `wanted`; the policy sees every frame."""
+        """Return the command and its source: the policy's, or `wanted` in the expert's stretches.
+
+        The policy processes every frame.
+        """
         return self._shared.command(wanted, self._policy.act(observation))
 
     def __enter__(self) -> PolicyDriver:

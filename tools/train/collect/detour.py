@@ -1,4 +1,4 @@
-"""Some other place that a robot leaves its told way for, for a while: what there is to learn is how it comes back."""
+"""Detours: the robot leaves the route for another place and comes back, so that coming back can be learned."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from sim_hil.scene.scene import Vec2
 from tools.train.collect.steering import Velocity
 from tools.train.scenes.sites import Site
 
-_LATEST: Final = 0.8  # of the way is behind it at most where it leaves it
-_LEAST_M: Final = 1.0
-_NEAR_M: Final = 1.0  # to the other place, where it turns back at the latest
-_MISTAKEN: Final = 0.6  # of detours are into a wrong opening, where there is one
-_INTO_M: Final = 2.0  # so deep it goes into one before it turns back
-_BEFORE_M: Final = 1.5  # of the mouth, or of where the way turns off before it, it leaves the way
-_GRAIN_M: Final = 0.1
-_NEARBY_M: Final = 8.0  # from the one that is to be taken
-_SAME_M: Final = 1.0
-_NEXT_M: Final = 15.0  # the one counted next to it may be farther away
+_LATEST: Final = 0.8  # a detour begins within this share of the route's length
+_LEAST_M: Final = 1.0  # shortest detour
+_NEAR_M: Final = 1.0  # distance to the other place at which the robot turns back
+_MISTAKEN: Final = 0.6  # share of detours into a wrong opening, if the route has one
+_INTO_M: Final = 2.0  # depth that the robot enters a wrong opening
+_BEFORE_M: Final = 1.5  # distance before the opening, or before the route's turn, at which the detour begins
+_GRAIN_M: Final = 0.1  # spacing of the points at which a route is sampled
+_NEARBY_M: Final = 8.0  # distance to the correct opening within which another one is mistaken for it
+_SAME_M: Final = 1.0  # openings closer than this to the correct one are the correct one
+_NEXT_M: Final = 15.0  # the same distance for the openings counted before and after it
 
 
 @dataclass(frozen=True)
 class Detour:
-    """Towards `to` (x m, y m in the world) after `after_m` of driving, for `for_m` of it."""
+    """A detour towards `to` (x m, y m in the world) that begins after `after_m` of driving and lasts `for_m`."""
 
     to: Vec2
     after_m: float
@@ -43,9 +43,9 @@ class Detour:
 
 
 def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.random.Generator) -> Detour | None:
-    """A detour from a task's way: into a wrong opening, as who has miscounted takes, or up to `most_m` to anywhere.
+    """Draw a detour from a task's route: into a wrong opening, as after miscounting, or up to `most_m` to any place.
 
-    None where no place was found.
+    Returns None if no place was found.
     """
     mistaken, where, far = (float(value) for value in rng.uniform(size=3))
     if mistaken < _MISTAKEN and (found := wrong_opening(site, robot, task, rng)) is not None:
@@ -58,7 +58,7 @@ def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.rando
 
 
 def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) -> Detour | None:
-    """Into some other opening near one that is to be taken."""
+    """Draw a detour into an opening near the correct one; None if there is none."""
     choices = [(step, opening) for step in task.told.steps for opening in _others(site, step)]
     if not choices:
         return None
@@ -67,20 +67,20 @@ def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) 
     middle_m, across_m = opening.middle_m, frame.across(step.at)
     mouth = frame.point(middle_m, across_m)
     low_m, high_m = frame.span(bounds_of(opening.area))[1]
-    # A passage that is crossed begins on the other side already.
+    # A crossed passage already begins on the other side of the route.
     edge_m = max(low_m, across_m) if sign > 0 else min(high_m, across_m)
     depth_m = high_m - edge_m if sign > 0 else edge_m - low_m
     inside = frame.point(middle_m, edge_m + sign * min(_INTO_M + _NEAR_M, 0.7 * depth_m))
     to = site.robot_grid(robot).nearest_free(*inside)
     if to is None or not opening.area.contains(*to):
         return None
-    # One that comes after the right one is missed by passing that, not by leaving where it leads.
+    # An opening behind the correct one is reached by passing the correct one, not from within it.
     along_m, (x, y) = min(_nearest_on(task.path, mouth), _nearest_on(task.path, step.at))
     return Detour(to, max(along_m - _BEFORE_M, 0.0), _BEFORE_M + 1.5 * hypot(to[0] - x, to[1] - y))
 
 
 def _others(site: Site, step: Step) -> list[Opening]:
-    """Openings that a step's is mistaken for: those counted next to it, and any to the sides not far from it."""
+    """Return openings that can be mistaken for a step's: those counted before and after it, and others close to it."""
     frame = Frame(step.ahead)
     at_m, across_m = frame.along(step.at), frame.across(step.at)
     found = [
@@ -100,7 +100,7 @@ def _others(site: Site, step: Step) -> list[Opening]:
 
 
 def _nearest_on(path: Sequence[Vec2], point: Vec2) -> tuple[float, Vec2]:
-    """How far along a path its point nearest to another one is, m, and which that is."""
+    """Return the distance along a path to its point nearest to `point`, m, and that nearest point."""
     corners = np.array(path, np.float64)
     lengths = np.hypot(*np.diff(corners, axis=0).T)
     marks = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -110,8 +110,8 @@ def _nearest_on(path: Sequence[Vec2], point: Vec2) -> tuple[float, Vec2]:
     return float(at[nearest]), (float(xs[nearest]), float(ys[nearest]))
 
 
-class Course:
-    """Whether one is on a detour, by how far one has come."""
+class DetourProgress:
+    """Tracks by the driven distance whether a detour is active."""
 
     def __init__(self, detour: Detour) -> None:
         self._detour = detour
@@ -119,13 +119,13 @@ class Course:
         self._over = False
 
     @property
-    def aside(self) -> bool:
-        """Whether to drive to the other place now."""
+    def active(self) -> bool:
+        """Whether the robot drives to the other place now."""
         return not self._over and self._gone_m >= self._detour.after_m
 
-    def went(self, gone_m: float, pose: SE2) -> None:
-        """So far, to this pose."""
-        if self.aside:
+    def advance(self, gone_m: float, pose: SE2) -> None:
+        """Add the distance driven to `pose`, m."""
+        if self.active:
             self._off_m += gone_m
             (x, y), far = self._detour.to, self._off_m >= self._detour.for_m
             self._over = far or hypot(x - pose.x_m, y - pose.y_m) < _NEAR_M
@@ -133,22 +133,22 @@ class Course:
 
 
 class DetourDriver:
-    """Drives to the other place as an expert would, while the course is aside."""
+    """An expert that drives to the other place while the detour is active."""
 
     def __init__(self, detour: Detour, episode: Episode, world: EpisodeWorld, teacher: ExpertPolicy) -> None:
-        """Raises ValueError where there is no way to it, or it is where the episode begins."""
+        """Raises ValueError if there is no path to the place, or the episode begins there."""
         elsewhere = replace(episode, goal_xy=detour.to, threshold_m=_NEAR_M)
         self._expert = teacher.alike()
         self._expert.reset(elsewhere, episode.instructions[0], world, episode.seed)
-        self._course, self._world, self._last = Course(detour), world, world.pose()
+        self._progress, self._world, self._last = DetourProgress(detour), world, world.pose()
 
     def command(self, observation: Observation) -> Velocity | None:
-        """What is commanded instead of the teacher's command; None while the teacher drives."""
+        """Return the command that replaces the teacher's; None while the detour is not active."""
         pose = self._world.pose()
-        self._course.went(hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m), pose)
+        self._progress.advance(hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m), pose)
         self._last = pose
-        return self._expert.act(observation) if self._course.aside else None
+        return self._expert.act(observation) if self._progress.active else None
 
     def close(self) -> None:
-        """Forget the world."""
+        """Release the world."""
         self._expert.close()

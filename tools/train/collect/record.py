@@ -1,4 +1,4 @@
-"""One drive recorded: the world, who drives in it, and what is kept of every frame."""
+"""Recording of one drive: the simulated world, the source of commands, and the data of every frame."""
 
 from __future__ import annotations
 
@@ -23,37 +23,38 @@ from tools.train.drives.drive import NOISE, PICTURE_PX, PLAN_TIMES_S
 from tools.train.drives.futures import chosen_future, label_futures
 
 Steer = Callable[[Observation, Velocity], tuple[Velocity, int]]
-"""From what is observed and what the expert wants to what is commanded, and whose that is (EXPERT, NOISE, POLICY)."""
-Tell = Callable[[EpisodeWorld, NDArray[np.float64]], Mapping[str, Any]]
-"""From the world and what the expert has chosen ([50, 3]) to the trace of this instant; asked once a second."""
+"""Maps (observation, the expert's command) to (command, its source: EXPERT, NOISE or POLICY)."""
+TraceAt = Callable[[EpisodeWorld, NDArray[np.float64]], Mapping[str, Any]]
+"""Maps (world, the expert's chosen future [50, 3]) to the trace of this instant; called once a second."""
 
-LEAST_FRAMES: Final = 30  # a shorter drive teaches nothing
-_BEFORE_CRASH: Final = 20  # frames: what led to a collision or a fall is not to be learned
-_PUPIL_STUCK_S: Final = 15.0
-_EXPERT_STUCK_S: Final = 40.0  # it may wait for people; for longer than this there is nothing to see
-_STUCK_M: Final = 0.5
-_OFF_M: Final = 6.0
+LEAST_FRAMES: Final = 30
+"""Shortest usable drive, frames."""
+_BEFORE_CRASH: Final = 20  # frames before a collision or fall that are discarded: they lead into it
+_POLICY_STUCK_S: Final = 15.0
+_EXPERT_STUCK_S: Final = 40.0  # longer than the policy's, because the expert waits for people
+_STUCK_M: Final = 0.5  # the robot is stuck if it stays within this distance for that time
+_OFF_M: Final = 6.0  # a policy's drive ends at this distance from the route
 
 
 class NothingToLearnError(Exception):
-    """A drive of which there is nothing to keep; its text says why, in a few words that many drives share."""
+    """A drive without usable frames; its text is a short reason, by which drives are counted."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """How the pictures of a drive are made: rendered at `render_px` (square), shrunk to 128, kept as JPEG."""
+class CameraSettings:
+    """Rendering of a drive's images: `render_px` square, reduced to 128 px, stored as JPEG."""
 
     render_px: int = PICTURE_PX
     jpeg_quality: int = 90
 
     def __post_init__(self) -> None:
         if not PICTURE_PX <= self.render_px <= 1024 or not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"expected pictures of {PICTURE_PX} to 1024 px and a quality of 1 to 100, found {self}")
+            raise ValueError(f"expected images of {PICTURE_PX} to 1024 px and a quality of 1 to 100, found {self}")
 
 
 @dataclass
 class Recorded:
-    """Frames of a drive that has ended; what `finish` keeps of them goes into a Drive."""
+    """Outcome and usable frames of a finished drive."""
 
     outcome: str
     collided: bool
@@ -75,46 +76,46 @@ class _Frames:
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """What is driven: the episode in its scene, and how it is looked at.
+    """One drive to record: episode, scene, cameras and conditions.
 
-    `path` [n, 2]: the told way, m. With `pupil` a policy drives: what goes wrong is kept, as there is something to
-    learn from it, until it has gone 6 m from the way or has stayed where it is for 15 s. The expert's drives are kept
-    up to their trouble, and none that goes further than `off_m` from the way: it would not be what the words say.
-    `linger_s`: for so long it is looked at after it has arrived. `detour`: it leaves its way for a while, if it can.
+    `path` [n, 2]: the described route, m. With `policy_drives` a policy commands: its mistakes are recorded, until it
+    is 6 m off the route or stuck for 15 s. The expert's drives end before a collision or fall; those farther than
+    `off_m` from the route are rejected, because the instruction would not describe them. `linger_s`: recording after
+    arrival, s. `detour`: temporary departure from the route, if it is possible.
     """
 
     episode: Episode
     scene: Scene
     path: NDArray[np.float64]
-    look: Look
+    camera: CameraSettings
     drift: str
-    pupil: bool = False
+    policy_drives: bool = False
     off_m: float = 4.0
     linger_s: float = 0.0
     detour: Detour | None = None
 
 
-def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> Recorded:
-    """Drive and record. Raises NothingToLearnError where less than 3 s can be learned from, SceneError, ValueError."""
+def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, trace_at: TraceAt) -> Recorded:
+    """Drive and record. Raises NothingToLearnError if less than 3 s are usable, SceneError, ValueError."""
     frames = _Frames()
-    options = WorldOptions(camera=(plan.look.render_px,) * 2, drift=plan.drift, linger_s=plan.linger_s)
+    options = WorldOptions(camera=(plan.camera.render_px,) * 2, drift=plan.drift, linger_s=plan.linger_s)
     first_collision: int | None = None
     with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
         try:
             expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
         except ValueError as error:
-            raise NothingToLearnError("the expert sees no way") from error
-        aside = _aside(plan, world, expert)
+            raise NothingToLearnError("the expert finds no path") from error
+        detour = _detour_driver(plan, world, expert)
         try:
             while not world.done:
                 observation = _shrunk(world.observe())
                 wanted = expert.act(observation)
                 command, by = steer(observation, wanted)
-                if aside is not None and (elsewhere := aside.command(observation)) is not None:
-                    command, by = elsewhere, NOISE
+                if detour is not None and (departing := detour.command(observation)) is not None:
+                    command, by = departing, NOISE
                 _keep(frames, plan, world, observation, expert, by)
                 if len(frames.traces) * TRACE_EVERY < len(frames.pose):
-                    frames.traces.append(tell(world, frames.chosen[-1]))
+                    frames.traces.append(trace_at(world, frames.chosen[-1]))
                 world.step(command)
                 if first_collision is None and world.collided:
                     first_collision = len(frames.pose)
@@ -122,19 +123,19 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, tell: Tell) -> R
                     world.stop()
         finally:
             expert.close()
-            if aside is not None:
-                aside.close()
+            if detour is not None:
+                detour.close()
         end, collided = world.end, world.collided
     outcome = "cut" if end == "stopped" else str(end)
     return _finish(frames, plan, outcome, collided, first_collision)
 
 
-def _aside(plan: DrivePlan, world: EpisodeWorld, expert: ExpertPolicy) -> DetourDriver | None:
+def _detour_driver(plan: DrivePlan, world: EpisodeWorld, expert: ExpertPolicy) -> DetourDriver | None:
     if plan.detour is None:
         return None
     try:
         return DetourDriver(plan.detour, plan.episode, world, expert)
-    except ValueError:  # there is no way to that place
+    except ValueError:  # there is no path to the place
         return None
 
 
@@ -151,10 +152,11 @@ def _keep(
 ) -> None:
     pose, choice = world.pose(), expert.choice
     if observation.image is None or choice is None:
-        raise ValueError("recording: expected a picture and a choice in every frame")
-    done, jpeg = cv2.imencode(".jpg", observation.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, plan.look.jpeg_quality])
+        raise ValueError("recording: expected an image and an expert's choice in every frame")
+    quality = [cv2.IMWRITE_JPEG_QUALITY, plan.camera.jpeg_quality]
+    done, jpeg = cv2.imencode(".jpg", observation.image[..., ::-1], quality)
     if not done:
-        raise ValueError("recording: a picture could not be compressed")
+        raise ValueError("recording: an image could not be compressed")
     frames.jpegs.append(np.asarray(jpeg, np.uint8).ravel())
     frames.pose.append(pose.as_tuple())
     frames.pose_odom.append(observation.T_odom_base.as_tuple())
@@ -165,10 +167,10 @@ def _keep(
 
 
 def is_hopeless(pose: NDArray[np.float64], plan: DrivePlan) -> bool:
-    """Whether a drive is to be cut; `pose` [N, 3] so far: it has stayed within 0.5 m, or a pupil is 6 m off the way."""
-    if plan.pupil and off_way_m(pose[-1, :2], plan.path) > _OFF_M:
+    """Return whether to end a drive: stuck within 0.5 m, or a policy is 6 m off the route. `pose` [N, 3] so far."""
+    if plan.policy_drives and off_way_m(pose[-1, :2], plan.path) > _OFF_M:
         return True
-    frames = round((_PUPIL_STUCK_S if plan.pupil else _EXPERT_STUCK_S) * RATE_HZ)
+    frames = round((_POLICY_STUCK_S if plan.policy_drives else _EXPERT_STUCK_S) * RATE_HZ)
     if len(pose) <= frames:
         return False
     lately = pose[-frames:, :2]
@@ -176,7 +178,7 @@ def is_hopeless(pose: NDArray[np.float64], plan: DrivePlan) -> bool:
 
 
 def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
-    """Distance from a point to a polyline [n, 2], m."""
+    """Return the distance from a point to a polyline [n, 2], m."""
     if len(path) < 2:
         return float(hypot(*(point - path[0])))
     a, way = path[:-1], np.diff(path, axis=0)
@@ -186,15 +188,16 @@ def off_way_m(point: NDArray[np.float64], path: NDArray[np.float64]) -> float:
 
 
 def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, first_collision: int | None) -> Recorded:
-    count = kept_frames(np.array(frames.pose), outcome, first_collision, pupil=plan.pupil)
+    count = kept_frames(np.array(frames.pose), outcome, first_collision, policy_drives=plan.policy_drives)
     if count < LEAST_FRAMES:
-        trouble = outcome if first_collision is None or plan.pupil else "collided"
-        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s before trouble ({trouble})")
-    if not plan.pupil and max(off_way_m(point, plan.path) for point in np.array(frames.pose)[:count, :2]) > plan.off_m:
-        raise NothingToLearnError("it left the way that it was told")
+        reason = outcome if first_collision is None or plan.policy_drives else "collided"
+        raise NothingToLearnError(f"less than {LEAST_FRAMES / RATE_HZ:g} s are usable ({reason})")
+    farthest_m = max(off_way_m(point, plan.path) for point in np.array(frames.pose)[:count, :2])
+    if not plan.policy_drives and farthest_m > plan.off_m:
+        raise NothingToLearnError("it left the described route")
     pose, by = np.array(frames.pose)[:count], np.array(frames.by, np.uint8)[:count]
     whole = outcome == "reached" and count == len(frames.pose)
-    future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.pupil)
+    future, steps = label_futures(pose, np.array(frames.chosen)[:count], by, goes_on=whole or plan.policy_drives)
     jpegs = frames.jpegs[:count]
     arrays: dict[str, NDArray[Any]] = {
         "jpeg": np.concatenate(jpegs),
@@ -211,16 +214,18 @@ def _finish(frames: _Frames, plan: DrivePlan, outcome: str, collided: bool, firs
     return Recorded(outcome, collided, arrays, traces)
 
 
-def kept_frames(pose: NDArray[np.float64], outcome: str, first_collision: int | None, *, pupil: bool = False) -> int:
-    """How many frames of a drive are learned from: those before its trouble; `pose` [N, 3].
+def kept_frames(
+    pose: NDArray[np.float64], outcome: str, first_collision: int | None, *, policy_drives: bool = False
+) -> int:
+    """Return the number of usable frames of a drive; `pose` [N, 3].
 
-    `first_collision`: the frame by which it had collided, if it did. A pupil's trouble is what it learns from, but for
-    a fall, out of which nobody drives.
+    `first_collision`: first frame after a collision, None without one. Of a policy's drive all frames are usable,
+    except those before a fall, from which no command recovers.
     """
     count = len(pose) - (_BEFORE_CRASH if outcome == "fell" else 0)
-    if pupil:
+    if policy_drives:
         return max(count, 0)
-    if outcome in ("timeout", "cut"):  # the time it stood at the end, waiting for what never came
+    if outcome in ("timeout", "cut"):  # discard the standing at the end, except 1 s of it
         gaps = np.hypot(*(pose[:, :2] - pose[-1, :2]).T)
         count = min(count, int(np.max(np.flatnonzero(gaps > _STUCK_M), initial=-1)) + 1 + RATE_HZ)
     if first_collision is not None:

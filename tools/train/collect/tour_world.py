@@ -1,8 +1,8 @@
-"""A robot that is carried along a told way: what it would see and should say once a second, and not how it walks there.
+"""Tours: a robot without physics follows a described route; its images and true reasoning texts are recorded.
 
-A recorded drive is physics, an expert that weighs futures ten times a second, and ten pictures a second. Words need
-one picture a second, and a body that glides as a walking one goes: swaying, at changing speeds, halting now and then,
-and at times off to some other place and back again.
+A drive needs physics, an expert that evaluates futures at 10 Hz, and ten images per second. The language model needs
+one image per second from a body that moves roughly as a walking robot: it sways, changes speed, stops, and sometimes
+leaves the route and comes back.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.crowd.people import UPDATE_HZ, People
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.simulation.camera import CameraWorld
-from tools.train.collect.detour import Course, draw_detour
-from tools.train.collect.record import Look, NothingToLearnError, Recorded
+from tools.train.collect.detour import DetourProgress, draw_detour
+from tools.train.collect.record import CameraSettings, NothingToLearnError, Recorded
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
 from tools.train.encoder.poses import body_state
@@ -42,31 +42,31 @@ Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
 
 _STEP_S: Final = 1.0 / RATE_HZ
-_REACH_M: Final = 10.0  # of a route: 9 s of it
-_VIEW_M: Final = 12.0  # who stands about within this is led round
-_STANDING_MPS: Final = 0.25
-_OFF_ROUTE_M: Final = 0.6
-_BLOCKED_M, _BLOCKED_RAD = 1.1, 1.0  # somebody so near ahead is waited for
-_PATIENCE_S: Final = 4.0  # and then passed, however close: people give way
-_SWAY_RADPS, _SWAY_S = 0.15, 1.5  # how much the steering sways (one standard deviation), and for how long one way
-_PACE_S: Final = (1.0, 6.0)  # for so long a pace is kept
-_HALT_SHARE: Final = 0.1  # of those times it halts, and for no longer than the next
-_HALT_S: Final = 2.5
-_SLOWEST: Final = 0.6  # of the expert's speed
-_ALLOWED_MPS: Final = 0.35  # a tour that is slower is given up
-_SPARE_S: Final = 30.0
-_DECOYS: Final = 8  # tries to find some other place
-_THERE_M: Final = 0.25  # so near the end of a route it has been reached
+_REACH_M: Final = 10.0  # planned length of a route: 9 s of driving
+_VIEW_M: Final = 12.0  # the route avoids people who stand within this distance
+_STANDING_MPS: Final = 0.25  # speed below which a person counts as standing
+_OFF_ROUTE_M: Final = 0.6  # the previous route is reused within this distance
+_BLOCKED_M, _BLOCKED_RAD = 1.1, 1.0  # the robot waits for a person within this distance and bearing
+_PATIENCE_S: Final = 4.0  # longest wait; then the robot goes on, because people give way
+_SWAY_RADPS, _SWAY_S = 0.15, 1.5  # standard deviation and correlation time of the yaw rate's noise
+_PACE_S: Final = (1.0, 6.0)  # range of the time between two changes of pace
+_HALT_SHARE: Final = 0.1  # share of these changes that are a halt
+_HALT_S: Final = 2.5  # longest halt
+_SLOWEST: Final = 0.6  # slowest pace as a share of the expert's speed
+_ALLOWED_MPS: Final = 0.35  # a tour with a lower mean speed is given up
+_SPARE_S: Final = 30.0  # time allowed in addition
+_DECOYS: Final = 8  # attempts to draw a detour
+_THERE_M: Final = 0.25  # distance to the end of a route at which it counts as reached
 
 
-class Carriage:
-    """The people of one layout and the cameras that see them, for one tour after the other.
+class TourWorld:
+    """People and cameras of one layout, reused by its tours.
 
-    Everybody looks the same in all of them; where they are, and walk, is each tour's own.
+    The people's appearance is the same in all tours; their positions and paths are each tour's own.
     """
 
     def __init__(self, site: Site, people: int) -> None:
-        """`people`: at most; a small layout has no room for many."""
+        """`people`: upper limit of their number; a small layout has room for fewer."""
         self.site = site
         while people and not _has_room(site, people):
             people //= 2
@@ -75,27 +75,27 @@ class Carriage:
         self._cameras: dict[str, CameraWorld] = {}
 
     def fill(self, episode: Episode) -> None:
-        """Let other people come, nobody near the start. Raises NothingToLearnError where they find no room."""
+        """Place new people, none near the start. Raises NothingToLearnError if there is no room."""
         try:
             self._people = People(replace(self.site.scene, start=episode.start), self.count, episode.seed)
         except ValueError as error:
             raise NothingToLearnError("no room for its people") from error
 
     def people(self) -> Array:
-        """[n, 3]: x m, y m, heading rad."""
+        """Return the people's poses [n, 3]: x m, y m, heading rad."""
         return self._people.poses()
 
     def velocities(self) -> Array:
-        """[n, 2]: m/s in the world."""
+        """Return the people's velocities [n, 2], m/s in the world."""
         return self._people.velocities()
 
     def wait(self, pose: SE2) -> None:
-        """Let everybody walk for a tenth of a second, the robot being at a pose."""
+        """Advance the people by 0.1 s with the robot at `pose`."""
         for _ in range(UPDATE_HZ // RATE_HZ):
             self._people.step(pose.x_m, pose.y_m, pose.theta_rad)
 
-    def picture(self, robot: str, pose: SE2, look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """What a robot sees from a pose now, as a JPEG."""
+    def picture(self, robot: str, pose: SE2, settings: CameraSettings, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """Render the robot's image from a pose as JPEG bytes."""
         if robot not in self._cameras:
             self._cameras[robot] = CameraWorld(
                 self.site.scene, people=self.count, seed=self.site.layout_seed, robot=robot
@@ -105,11 +105,11 @@ class Carriage:
         state = np.zeros(camera.state_size)
         state[:7] = body_state(self.site.scene, robot, pose.as_tuple(), rng)
         state[len(state) - len(rows) :] = rows
-        picture = camera.render(state, look.render_px, look.render_px, ASPECT)
-        if look.render_px != PICTURE_PX:
+        picture = camera.render(state, settings.render_px, settings.render_px, ASPECT)
+        if settings.render_px != PICTURE_PX:
             small = cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
             picture = np.asarray(small, np.uint8)
-        return encoded(picture, look.jpeg_quality)
+        return encoded(picture, settings.jpeg_quality)
 
     def close(self) -> None:
         """Release the renderers."""
@@ -119,8 +119,8 @@ class Carriage:
 
 
 @dataclass
-class Glider:
-    """A body that is steered along routes without being pushed by anything; never into a wall."""
+class KinematicBase:
+    """A body without physics that is steered along routes and stops at walls."""
 
     pose: SE2
     driving: Driving
@@ -133,7 +133,7 @@ class Glider:
     _kept_s: float = 0.0
 
     def step(self, route: Array, *, halted: bool = False) -> float:
-        """A tenth of a second along `route` [n, 2], points 0.1 m apart from here on; how far it came, m."""
+        """Move for 0.1 s along `route` [n, 2], whose points are 0.1 m apart; return the distance moved, m."""
         self._change_pace()
         left_m = 0.1 * (len(route) - 1)
         at = min(round((0.45 + 0.45 * self.speed_mps) * 10), len(route) - 1)
@@ -173,16 +173,16 @@ class Glider:
         return gone
 
 
-def carried(
-    scenario: Scenario, carriage: Carriage, config: TourConfig, look: Look, drift: str, collect: CollectConfig,
-    rng: np.random.Generator,
+def record_tour(
+    scenario: Scenario, world: TourWorld, config: TourConfig, camera: CameraSettings, drift: str,
+    collect: CollectConfig, rng: np.random.Generator,
 ) -> Recorded:  # fmt: skip
-    """Carry a robot along a scenario's way. `drift`: of its odometry, as of a drive's.
+    """Move a robot along a scenario's route and record it. `drift`: name of the odometry drift.
 
-    Raises NothingToLearnError where there is no way, or where it does not arrive.
+    Raises NothingToLearnError if there is no path, or the robot does not arrive in time.
     """
-    carriage.fill(scenario.episode)
-    tour = _Tour(scenario, carriage, config, collect, rng)
+    world.fill(scenario.episode)
+    tour = _Tour(scenario, world, config, collect, rng)
     odometer = Odometer(drift, scenario.episode.seed, tour.body.pose)
     jpegs: list[NDArray[np.uint8]] = []
     ends: list[int] = []
@@ -191,14 +191,14 @@ def carried(
     while not tour.over:
         tour.look_ahead()
         if len(ends) % TRACE_EVERY == 0:
-            jpegs.append(carriage.picture(scenario.episode.robot, tour.body.pose, look, rng))
+            jpegs.append(world.picture(scenario.episode.robot, tour.body.pose, camera, rng))
             traces.append(tour.trace())
         ends.append((ends[-1] if ends else 0) + (len(jpegs[-1]) if len(ends) % TRACE_EVERY == 0 else 0))
         rows["pose"].append(tour.body.pose.as_tuple())
         rows["pose_odom"].append(odometer.pose.as_tuple())
         rows["state"].append(odometer.velocity())
         rows["plan_xy"].append(tour.plan)
-        tour.go_on()
+        tour.step()
         odometer.step(tour.body.pose, _STEP_S)
     count = len(ends)
     arrays: dict[str, NDArray[Any]] = {
@@ -216,39 +216,39 @@ def carried(
 
 
 class _Tour:
-    """A tour under way."""
+    """A tour while it is recorded."""
 
     def __init__(
-        self, scenario: Scenario, carriage: Carriage, config: TourConfig, collect: CollectConfig,
+        self, scenario: Scenario, world: TourWorld, config: TourConfig, collect: CollectConfig,
         rng: np.random.Generator,
     ) -> None:  # fmt: skip
         episode, site = scenario.episode, scenario.site
-        self._carriage, self._config, self._rng, self._site = carriage, config, rng, site
+        self._world, self._config, self._rng, self._site = world, config, rng, site
         self._robot, self._goal, self._task = episode.robot, episode.goal_xy, scenario.task
         self._near_m = collect.arrive_share * episode.threshold_m
         self._driving = driving_of(episode.robot)
         self._speed_mps = collect.speed_mps
         self._planner = self._planner_to(self._goal, NEAR * self._near_m, scenario.task.path)
         if not self._planner.reachable(*episode.start[:2]):
-            raise NothingToLearnError("the expert sees no way")
+            raise NothingToLearnError("the expert finds no path")
         self._tracer = Tracer(scenario)
-        self.body = Glider(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
+        self.body = KinematicBase(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
         self._route = np.array([episode.start[:2]])
         self._ticks, self._blocked_s = 0, 0.0
         self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
-        self._aside, self._aside_route = self._drawn_aside(), self._route
+        self._detour, self._detour_route = self._drawn_detour(), self._route
         self._linger_s: float | None = None
         self.plan: list[Vec2] = []
 
     def _paced(self) -> Driving:
         return replace(self._driving, speed_mps=self._speed_mps)
 
-    def _planner_to(self, goal: Vec2, near_m: float, told: tuple[Vec2, ...] = ()) -> RoutePlanner:
+    def _planner_to(self, goal: Vec2, near_m: float, described: tuple[Vec2, ...] = ()) -> RoutePlanner:
         robot = self._robot
-        return RoutePlanner(self._site.scene, goal, footprint_m(robot), max_step_m(robot), near_m, told)
+        return RoutePlanner(self._site.scene, goal, footprint_m(robot), max_step_m(robot), near_m, described)
 
-    def _drawn_aside(self) -> tuple[Course, RoutePlanner] | None:
-        """A way off the told one, and what leads there; None where it stays on it."""
+    def _drawn_detour(self) -> tuple[DetourProgress, RoutePlanner] | None:
+        """Draw a detour and its planner; None if the tour has none."""
         if float(self._rng.uniform()) >= self._config.stray_share:
             return None
         for _ in range(_DECOYS):
@@ -256,7 +256,7 @@ class _Tour:
             planner = None if detour is None else self._planner_to(detour.to, 0.5)
             if detour is not None and planner is not None and planner.reachable(*self._here):
                 self._left_s += 2 * detour.for_m / _ALLOWED_MPS
-                return Course(detour), planner
+                return DetourProgress(detour), planner
         return None
 
     @property
@@ -265,54 +265,54 @@ class _Tour:
 
     @property
     def over(self) -> bool:
-        """Whether it has arrived and stayed. Raises NothingToLearnError where it does not come on."""
+        """Whether the robot has arrived and the recording after arrival is done. Raises NothingToLearnError if late."""
         if self._left_s <= 0:
             raise NothingToLearnError("it did not arrive in time")
         return self._linger_s is not None and self._linger_s <= 0
 
     def look_ahead(self) -> None:
-        """Work out the way on from here."""
+        """Update the planned route from the current pose."""
         pose = self.body.pose
         self._route = from_here(self._route, pose)
-        self._aside_route = from_here(self._aside_route, pose)
+        self._detour_route = from_here(self._detour_route, pose)
         if self._ticks % TRACE_EVERY == 0:
             standing = self._standing()
             kept = self._route if hypot(*(self._route[0] - self._here)) < _OFF_ROUTE_M else None
             self._route = self._planner.route(self._here, standing, _REACH_M, kept)
-            if self._aside is not None and self._aside[0].aside:
-                self._aside_route = self._aside[1].route(self._here, standing, _REACH_M)
+            if self._detour is not None and self._detour[0].active:
+                self._detour_route = self._detour[1].route(self._here, standing, _REACH_M)
         self.plan = along(self._route, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
 
     def _standing(self) -> Array:
-        people, velocities, pose = self._carriage.people()[:, :2], self._carriage.velocities(), self.body.pose
+        people, velocities, pose = self._world.people()[:, :2], self._world.velocities(), self.body.pose
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m)
         return people[(gaps < _VIEW_M) & (np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDING_MPS)]
 
     def trace(self) -> Mapping[str, object]:
-        """What is to be said here."""
+        """Return the true reasoning text of this instant."""
         means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
-        people, velocities = self._carriage.people(), self._carriage.velocities()
+        people, velocities = self._world.people(), self._world.velocities()
         return aspects_json(self._tracer.trace(self.body.pose, people, velocities, means))
 
-    def go_on(self) -> None:
-        """A tenth of a second on."""
+    def step(self) -> None:
+        """Advance robot and people by 0.1 s."""
         arrived = hypot(self.body.pose.x_m - self._goal[0], self.body.pose.y_m - self._goal[1]) < self._near_m
         if arrived and self._linger_s is None:
             self._linger_s = float(self._rng.uniform(0.5, 1.0)) * self._config.linger_s
-        course = None if self._aside is None else self._aside[0]
-        aside = course is not None and course.aside and len(self._aside_route) > 1
-        gone = self.body.step(self._aside_route if aside else self._route, halted=self._halted())
-        if course is not None:
-            course.went(gone, self.body.pose)
-        self._carriage.wait(self.body.pose)
+        detour = None if self._detour is None else self._detour[0]
+        departed = detour is not None and detour.active and len(self._detour_route) > 1
+        gone = self.body.step(self._detour_route if departed else self._route, halted=self._halted())
+        if detour is not None:
+            detour.advance(gone, self.body.pose)
+        self._world.wait(self.body.pose)
         self._ticks += 1
         self._left_s -= _STEP_S
         if self._linger_s is not None:
             self._linger_s -= _STEP_S
 
     def _halted(self) -> bool:
-        """Whether it waits for somebody who is right before it, as it does for a while."""
-        people, pose = self._carriage.people(), self.body.pose
+        """Whether the robot waits for a person directly ahead."""
+        people, pose = self._world.people(), self.body.pose
         dx, dy = people[:, 0] - pose.x_m, people[:, 1] - pose.y_m
         bearings = (np.arctan2(dy, dx) - pose.theta_rad + pi) % (2 * pi) - pi
         blocked = bool(np.any((np.hypot(dx, dy) < _BLOCKED_M) & (np.abs(bearings) < _BLOCKED_RAD)))

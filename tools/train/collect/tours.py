@@ -1,7 +1,7 @@
-"""The tours beside a data set's drives, from which the language model learns and nobody else does.
+"""Tours of a data set, which train the language model alone.
 
-They lie in `tours/` of the data set's folder: data sets of their own with a picture of one frame a second, each in
-a folder whose name begins the hash of the numbers that it was made with.
+They lie in `tours/` of the data set's folder: separate data sets with one image per second, each in a folder named by
+the hash of its configuration.
 """
 
 from __future__ import annotations
@@ -24,25 +24,27 @@ from tools.train.samples.anchors import Anchor, anchors_of
 FOLDER: Final = "tours"
 FORMAT: Final = 3
 PREFIX: Final = "w"
-_TURN: Final = 500  # of collections: rounds of DAgger take those from 0 on, their experts those from 1000 on
-_OF_DRIVES: Final = frozenset(  # what a tour has in common with the drives beside it
+_TURN: Final = 500
+"""Collection number of tours: DAgger rounds use those from 0 on, their experts those from 1000 on."""
+_OF_DRIVES: Final = frozenset(  # fields of CollectConfig that tours use too
     (
         "kinds", "sharp_share", "jpeg_quality_min", "jpeg_quality_max", "typical_drift_share", "severe_drift_share",
         "speed_mps", "arrive_share",
     )
 )  # fmt: skip
-# Whether one waits for somebody, and how one goes round, is the driver's choice: of who is carried it is not known.
+# Waiting for a person and passing around one are the driver's choices, which a tour does not model.
 _IN_THE_WAY_M: Final = 2
+"""Distance of a person ahead up to which an anchor is left out, m."""
 
 
 def build_tours(
     dataset: Dataset, config: TourConfig, collect: CollectConfig, seed: int, *, ranks: Ranks,
     progress: StageProgress, stopped: Callable[[], bool] = lambda: False,
 ) -> Dataset:  # fmt: skip
-    """The tours, those that are not there yet made by the first rank's processes; all must call.
+    """Record missing tours in the first rank's processes and return all; every rank must call this function.
 
-    They have layouts of their own; those of a layout that the data set holds out are left out. Raises CollectError,
-    DriveError, OSError, and KeyboardInterrupt when `stopped`.
+    Tours in a layout that the data set holds out are left out. Raises CollectError, DriveError, OSError, and
+    KeyboardInterrupt if `stopped`.
     """
     folder = dataset.folder / FOLDER / _key(config, collect, seed)
     with ranks.by_first() as here:
@@ -57,14 +59,14 @@ def build_tours(
 
 
 def _key(config: TourConfig, collect: CollectConfig, seed: int) -> str:
-    """Of what a tour depends on: how many there are is no part of it, nor how many processes make them."""
-    looks = {name: value for name, value in asdict(collect).items() if name in _OF_DRIVES}
-    numbers = {"format": FORMAT, "seed": seed, **asdict(replace(config, count=0)), "collect": looks}
+    """Hash what a tour depends on; the numbers of tours and processes are not part of it."""
+    shared = {name: value for name, value in asdict(collect).items() if name in _OF_DRIVES}
+    numbers = {"format": FORMAT, "seed": seed, **asdict(replace(config, count=0)), "collect": shared}
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:
-    """Those of tours at which nobody is in the way; their frames are whole seconds, and words hold for these alone."""
+    """Yield the tours' anchors without a person in the way; only frames at whole seconds have images and text."""
     for drive in tours.drives(ids, pictures=False):
         clear = {int(trace["k"]) for trace in drive.traces if not _is_blocked(parse_people(str(trace["motion"])))}
         for anchor in anchors_of(drive):

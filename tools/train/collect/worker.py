@@ -1,6 +1,6 @@
-"""The process that records drives: some scenarios of one layout, one after the other, each in fresh physics.
+"""The worker process that records drives or tours of one layout, one after the other, each in a new simulation.
 
-What is drawn for a drive depends on the collection's seed and the drive's number alone.
+A drive's random numbers depend on the collection's seed and the drive's number alone.
 """
 
 from __future__ import annotations
@@ -26,9 +26,17 @@ from sim_hil.benchmark.workers.worker_process import Message, worker_main
 from sim_hil.scene.scene import SceneError
 from tools.train.collect.dagger_driver import PolicyDriver, PolicyOptions
 from tools.train.collect.detour import draw_detour
-from tools.train.collect.record import DrivePlan, Look, NothingToLearnError, Recorded, Steer, Tell, record
+from tools.train.collect.record import (
+    CameraSettings,
+    DrivePlan,
+    NothingToLearnError,
+    Recorded,
+    Steer,
+    TraceAt,
+    record,
+)
 from tools.train.collect.steering import SteeringNoise, Velocity
-from tools.train.collect.tour_world import Carriage, carried
+from tools.train.collect.tour_world import TourWorld, record_tour
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.config.scenes import SHARES
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
@@ -38,14 +46,14 @@ from tools.train.scenes.traces import Tracer
 
 MODULE: Final = "tools.train.collect.worker"
 _TAG: Final = 0xC011
-_PLAN_STEP: Final = 3 * RATE_HZ - 1  # of a future: where the robot means to be in 3 s
+_PLAN_STEP: Final = 3 * RATE_HZ - 1  # index of the planned pose in 3 s
 
 
 @dataclass(frozen=True)
 class Order:
-    """What one process is told: drives `start` to `start + count - 1` into `folder`, but for those in `skip`.
+    """Job of one process: record drives `start` to `start + count - 1` into `folder`, except those in `skip`.
 
-    `policy`: the artifacts that drive, and how; None where the expert does. `tour`: nobody drives, it is carried.
+    `policy`: artifacts that drive, and their options; None if the expert drives. `tour`: record tours instead.
     """
 
     folder: str
@@ -60,32 +68,32 @@ class Order:
     tour: TourConfig | None = None
 
     def id(self, number: int) -> str:
-        """Of a drive of this collection."""
+        """Return the id of a drive of this collection."""
         return f"{self.prefix}{number:05d}"
 
     def as_json(self) -> dict[str, Any]:
-        """What `of_json` reads."""
+        """Return the content that `of_json` reads."""
         return dict(plain(self))
 
     @staticmethod
     def of_json(content: Mapping[str, object]) -> Order:
-        """An order that `as_json` has written; raises FieldError."""
+        """Build the order that `as_json` wrote. Raises FieldError."""
         return build(Order, content, "order")
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What is drawn for one drive beside its scenario."""
+    """Random settings of one drive in addition to its scenario."""
 
     noise: bool
-    look: Look
+    camera: CameraSettings
     drift: str
     linger_s: float
     strays: bool
 
     @staticmethod
     def of(config: CollectConfig, seed: int, number: int) -> Draw:
-        """The same for the same numbers, whoever asks."""
+        """Draw the settings of drive `number`; equal arguments give equal settings."""
         rng = np.random.default_rng((seed, number, _TAG))
         noise, sharp, drift = (float(value) for value in rng.uniform(size=3))
         quality = int(rng.integers(config.jpeg_quality_min, config.jpeg_quality_max + 1))
@@ -93,7 +101,7 @@ class Draw:
         severe, typical = config.severe_drift_share, config.typical_drift_share
         return Draw(
             noise=noise < config.noise_share,
-            look=Look(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
+            camera=CameraSettings(2 * PICTURE_PX if sharp < config.sharp_share else PICTURE_PX, quality),
             drift="severe" if drift < severe else "typical" if drift < severe + typical else "none",
             linger_s=(1.0 + linger) / 2 * config.linger_s,
             strays=strays < config.stray_share,
@@ -101,9 +109,9 @@ class Draw:
 
 
 def messages(job: Message) -> Iterator[Mapping[str, Any]]:
-    """What comes of an order: `{"begun": id}`, then `{"drive": entry}` or `{"dropped": id, "why": …}`, for each drive.
+    """Record an order; yield `{"begun": id}`, then `{"drive": entry}` or `{"dropped": id, "why": …}`, for each drive.
 
-    `{"refused": …}` ends it: the policy's artifacts cannot be used.
+    `{"refused": …}` ends the order: the policy's artifacts cannot be used.
     """
     order = Order.of_json(job)
     numbers = range(order.start, order.start + order.count)
@@ -120,7 +128,7 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
             yield {"dropped": order.id(number), "why": "no such layout"}
         return
     with ExitStack() as stack:
-        carriages: dict[int, Carriage] = {}
+        worlds: dict[int, TourWorld] = {}
         for number, scenario in zip(numbers, scenarios, strict=True):
             drive_id = order.id(number)
             if drive_id in order.skip:
@@ -131,10 +139,10 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
                     entry = _drive(order, number, scenario)
                 else:
                     seed = scenario.layout_seed
-                    if seed not in carriages:
-                        carriages[seed] = _carriage(order.tour, scenario, scenarios)
-                        stack.callback(carriages[seed].close)
-                    entry = _tour(order, order.tour, number, scenario, carriages[seed])
+                    if seed not in worlds:
+                        worlds[seed] = _tour_world(order.tour, scenario, scenarios)
+                        stack.callback(worlds[seed].close)
+                    entry = _tour(order, order.tour, number, scenario, worlds[seed])
                 yield {"drive": asdict(entry)}
             except (NothingToLearnError, SceneError) as error:
                 yield {"dropped": drive_id, "why": str(error)}
@@ -158,43 +166,44 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         episode=episode,
         scene=scenario.scene,
         path=np.array(scenario.task.path, np.float64),
-        look=draw.look,
+        camera=draw.camera,
         drift=draw.drift,
-        pupil=order.policy is not None,
+        policy_drives=order.policy is not None,
         linger_s=draw.linger_s,
         detour=detour,
         off_m=DrivePlan.off_m + (0.0 if detour is None else detour.for_m),
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))
-    # Whoever drives away from the goal is not stuck before somebody, and no more is a pupil.
+    # On a detour or under a policy, no progress towards the goal does not mean that a person blocks the expert.
     expert = ExpertPolicy(
         margin_m=config.margin_m,
         speed_mps=config.speed_mps,
         told=scenario.task.path,
-        patient=plan.pupil or detour is not None,
+        patient=plan.policy_drives or detour is not None,
         rests=True,
         wall_m=config.wall_m,
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
-            recorded, driver = record(plan, expert, policy.steer, _teller(scenario)), policy.name
+            recorded, driver = record(plan, expert, policy.steer, _trace_at(scenario)), policy.name
     else:
-        steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _as_wanted
-        recorded, driver = record(plan, expert, steer, _teller(scenario)), "expert-noise" if draw.noise else "expert"
+        steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _expert_command
+        recorded = record(plan, expert, steer, _trace_at(scenario))
+        driver = "expert-noise" if draw.noise else "expert"
     return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
 
 
-def _carriage(tour: TourConfig, scenario: Scenario, scenarios: Sequence[Scenario]) -> Carriage:
-    """Of a scenario's layout; the first one there says how many people there are, whoever is asked for first."""
+def _tour_world(tour: TourConfig, scenario: Scenario, scenarios: Sequence[Scenario]) -> TourWorld:
+    """Build the world of a scenario's layout; the layout's first scenario determines the number of people."""
     first = next(each for each in scenarios if each.layout_seed == scenario.layout_seed)
-    return Carriage(scenario.site, min(first.episode.people, tour.people_most))
+    return TourWorld(scenario.site, min(first.episode.people, tour.people_most))
 
 
-def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, carriage: Carriage) -> Entry:
+def _tour(order: Order, tour: TourConfig, number: int, scenario: Scenario, world: TourWorld) -> Entry:
     draw = Draw.of(order.config, order.seed, number)
     rng = np.random.default_rng((order.seed, number, _TAG, 2))
-    recorded = carried(scenario, carriage, tour, draw.look, draw.drift, order.config, rng)
-    about = replace(_about(scenario, order.id(number), recorded, TOUR_DRIVER, draw), people=carriage.count)
+    recorded = record_tour(scenario, world, tour, draw.camera, draw.drift, order.config, rng)
+    about = replace(_about(scenario, order.id(number), recorded, TOUR_DRIVER, draw), people=world.count)
     return _saved(order, Drive(about, **recorded.arrays))
 
 
@@ -204,7 +213,7 @@ def _saved(order: Order, drive: Drive) -> Entry:
     return Entry.of(drive, path)
 
 
-def _as_wanted(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+def _expert_command(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
     return wanted, EXPERT
 
 
@@ -212,14 +221,14 @@ def _noisy(noise: SteeringNoise, _: Observation, wanted: Velocity) -> tuple[Velo
     return noise.command(wanted)
 
 
-def _teller(scenario: Scenario) -> Tell:
+def _trace_at(scenario: Scenario) -> TraceAt:
     tracer = Tracer(scenario)
 
-    def tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
+    def trace_at(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
         means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
         return aspects_json(tracer.trace(world.pose(), world.people(), world.people_velocities(), means))
 
-    return tell
+    return trace_at
 
 
 def _about(scenario: Scenario, drive_id: str, recorded: Recorded, driver: str, draw: Draw) -> About:

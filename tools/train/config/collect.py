@@ -1,4 +1,4 @@
-"""The numbers of recorded data: drives of the expert, tours, and rounds of DAgger."""
+"""Configuration of recorded data: drives of the expert, tours, and DAgger rounds."""
 
 from __future__ import annotations
 
@@ -7,54 +7,56 @@ from dataclasses import dataclass, field
 from typing import Final
 
 RATE_HZ: Final = 10
-TRACE_EVERY: Final = 10  # frames: reasoning is written down once a second
+"""Frames per second of a recorded drive."""
+TRACE_EVERY: Final = 10
+"""Frames between two reasoning texts: one per second."""
 PLANNED_DRIVE_S: Final = 30.0
+"""Typical length of a drive, s; used only to estimate a run's work."""
 
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How many drives of the expert, where, and how varied. The same numbers and seed give the same drives.
+    """Number, scenes and variation of the expert's drives. The same values and seed give the same drives.
 
-    What is called a share is the chance of each drive.
+    A `..._share` is the probability for each drive.
     """
 
     episodes: int = 700
     kinds: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the kinds of scenes; empty: those of `tools.train.scenes.scenarios`."""
+    """Shares of the kinds of scenes; empty: the default shares (`tools.train.config.scenes`)."""
     drives_per_layout: int = 4
-    """Fewer show more places; each place takes its time to be thought up, and a process makes the drives in it."""
+    """Drives in each layout. Fewer give more layouts, but each layout takes time to generate."""
     jobs: int = 0
-    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
+    """Parallel processes; 0: one per core. Does not change the drives."""
     noise_share: float = 0.3
-    """Drives in which the steering is disturbed now and then."""
+    """Drives with bursts of steering noise."""
     sharp_share: float = 0.3
-    """Drives whose pictures are rendered twice as large and shrunk, as a real camera's are."""
+    """Drives whose images are rendered at twice the size and reduced, which resembles a real camera."""
     jpeg_quality_min: int = 80
     jpeg_quality_max: int = 95
     typical_drift_share: float = 0.5
     severe_drift_share: float = 0.1
     speed_mps: float = 0.8
-    """The expert's, which is what a policy may drive on board: it could not follow a faster one."""
+    """Speed of the expert, m/s: the limit on the robot, as a policy could not imitate a faster expert."""
     margin_m: float = 0.1
-    """Kept to people beyond what the benchmark's expert keeps."""
+    """Distance kept to people in addition to the benchmark expert's, m."""
     wall_m: float = 0.0
-    """Kept to walls and things beyond what it keeps, where there is room."""
+    """Distance kept to walls and objects in addition to the benchmark expert's where there is room, m."""
     arrive_share: float = 0.7
-    """Of the distance that counts as arrived: so near the goal a drive goes, that the last metres are learned too."""
+    """A drive ends at this share of the success distance from the goal, so that the last metres are learned too."""
     linger_s: float = 0.0
-    """A drive goes on for up to so long after it has arrived, and at least half of it: to stay there, where the expert
-    comes to rest, is to be learned as well."""
+    """Longest recording after arrival, s; each drive takes between half of it and all of it. It teaches standing."""
     stray_share: float = 0.0
     stray_m: float = 6.0
-    """Drives of the expert that leave their way and come back: as a rule for an opening near the one that is to be
-    taken, else for some other place, up to so far."""
+    """Share of the expert's drives that leave the route and come back, and the longest detour, m. Most detours lead
+    into an opening near the correct one, the others to any other place."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes <= 1_000_000 or not 0 <= self.jobs <= 1024:
             raise ValueError(f"expected 1 to 1000000 episodes and 0 to 1024 jobs, found {self.episodes}, {self.jobs}")
         shares = (self.noise_share, self.sharp_share, self.typical_drift_share, self.severe_drift_share)
         if not all(0 <= share <= 1 for share in shares) or self.typical_drift_share + self.severe_drift_share > 1:
-            raise ValueError(f"expected shares of 0 to 1, those of the drifts 1 together at most, found {shares}")
+            raise ValueError(f"expected shares of 0 to 1 and a sum of the drift shares up to 1, found {shares}")
         if not 30 <= self.jpeg_quality_min <= self.jpeg_quality_max <= 100:
             raise ValueError("jpeg_quality: expected 30 <= min <= max <= 100")
         if not 1 <= self.drives_per_layout <= 100:
@@ -72,29 +74,28 @@ class CollectConfig:
 
 
 OF_TOURS: Final = "tours: "
-"""How the lines of a budget begin that are not of drives."""
+"""Prefix of the budget lines that concern tours."""
 
 
 @dataclass(frozen=True)
 class TourConfig:
-    """How many tours, and how varied. The same numbers and seed give the same tours.
+    """Number and variation of tours. The same values and seed give the same tours.
 
-    But for a pixel here and there in those of a layout that was ended in between: a renderer draws what it has drawn
-    before in the order in which it first did.
-    What is called a share is the chance of each tour.
+    Exception: single pixels may differ in a layout whose recording was interrupted, because the renderer draws objects
+    in the order in which it first saw them. A `..._share` is the probability for each tour.
     """
 
     count: int = 0
-    """0: none."""
+    """Number of tours; 0: none."""
     per_layout: int = 8
     people_most: int = 20
-    """More people than these a scene never has: they hide what is spoken of, and take their time to be moved."""
+    """Upper limit of people in a scene: more would occlude the described objects and slow the simulation."""
     stray_share: float = 0.35
-    """Tours that leave their way, as a rule for an opening near theirs, else for some other place, and come back."""
+    """Tours that leave the route and come back; most lead into an opening near the correct one."""
     stray_m: float = 8.0
-    """So far they are carried to some other place at most."""
+    """Longest detour to another place, m."""
     linger_s: float = 5.0
-    """A tour goes on for up to so long after it has arrived, half of it at least: on to the goal, where it stands."""
+    """Longest recording after arrival, s; each tour takes between half of it and all of it."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.count <= 1_000_000 or not 1 <= self.per_layout <= 100:
@@ -109,17 +110,17 @@ class TourConfig:
 
 @dataclass(frozen=True)
 class DaggerConfig:
-    """Rounds in which the expert relabels the policy's own drives, after which imitation goes on."""
+    """Rounds in which the expert relabels the policy's own drives and imitation continues on them."""
 
     rounds: int = 2
     episodes: int = 150
     """Drives of the policy in one round."""
     expert_episodes: int = 0
-    """New drives of the expert alone beside them, in other layouts than all before."""
+    """Additional drives of the expert alone in new layouts."""
     newest_only: bool = False
-    """Learn after a round from its drives alone. It then needs nothing of what is before it but the weights."""
+    """Train on the newest round's drives alone; the round then needs only the weights from before it."""
     sft_rounds: int = 1
-    """The language model goes on after so many of the first rounds: an expert's drives hardly show it a missed turn."""
+    """The language model continues after this many first rounds: the expert's drives hardly contain missed turns."""
     latency_mean_s: float = 2.0
     """Mean generation time in those drives; each drive draws its own between 0 and twice this."""
 

@@ -1,4 +1,4 @@
-"""The numbers of stage `encoder`: the pictures, how they are changed, and the training on them."""
+"""Configuration of stage `encoder`: images, augmentation and training."""
 
 from __future__ import annotations
 
@@ -9,36 +9,37 @@ from tools.train.config.optim import OptimConfig
 from tools.train.config.scenes import CORRIDOR, KINDS
 
 MOST_SCENES: Final = 50_000
-"""Of each sort; where a layout cannot be built, the one so many further on is taken."""
-OUTDOORS_LEAST: Final = 20  # people
+"""Upper limit of scenes per split; a layout that cannot be built is replaced by the one this many further on."""
+OUTDOORS_LEAST: Final = 20
+"""Fewest people in an outdoor scene."""
 
 
 @dataclass(frozen=True)
 class FramesConfig:
-    """How many pictures, where, and how they are taken. A kind that is named twice has twice as many scenes."""
+    """Number, scenes and rendering of images. A kind that is listed twice has twice as many scenes."""
 
     count: int = 120_000
-    """To learn from; 0: the encoder stays as it is."""
+    """Training images; 0: the encoder is not trained."""
     held: int = 6_000
-    """In layouts that are never learned from."""
+    """Held-out images, in layouts that are never trained on."""
     per_scene: int = 600
     kinds: tuple[str, ...] = (
         "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "sidewalk",
         "hospital", "office", "warehouse", "sidewalk", "hospital", "office", "warehouse", "corridor",
     )  # fmt: skip
     people_indoors: int = 60
-    """Most of one scene."""
+    """Upper limit of people in one scene."""
     people_outdoors: int = 120
     moment: int = 8
-    """Pictures taken before everybody moves on."""
+    """Images taken before the people move."""
     moment_s: float = 0.5
-    """For how long they move."""
+    """Duration of each movement, s."""
     sharp_share: float = 0.3
-    """Pictures rendered twice as large and shrunk, as a real camera's are."""
+    """Share of images rendered at twice the size and reduced, which resembles a real camera."""
     jpeg_quality_min: int = 85
     jpeg_quality_max: int = 100
     jobs: int = 0
-    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
+    """Parallel processes; 0: one per core. Does not change the images."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.count <= 10_000_000 and 0 <= self.held <= 1_000_000 and 1 <= self.per_scene <= 100_000):
@@ -48,7 +49,7 @@ class FramesConfig:
         if not self.kinds or not set(self.kinds) <= set(KINDS):
             raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {', '.join(self.kinds) or 'none'}")
         if self.held and set(self.kinds) <= {CORRIDOR}:
-            raise ValueError(f"held: {CORRIDOR} is one scene, which is learned from; name another kind or set held = 0")
+            raise ValueError(f"held: {CORRIDOR} is one scene, used for training; name another kind or set held = 0")
         if not (0 <= self.people_indoors <= 200 and OUTDOORS_LEAST <= self.people_outdoors <= 200):
             raise ValueError(f"expected up to 200 people, {OUTDOORS_LEAST} or more outdoors")
         if not (1 <= self.moment <= 1000 and 0 < self.moment_s <= 60 and 0 <= self.sharp_share <= 1):
@@ -59,20 +60,20 @@ class FramesConfig:
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How much pictures are changed; what is called a share is the chance of each picture."""
+    """Image augmentation; a `..._share` is the probability for each image."""
 
     brightness: float = 0.3
-    """Most by which all is brighter or darker, as a share."""
+    """Largest relative change of brightness."""
     contrast: float = 0.25
-    """Most by which differences from the mean grow or shrink, as a share."""
+    """Largest relative change of the differences from the mean."""
     colour: float = 0.08
-    """Most by which each of red, green and blue is off, as a share."""
+    """Largest relative change of each of red, green and blue."""
     blur_share: float = 0.3
     blur_px: float = 0.9
-    """Largest standard deviation of the blur."""
+    """Largest standard deviation of the blur, px."""
     noise_share: float = 0.3
     noise: float = 6.0
-    """Largest standard deviation of the noise, of 255."""
+    """Largest standard deviation of the noise, grey levels of 255."""
     jpeg_share: float = 0.5
     jpeg_quality_min: int = 40
     jpeg_quality_max: int = 95
@@ -90,12 +91,12 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Training of the vision encoder on the simulator's own labels."""
+    """Training of the vision encoder on the simulator's labels."""
 
     frames: FramesConfig = field(default_factory=FramesConfig)
     epochs: int = 2
     batch: int = 64
-    """Pictures of all ranks together."""
+    """Images per step over all ranks."""
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(
             lr=1e-3, final_lr_share=0.02, weight_decay=0.02, warmup_steps=500, bf16=True
@@ -103,13 +104,13 @@ class EncoderConfig:
     )
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     mirrored: float = 0.5
-    """Share of pictures that are shown as a mirror shows them: later stages learn from drives in the mirror."""
+    """Share of mirrored images: later stages train on mirrored drives."""
     checkpoint_steps: int = 500
     """Steps between two checkpoints."""
     look_steps: int = 500
-    """Steps between two looks at held-out pictures."""
+    """Steps between two evaluations on held-out images."""
     look_frames: int = 768
-    """Held-out pictures of one look; at the end it is all of them."""
+    """Held-out images of such an evaluation; the last one uses all."""
 
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, self.checkpoint_steps, self.look_steps) < 1 or self.look_frames < 0:

@@ -1,4 +1,4 @@
-"""The numbers of stage `evaluate`: the episodes, and how slow reasoning is in them."""
+"""Configuration of stage `evaluate`."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Which episodes are driven, and how slow reasoning is in them."""
+    """Episodes of the evaluation and the latency of reasoning in them."""
 
     episodes: int = 60
     scenario_seed: int = 9001
-    """Of `tools.train.scenes.scenarios`: layouts that no other stage draws."""
+    """Seed of the layouts (`tools.train.scenes.scenarios`); no other stage uses this one."""
     kinds: Mapping[str, float] = field(default_factory=dict)
-    """Shares of the kinds of scenes; empty: those of `tools.train.scenes.scenarios`."""
+    """Shares of the kinds of scenes; empty: the default shares (`tools.train.config.scenes`)."""
     latency_s: float = 2.0
     drift: str = "none"
     jobs: int = 0
-    """Processes at a time; 0: as many as there are cores. Changes nothing in what comes out."""
+    """Parallel processes; 0: one per core. Does not change the results."""
 
     def __post_init__(self) -> None:
         if not (1 <= self.episodes <= 10_000 and 0 <= self.scenario_seed <= 9_999 and 0 <= self.jobs <= 1024):

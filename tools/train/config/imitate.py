@@ -1,4 +1,4 @@
-"""The numbers of stage `imitate`: delays, semantic states, samples, losses and the training on them."""
+"""Configuration of stage `imitate`: delays, semantic states, samples, losses and training."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from tools.train.config.sft import DrawConfig
 
 TIC_VLA, POINT_GOAL = "tic-vla", "point-goal"
 LONGEST_S: Final = 60.0
+"""Upper limit of a delay, s."""
 
 
 @dataclass(frozen=True)
 class DelayConfig:
-    """Ages to train under: uniform from `low_s` to `high_s` (paper, Algorithm 1), or those of a device's profile."""
+    """Delays in training: uniform from `low_s` to `high_s` (paper, Algorithm 1), or those of a device's profile."""
 
     low_s: float = 0.0
     high_s: float = 10.0
     profile: str = ""
     """A file of `edge-calib latency`; empty: uniform."""
     near_share: float = 0.0
-    """Share of ages that are uniform up to `near_s` instead: it is by fresh words that a policy learns to listen. Of a
-    profile's it is not used."""
+    """Share of delays drawn uniformly from `low_s` to `near_s`: the policy learns to use semantic states from recent
+    ones. Ignored with a profile."""
     near_s: float = 4.0
 
     def __post_init__(self) -> None:
@@ -40,21 +41,21 @@ class DelayConfig:
 
 @dataclass(frozen=True)
 class WeightConfig:
-    """How often frames are drawn, as factors on an ordinary one's chance; those that hold are multiplied."""
+    """Factors on the probability of drawing a frame; factors of all conditions that a frame meets are multiplied."""
 
     turn: float = 2.0
-    """Its label turns by more than 0.5 rad within 3 s."""
+    """Frames whose label turns by more than 0.5 rad within 3 s."""
     people: float = 2.0
-    """Somebody is in view within 6 m."""
+    """Frames with a person in view within 6 m."""
     goal: float = 2.0
     goal_m: float = 4.0
-    """The goal is nearer than this."""
+    """Distance to the goal below which `goal` applies, m."""
     recovery: float = 1.5
-    """Something other than the expert commands within the next 5 s, so that the label leads back."""
+    """Frames in whose next 5 s another source than the expert commands, so that the label leads back."""
     policy: float = 1.0
-    """Its drive is a policy's (DAgger)."""
+    """Frames of a policy's drive (DAgger)."""
     stuck: float = 1.0
-    """It has stood for a second and its label does not: a policy that sees this too seldom stands for good."""
+    """Frames where the robot has stood for 1 s and the label moves: with too few of them a policy stands forever."""
 
     def __post_init__(self) -> None:
         factors = (self.turn, self.people, self.goal, self.recovery, self.policy, self.stuck)
@@ -64,28 +65,29 @@ class WeightConfig:
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """What a sample is made of beside its frame."""
+    """Composition of a sample: semantic state, its text and noise."""
 
     group: int = 4
-    """Frames that act on one state and share its keys and values: fewer vary more, more are faster."""
+    """Frames that share one semantic state and its keys and values: fewer vary more, more are faster."""
     reasoning: bool = True
-    """False: states end with their prompt, as those of a model that says nothing."""
+    """False: states end after the prompt, without decoded text."""
     cut_text: float = 0.1
-    """Share of states whose text ends early: a power budget may cut it at any token."""
+    """Share of states with truncated text: a power budget may stop decoding at any token."""
     prompt_only: float = 0.05
-    """Share of states of a prompt without any text: what the mode without reasoning drives by."""
+    """Share of states without text, as in mode `no-reasoning`."""
     text_only: float = 0.0
-    """Share of states whose prompt is hidden: of a turn it tells the side, and only the text tells when."""
+    """Share of states with a masked prompt: the prompt names the side of a turn, only the text tells when to turn."""
     standing_start: float = 0.5
-    """Chance of an age that reaches beyond the drive's first frame, as a factor on that of any other age."""
+    """Factor on the probability of delays that reach before the drive's first frame."""
     longest_told_s: float = 10.0
-    """Δt beyond this is told as this, as the robot tells it (the targets' `runtime.max_delay_s`)."""
+    """Upper clip of the Δt input, s, as on the robot (the targets' `runtime.max_delay_s`)."""
     offset_noise_m_per_m: float = 0.02
-    """Of the motion offset, in m for each metre driven since the state, one standard deviation (paper, Table 14)."""
+    """Noise of the motion offset, one standard deviation, m per metre driven since the anchor (paper, Table 14)."""
     offset_noise_deg_per_m: float = 1.0
+    """Noise of the heading offset, one standard deviation, degrees per metre driven since the anchor."""
     blind: float = 0.0
-    """Share of samples without the picture of now, so that what is said has to be heard: an expert's pictures alone
-    nearly tell its way."""
+    """Share of samples without the current image, so that the policy must use the semantic state: the expert's images
+    alone almost determine its path."""
     weights: WeightConfig = field(default_factory=WeightConfig)
 
     def __post_init__(self) -> None:
@@ -102,7 +104,7 @@ class SampleConfig:
             raise ValueError("expected offset_noise_m_per_m from 0 to 1 and offset_noise_deg_per_m from 0 to 90")
 
     def undisturbed(self) -> SampleConfig:
-        """The same with every frame alike, every age exact and nothing disturbed: what is evaluated on."""
+        """Return the configuration for evaluation: equal frame weights and no noise."""
         even = WeightConfig(turn=1.0, people=1.0, goal=1.0, recovery=1.0)
         return replace(
             self, blind=0.0, cut_text=0.0, prompt_only=0.0, text_only=0.0, standing_start=0.0, offset_noise_m_per_m=0.0,
@@ -112,16 +114,17 @@ class SampleConfig:
 
 @dataclass(frozen=True)
 class KvConfig:
-    """Which states are kept."""
+    """Semantic states that are computed and cached."""
 
     draws: int = 1
-    """States of each anchor, each with words and a `before` of its own."""
+    """States of each anchor, each with its own instruction wording and previous progress."""
     own_share: float = 0.0
-    """Share of states with the text that the model says itself; the others have the true one (paper appendix B)."""
+    """Share of states with text that the model decodes; the others have the true text (paper appendix B)."""
     own_share_policy: float = 0.8
-    """The same along a policy's drives (DAgger): off the way the truth leads back, but on the robot nobody says it."""
+    """The same along a policy's drives (DAgger). Off the route the true text leads back, which is not available on the
+    robot."""
     max_new_tokens: int = 72
-    """Of its own texts."""
+    """Upper limit of decoded tokens."""
     every: int = TRACE_EVERY
     """Frames between two anchors."""
     batch: int = 32
@@ -138,18 +141,18 @@ class KvConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Equation 4, of the query head and of the point-goal network: smooth L1 of the integrated poses; and walls."""
+    """Loss of the query head and the point-goal network: smooth L1 of the integrated poses (equation 4), and walls."""
 
     beta: float = 1.0
-    """Below this error it is quadratic, m and rad; torch's own value, the paper names none."""
+    """Error below which the loss is quadratic, m and rad; torch's default, the paper states none."""
     heading_weight: float = 1.0
-    """Of an error of one radian beside one of a metre."""
+    """Weight of an error of 1 rad relative to an error of 1 m."""
 
     walls: float = 0.0
-    """Of each metre that a plan comes too near to walls (`tools.train.scenes.walls`); 0: these are not looked at. Heads
-    that learn by another objective leave it out."""
+    """Weight of each metre that a plan is too close to walls (`tools.train.scenes.walls`); 0: walls are ignored. Heads
+    with another objective do not use it."""
     room_m: float = 0.2
-    """Nearer than this is too near, unless the expert's own plan comes as near."""
+    """Distance to walls below which a plan is too close, m, unless the expert's plan is as close."""
 
     def __post_init__(self) -> None:
         if not (0 < self.beta <= 100 and 0 <= self.heading_weight <= 100):
@@ -160,14 +163,14 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class ImitateEvalConfig:
-    """How much is looked at."""
+    """Size of the evaluation after imitation."""
 
     samples: int = 4096
     batch: int = 64
     edges_s: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
-    """Ages are told apart by these; the last bin holds its upper edge."""
+    """Edges of the delay bins, s; the last bin includes its upper edge."""
     own_words: bool = True
-    """Look also at what becomes of it when the language model has said the texts itself."""
+    """Also evaluate with text that the language model decoded itself."""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.batch < 1:
@@ -181,25 +184,25 @@ class ImitateConfig:
     """Imitation learning with delayed inference."""
 
     policy: str = TIC_VLA
-    """Or point-goal: the paper's behaviour cloning baseline, from picture, state and goal, told nothing."""
+    """tic-vla, or point-goal: the paper's behaviour cloning baseline from image, state and goal, without language."""
     samples: int = 384_000
-    """Samples in all (the paper: 10 epochs of frames 3 s apart)."""
+    """Total number of samples (the paper: 10 epochs of frames 3 s apart)."""
     batch: int = 64
-    """Samples of one step, of all ranks together (the paper: 16 on each of 8)."""
+    """Samples per step over all ranks (the paper: 16 on each of 8)."""
     go_on_share: float = 0.5
-    """Of `samples` after a round of DAgger, from the weights before it; 0: from the beginning with all of them."""
+    """Share of `samples` after a DAgger round, starting from the previous weights; 0: train anew with all samples."""
     inject_delay: bool = True
-    """False: states are always those of now (the crosses in the paper's Table 2)."""
+    """False: semantic states have no delay (the crosses in the paper's Table 2)."""
     delays: DelayConfig = field(default_factory=DelayConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
     states: KvConfig = field(default_factory=KvConfig)
     mirrored: float = 0.3
-    """Share of samples that are of the drives as a mirror shows them, at whole seconds."""
+    """Share of samples from mirrored drives, at whole seconds."""
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=lambda: OptimConfig(bf16=True))
-    """Table 8; in bfloat16, which is nearly twice as fast on two cores."""
+    """Table 8; bfloat16 is nearly twice as fast on two cores."""
     held_samples: int = 1024
-    """Of held-out layouts, whose loss is looked at every `held_steps` steps and at the end."""
+    """Samples from held-out layouts whose loss is computed every `held_steps` steps and at the end."""
     held_steps: int = 500
     checkpoint_steps: int = 500
     evaluate: ImitateEvalConfig = field(default_factory=ImitateEvalConfig)

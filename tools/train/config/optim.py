@@ -1,4 +1,4 @@
-"""The numbers of an optimiser."""
+"""Configuration of an optimiser."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Numbers of an optimiser; the defaults are the paper's for the action expert (Table 8)."""
+    """AdamW with warm-up and cosine decay; the defaults are the paper's for the action expert (Table 8)."""
 
     lr: float = 2e-4
     final_lr_share: float = 0.0
-    """What of `lr` the cosine ends at."""
+    """Final learning rate as a share of `lr`."""
     weight_decay: float = 1e-2
     warmup_steps: int = 1000
     clip: float = 1.0

@@ -1,4 +1,4 @@
-"""What a training run is made of: a network, a seed and one table of numbers a stage, read strictly from TOML."""
+"""The recipe of a training run: network, seed and one configuration table per stage, read strictly from TOML."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ STAGES: Final[Mapping[str, type]] = {
     "rl": RlConfig,
     "evaluate": EvaluateConfig,
 }
-"""Name of a stage and the dataclass of its numbers."""
+"""Configuration class of each stage."""
 MAX_RECIPE_BYTES: Final = 1 << 20
+"""Upper limit of a recipe file, bytes."""
 
 
 class RecipeError(ValueError):
@@ -49,7 +50,7 @@ class RecipeError(ValueError):
 
 @dataclass(frozen=True)
 class Recipe:
-    """One training run. A stage's numbers are None where a caller that runs other stages alone leaves them out."""
+    """Configuration of one training run. A stage's table is None if the caller does not run that stage."""
 
     name: str
     seed: int
@@ -67,34 +68,34 @@ class Recipe:
             raise RecipeError(f"expected a name and a seed from 0 to 2^31 - 1, found {self.name!r} and {self.seed}")
 
     def to_tables(self) -> dict[str, Any]:
-        """Every number of the run, defaults included, as plain tables."""
+        """Return every value of the run, defaults included, as plain tables."""
         stages = {name: plain(getattr(self, name)) for name in STAGES if getattr(self, name) is not None}
         dagger = plain(self.dagger)
         head = {"schema": SCHEMA, "name": self.name, "seed": self.seed}
         return {**head, "model": self.model.to_dict(), **stages, "dagger": dagger}
 
     def to_toml(self) -> str:
-        """The same for people; `resolved` reads it back."""
+        """Return the tables as TOML; `load_recipe` reads it."""
         return toml_text(self.to_tables())
 
 
 def recipe_names() -> list[str]:
-    """The shipped recipes."""
+    """Return the names of the shipped recipes."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
-    """A shipped recipe or a `.toml` file, with `--set KEY=VALUE` applied; raises RecipeError.
+    """Load a shipped recipe or a `.toml` file and apply `--set KEY=VALUE`. Raises RecipeError.
 
-    KEY is `seed`, `STAGE.field` or `model.SECTION.field`. A file names a preset and what it changes of it
-    (`[model] preset`, `[model.set] "action.layers"`), or is what `Recipe.to_toml` wrote.
+    KEY is `seed`, `STAGE.field` or `model.SECTION.field`. A file names a preset with changes (`[model] preset`,
+    `[model.set] "action.layers"`), or was written by `Recipe.to_toml`.
     """
     path = FOLDER / f"{name_or_path}.toml" if name_or_path in recipe_names() else Path(name_or_path)
     if path.suffix != ".toml":
         raise RecipeError(f"recipe {name_or_path!r}: expected one of {', '.join(recipe_names())}, or a .toml file")
     try:
         if path.stat().st_size > MAX_RECIPE_BYTES:
-            raise RecipeError(f"recipe {path}: more than {MAX_RECIPE_BYTES} bytes, which is no recipe")
+            raise RecipeError(f"recipe {path}: expected at most {MAX_RECIPE_BYTES} bytes")
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise RecipeError(f"recipe {path}: cannot be read ({error.strerror})") from error
@@ -109,7 +110,7 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
 
 
 def recipe_of(tables: Mapping[str, object], overrides: Sequence[str] = ()) -> Recipe:
-    """A recipe from its tables; raises RecipeError, FieldError, ModelConfigError."""
+    """Build a recipe from its tables. Raises RecipeError, FieldError, ModelConfigError."""
     known = ("schema", "name", "seed", "model", "dagger", *STAGES)
     for key in tables:
         if key not in known:
@@ -128,12 +129,12 @@ def recipe_of(tables: Mapping[str, object], overrides: Sequence[str] = ()) -> Re
     model = with_overrides(_model(content.get("model")), model_settings(overrides))
     name, seed = content.get("name"), content.get("seed")
     if not isinstance(name, str) or type(seed) is not int:
-        raise RecipeError(f"expected name, a text, and seed, a whole number; found {name!r} and {seed!r}")
+        raise RecipeError(f"expected a string as name and an integer as seed, found {name!r} and {seed!r}")
     return Recipe(name, seed, model, **stages)
 
 
 def filled(default: object, table: object) -> object:
-    """A table over the numbers of `default`, nested tables too: `optim.lr` alone changes nothing else."""
+    """Fill missing keys of a table from `default`, in nested tables too: `optim.lr` alone changes nothing else."""
     if not isinstance(table, Mapping):
         return table
     whole = {**plain(default), **table}
@@ -145,12 +146,12 @@ def filled(default: object, table: object) -> object:
 
 
 def stage_seed(recipe: Recipe, stage: str) -> int:
-    """The seed of a stage's job: of the run's seed, another one for every stage."""
+    """Derive a stage's seed from the run's seed; every stage has another one."""
     return int(np.random.default_rng((recipe.seed, crc32(stage.encode()))).integers(2**31))
 
 
 def _model(table: object) -> TicVlaConfig:
-    """A preset with changes, or every number of a network."""
+    """Build the network's configuration from a preset with changes, or from a complete table."""
     if not isinstance(table, Mapping):
         raise RecipeError("expected a table [model] with preset")
     if "preset" not in table:
@@ -171,7 +172,7 @@ def _as_text(value: object) -> str:
 
 
 def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> None:
-    """Put one `KEY=VALUE` into the tables as a value of its field's type."""
+    """Store one `KEY=VALUE` in the tables as a value of its field's type."""
     key, equals, text = (part.strip() for part in setting.partition("="))
     where = f"--set {setting}"
     if not equals:
@@ -199,5 +200,5 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
 
 
 def _fields_of(kind: object) -> dict[str, Any]:
-    """Types of a dataclass's fields; none of another type."""
+    """Return the types of a dataclass's fields; empty for other types."""
     return field_types(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}

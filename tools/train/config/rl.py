@@ -1,4 +1,4 @@
-"""The numbers of stage `rl`: PPO (Table 9), its rollouts, and the choice of the best policy."""
+"""Configuration of stage `rl`: PPO (Table 9), its rollouts, and the selection of the best policy."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from tools.train.config.scenes import SHARES, TASKS_PER_SCENE
 POLICIES: Final = ("action", "point-goal")
 _DELAYS: Final = 41
 LOG_STD_RANGE = (-4.0, 0.5)
-"""exp: 0.018 to 1.6 m/s and rad/s. Below it nothing is explored, above it nothing is driven."""
+"""Range of the exploration's log standard deviation: 0.018 to 1.6 m/s or rad/s. Less does not explore, more does not
+drive."""
 
 
 @dataclass(frozen=True)
 class PpoConfig:
-    """Table 9; where a minibatch shows that the policy has moved by 1.5 `target_kl` it moves no more in this update.
+    """PPO constants (Table 9).
 
-    The value function learns on. 0: it may move for all epochs.
+    Once a minibatch's KL divergence exceeds 1.5 `target_kl`, an update trains only the value function; 0: no limit.
     """
 
     action_lr: float = 1e-5
@@ -46,45 +47,44 @@ class PpoConfig:
 
 @dataclass(frozen=True)
 class RlConfig:
-    """Online reinforcement learning of the last layer and the head."""
+    """Online reinforcement learning of the action expert's last layer and head."""
 
     policy: str = "action"
-    """What is trained: the action expert's last layer and head, or the paper's `point-goal` baseline from nothing."""
+    """`action`: train the action expert's last layer and head; `point-goal`: the paper's baseline, from scratch."""
     iterations: int = 300
     episodes: int = 16
-    """Whole episodes of one iteration; with some 250 steps each, 4,000 steps (the paper: 1,024)."""
+    """Episodes of one iteration, about 4,000 steps at 250 steps each (the paper: 1,024 steps)."""
     episodes_per_job: int = TASKS_PER_SCENE
-    """One layout's: a job that begins inside a layout has to draw the tasks before its own too."""
+    """Episodes of one worker job: those of one layout, because a job must also generate the layout's earlier tasks."""
     ppo: PpoConfig = field(default_factory=PpoConfig)
     log_std: tuple[float, ...] = (-1.9, -1.5)
-    """Of the exploration of v and ω at the start: 0.15 m/s and 0.22 rad/s."""
+    """Initial log standard deviations of v and ω: 0.15 m/s and 0.22 rad/s."""
     reward_scale: float = 0.01
     mean_delay_s: float = 5.0
-    """Times of a generation are drawn evenly from 0 to twice this (paper: some 50 environment steps on average)."""
+    """Latencies are drawn uniformly from 0 to twice this, s (paper: about 50 environment steps on average)."""
     delay_profile: str = ""
-    """A file of `edge-calib latency` to draw from instead."""
+    """Latency profile of `edge-calib latency` to draw from instead."""
     rotation: tuple[str, ...] = ("office", "hospital", "warehouse")
     rotate_every: int = 100
     """Iterations in one kind of scene before the next; 0: all kinds in every iteration."""
     tasks: int = 3
-    """Tasks of each kind, all of one layout, each time with another crowd; 0: always another one."""
+    """Tasks of each kind, all in one layout, repeated with new crowds; 0: always new tasks."""
     drift: str = "typical"
     max_s: float = 90.0
     warmup_iterations: int = 3
-    """In which the value network learns and the policy does not."""
+    """First iterations, in which only the value network is trained."""
     imitation: float = 0.0
-    """Weight of a penalty on leaving the imitated commands; the paper has none."""
+    """Weight of a penalty on the distance from the imitated policy's commands; the paper has none."""
     evaluate_every: int = 10
     evaluate_episodes: int = 24
     keep_margin: float = 0.06
-    """By how much more the evaluation's success must be than the best's to replace it: the best of many is luck too."""
+    """Least gain in success over the best policy to replace it, because scores are noisy."""
     fall_back: float = 0.08
-    """By how much success may drop below the best's, or collisions rise at no more success, before that one is taken up
-    again."""
+    """Loss of success against the best policy, or rise of collisions without more success, that resets to the best."""
     final_episodes: int = 32
-    """On fresh scenarios, with the policy it began with and with the best; the best is kept if it is ahead there."""
+    """Episodes on other scenarios that compare the first and the best policy; the best is kept if it is ahead."""
     jobs: int = 0
-    """Worker processes; 0: as many as there are cores. Changes nothing in what comes out."""
+    """Worker processes; 0: one per core. Does not change the result."""
 
     def __post_init__(self) -> None:
         driven = (self.episodes, self.episodes_per_job, self.evaluate_episodes, self.final_episodes)
@@ -105,18 +105,18 @@ class RlConfig:
             raise ValueError("expected imitation from 0 on, fall_back and keep_margin from 0 to 1")
 
     def kinds(self, iteration: int) -> dict[str, float]:
-        """Shares of the kinds of scenes that an iteration drives in."""
+        """Return the shares of the kinds of scenes of an iteration."""
         if self.rotate_every == 0:
             return dict.fromkeys(self.rotation, 1.0)
         return {self.rotation[(iteration // self.rotate_every) % len(self.rotation)]: 1.0}
 
     def numbers(self, iteration: int) -> tuple[int, ...]:
-        """Scenarios that an iteration drives in, of their seed."""
+        """Return the numbers of an iteration's scenarios."""
         first = iteration * self.episodes
         return tuple(n % self.tasks if self.tasks else n for n in range(first, first + self.episodes))
 
     def delays(self) -> LatencyProfile:
-        """Reasoning times to draw from, with how late each captures its newest frame. Raises LatencyError."""
+        """Return the latency profile to draw from. Raises LatencyError."""
         if self.delay_profile:
             return load_profile(Path(self.delay_profile))
         times = tuple(round(float(v), 4) for v in np.linspace(0.0, 2 * self.mean_delay_s, _DELAYS))

@@ -1,4 +1,4 @@
-"""The kinds of training scenes, and how often each of them is drawn."""
+"""The kinds of training scenes and their default shares."""
 
 from __future__ import annotations
 

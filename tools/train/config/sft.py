@@ -1,4 +1,4 @@
-"""The numbers of stage `sft`: what is drawn for a sample of the language model, and the training on it."""
+"""Configuration of stage `sft`: samples of the language model and the training on them."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from tools.train.config.collect import TourConfig
 from tools.train.config.optim import OptimConfig
 
 AROUND: Final = 3
-"""Frames before and after an anchor at which its words still hold."""
+"""Frames before and after an anchor for which its text is still true."""
 
 
 @dataclass(frozen=True)
 class DrawConfig:
-    """What is drawn for each sample."""
+    """Random variation of each sample's text."""
 
     waypoints_only: float = 0.2
-    """Share of answers that are waypoints without reasoning."""
+    """Share of answers with waypoints and without reasoning text."""
     before_min_s: float = 0.3
     before_max_s: float = 4.0
-    """The last generation's newest frame is so long ago: what a generation takes."""
+    """Range of the time since the previous generation's newest frame, s: the duration of a generation."""
     before_late: float = 0.15
     before_latest_s: float = 10.0
-    """A share of generations takes longer, up to this."""
+    """Share of generations that take longer, and their upper limit, s."""
     before_wrong: float = 0.25
-    """Share of wrong words about the progress so far: a model that trusted them blindly could never mend a mistake."""
+    """Share of prompts with wrong previous progress, so that the model learns to correct mistakes."""
     way_turn_rad: float = 0.035
     way_scale: float = 0.02
     way_point_m: float = 0.05
-    """Standard deviations of what odometry tells of the way, beyond what it was recorded with."""
+    """Standard deviations of the noise added to the past motion from odometry: rad, share and m."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.waypoints_only <= 1 and 0 <= self.before_wrong < 1 and 0 <= self.before_late <= 1):
@@ -42,16 +42,16 @@ class DrawConfig:
 
 @dataclass(frozen=True)
 class ShowConfig:
-    """How much what is shown differs from what was recorded."""
+    """Random variation of each sample's frames."""
 
     shift_frames: int = AROUND
-    """The newest frame is up to so many earlier or later (0.1 s each)."""
+    """Largest shift of the newest frame, frames of 0.1 s."""
     jitter_frames: int = 2
-    """And the older ones up to so many beyond that, each on its own."""
+    """Largest additional shift of each older frame, frames."""
     noise: float = 0.1
-    """Standard deviation of what is added to a visual token's numbers, in units of theirs."""
+    """Standard deviation of the noise added to visual tokens, relative to theirs."""
     drop: float = 0.1
-    """Share of visual tokens that are blank."""
+    """Share of visual tokens set to zero."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.shift_frames <= AROUND or not 0 <= self.jitter_frames <= 5:
@@ -61,13 +61,13 @@ class ShowConfig:
 
 
 @dataclass(frozen=True)
-class RetellConfig:
-    """How many other ways are told of each drive."""
+class RelabelConfig:
+    """Relabelling of drives with instructions for other goals."""
 
     ways: int = 0
-    """At most; 0: none."""
+    """Upper limit of other instructions per drive; 0: none."""
     tries: int = 24
-    """Goals that are looked at for them, by chance."""
+    """Random goals that are tried per drive."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ways <= 64 or not 0 <= self.tries <= 1000:
@@ -76,16 +76,16 @@ class RetellConfig:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """How much is looked at."""
+    """Size of the evaluation after fine-tuning."""
 
     anchors: int = 384
-    """Anchors that are answered with the right words before them."""
+    """Anchors decoded with the true previous progress."""
     epoch_anchors: int = 64
-    """The same after every epoch, for a curve."""
+    """Anchors decoded after every epoch, for a curve."""
     drives: int = 64
-    """Drives along which the model hears only itself."""
+    """Drives decoded with the model's own previous progress."""
     gap_s: float = 2.0
-    """Between two generations of such a drive: the mean of the benchmark's latency profile. Whole seconds."""
+    """Time between two generations of such a drive, whole seconds: the mean of the benchmark's latency profile."""
     max_new_tokens: int = 72
     batch: int = 48
 
@@ -102,28 +102,29 @@ class SftConfig:
 
     epochs: int = 8
     batch: int = 32
-    """Samples of all ranks together."""
+    """Samples per step over all ranks."""
     words: DrawConfig = field(default_factory=DrawConfig)
     shown: ShowConfig = field(default_factory=ShowConfig)
-    retold: RetellConfig = field(default_factory=RetellConfig)
-    """Other instructions under which every drive is shown too."""
+    retold: RelabelConfig = field(default_factory=RelabelConfig)
+    """Other instructions for every drive."""
     tours: TourConfig = field(default_factory=TourConfig)
-    """Robots that were carried along told ways, whose words are learned beside those of the drives."""
+    """Tours whose text is learned in addition to that of the drives."""
     tours_again: float = 0.25
-    """Share of them that is learned again, others each time, where it goes on after a round of DAgger."""
+    """Share of the tours, another one each time, that is used after a DAgger round."""
     mirrored: float = 0.5
-    """Share of samples that are of the drives as a mirror shows them: other places to speak of."""
+    """Share of samples from mirrored drives."""
     go_on_share: float = 0.4
     go_on_lr_share: float = 0.3
-    """Of epochs and of the learning rate, after a round of DAgger, from the weights before; 0: from the beginning."""
+    """Shares of the epochs and of the learning rate after a DAgger round, starting from the previous weights;
+    go_on_share 0: train anew."""
     deciding: int = 2
-    """How often an anchor that decides (`tools.train.samples.anchors`) is shown in an epoch; the others once."""
+    """Repetitions per epoch of an anchor near a change of progress (`tools.train.samples.anchors`); others have one."""
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=1e-3, final_lr_share=0.02, warmup_steps=200, bf16=True)
     )
-    """The paper's 2e-5 (Table 8) is for a language model that can speak; ours begins from nothing."""
+    """The paper's 2e-5 (Table 8) is for a pretrained language model; ours is trained from scratch."""
     held_anchors: int = 512
-    """Anchors of held-out layouts whose loss is looked at after every epoch."""
+    """Anchors of held-out layouts whose loss is computed after every epoch."""
     checkpoint_steps: int = 200
     """Steps between two checkpoints."""
     evaluate: EvalConfig = field(default_factory=EvalConfig)

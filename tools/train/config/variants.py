@@ -1,4 +1,4 @@
-"""The paper's ablations and baselines by name: what each changes of a recipe (tables 1, 2, 5, 6, 11 and 13)."""
+"""The paper's ablations and baselines by name, as settings of a recipe (tables 1, 2, 5, 6, 11 and 13)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "diffusion": ("model.action.head=diffusion",),
         "flow": ("model.action.head=flow",),
         "point-goal-bc": ("imitate.policy=point-goal",),
-        # From nothing, where the recipe's numbers are for a policy that drives already.
+        # Trained from scratch, whereas the recipe's values are for a policy that already drives.
         "point-goal-rl": (
             "rl.policy=point-goal",
             "rl.ppo.action_lr=3e-4",
@@ -34,5 +34,4 @@ VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         ),
     }
 )
-"""Settings by name; where the benchmark checks a variant (`sim_hil.benchmark.conditions.variants`), the names are the
-same."""
+"""Settings by variant; the benchmark uses the same names (`sim_hil.benchmark.conditions.variants`)."""

@@ -1,1 +1,1 @@
-"""Recorded drives on disk: one file a drive, data sets, windows and future poses."""
+"""Recorded drives on disk: one file per drive, data sets and future poses."""

@@ -1,7 +1,7 @@
-"""The writing half of a data set: drives come one by one, in any order, and a run that was killed goes on.
+"""Writing of a data set: drives are added one by one, in any order, and an interrupted run continues.
 
-`index.jsonl` gets a line as each drive comes, or as one is given up; `dataset.json` is the index made of it at the end,
-sorted, so that the same drives give the same file whatever the order.
+`index.jsonl` receives one line for each added or dropped drive. `dataset.json` is the sorted index that is written at
+the end: the same drives give the same file in any order.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ LINES: Final = "index.jsonl"
 
 @dataclass(frozen=True)
 class Dropped:
-    """A drive that was given up: nothing of it is in the data set but that it was."""
+    """A drive that could not be recorded, and the reason."""
 
     id: str
     why: str
 
 
 class DatasetWriter:
-    """One writer at a time; methods raise OSError when the disk fails."""
+    """The only writer of a data set; methods raise OSError if the disk fails."""
 
     def __init__(self, folder: Path) -> None:
-        """Make a data set, or go on with one, less drives whose file is not whole. Raises DriveError."""
+        """Create a data set, or continue one without drives whose file is damaged. Raises DriveError."""
         (folder / DRIVES).mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._lock = _locked(folder)
@@ -49,33 +49,33 @@ class DatasetWriter:
         self._rewrite()
 
     def path(self, drive_id: str) -> Path:
-        """Where a drive's file belongs."""
+        """Return the path of a drive's file."""
         return self.folder / DRIVES / f"{drive_id}.safetensors"
 
     def has(self, drive_id: str) -> bool:
-        """Whether that drive is there, or was given up."""
+        """Return whether a drive was added or dropped."""
         return drive_id in self._entries or drive_id in self._dropped
 
     def entries(self, prefix: str = "") -> list[Entry]:
-        """Drives that are there, sorted, of those whose id begins so."""
+        """Return the added drives whose id begins with `prefix`, sorted."""
         return [entry for key, entry in sorted(self._entries.items()) if key.startswith(prefix)]
 
     def dropped(self, prefix: str = "") -> list[Dropped]:
-        """Drives that were given up, likewise."""
+        """Return the dropped drives whose id begins with `prefix`, sorted."""
         return [dropped for key, dropped in sorted(self._dropped.items()) if key.startswith(prefix)]
 
     def add(self, entry: Entry) -> None:
-        """Take in a drive whose file has been written."""
+        """Add a drive whose file has been written."""
         self._entries[entry.id] = entry
         self._append({"drive": asdict(entry)})
 
     def drop(self, drive_id: str, why: str) -> None:
-        """Take note that there will be no such drive."""
+        """Record that a drive is missing, and why."""
         self._dropped[drive_id] = Dropped(drive_id, why)
         self._append({"dropped": asdict(self._dropped[drive_id])})
 
     def finish(self) -> Dataset:
-        """Write the index of what there is, and open it."""
+        """Write the index of the added drives and open the data set."""
         drives = [asdict(entry) for entry in self.entries()]
         dropped = [asdict(each) for each in self.dropped()]
         content = {"format": FORMAT, "drives": drives, "dropped": dropped}
@@ -83,7 +83,7 @@ class DatasetWriter:
         return Dataset.open(self.folder)
 
     def summary(self, prefix: str = "") -> dict[str, Any]:
-        """Counts, for a result: drives, frames, bytes, collisions, outcomes, kinds, why others were given up."""
+        """Return counts for a result: drives, frames, bytes, collisions, outcomes, kinds, reasons of dropped drives."""
         entries, dropped = self.entries(prefix), self.dropped(prefix)
         return {
             "drives": len(entries),
@@ -97,7 +97,7 @@ class DatasetWriter:
         }
 
     def close(self) -> None:
-        """Let other writers in."""
+        """Release the lock for other writers."""
         self._lock.close()
 
     def __enter__(self) -> DatasetWriter:
@@ -113,14 +113,14 @@ class DatasetWriter:
             os.fsync(file.fileno())
 
     def _rewrite(self) -> None:
-        """Without torn lines, and without drives whose files have gone."""
+        """Rewrite the lines without truncated ones and without drives whose files are missing."""
         lines = [{"drive": asdict(entry)} for entry in self.entries()]
         lines += [{"dropped": asdict(each)} for each in self.dropped()]
         write_whole(self.folder / LINES, "".join(json.dumps(line) + "\n" for line in lines))
 
 
 def _read(path: Path) -> list[Entry | Dropped]:
-    """What was noted; the last line may be torn."""
+    """Read all complete lines; the last line may be truncated."""
     if not path.exists():
         return []
     found: list[Entry | Dropped] = []
@@ -139,5 +139,5 @@ def _locked(folder: Path) -> IO[bytes]:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         lock.close()
-        raise DriveError(f"{folder}: another process writes this data set; wait for it, or end it") from error
+        raise DriveError(f"{folder}: another process is writing this data set; wait for it or end it") from error
     return lock

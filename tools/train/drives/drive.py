@@ -1,7 +1,7 @@
-"""One recorded drive as training sees it: pictures, poses, labels and words, in one file; and a folder of such files.
+"""Recorded drives (images, poses, labels and texts in one file each) and data sets, which are folders of drives.
 
-A drive is `drives/ID.safetensors`: arrays over N frames at 10 Hz, and one JSON text with what is the same for the whole
-drive. `dataset.json` lists the drives with the hash of each file (`tools.train.drives.dataset` writes it).
+A drive is `drives/ID.safetensors`: arrays over N frames at 10 Hz, and a JSON header with the properties of the whole
+drive. `dataset.json` lists the drives with the hash of each file (written by `tools.train.drives.dataset`).
 """
 
 from __future__ import annotations
@@ -26,17 +26,21 @@ from edge.core.geometry import SE2
 from tools.train.config.collect import TRACE_EVERY
 
 FUTURE_STEPS: Final = 50
+"""Labelled future poses of a frame, 0.1 s apart."""
 PLAN_TIMES_S: Final = (3.0, 6.0, 9.0)
+"""Times of the expert's waypoints, s."""
 PICTURE_PX: Final = 128
-EXPERT, NOISE, POLICY = 0, 1, 2  # who commanded a frame: values of `by`
+"""Width and height of a recorded image, px."""
+EXPERT, NOISE, POLICY = 0, 1, 2
+"""Source of a frame's command: values of `Drive.by`."""
 POLICY_DRIVER: Final = "policy:"
-"""What the name of a driver begins with that is a policy (DAgger); its hash follows."""
+"""Prefix of the driver's name in a policy's drive (DAgger); the policy's hash follows."""
 TOUR_DRIVER: Final = "tour"
-"""The driver of what nobody drove: a robot that was carried along, with one picture a second."""
+"""Driver's name in a tour: no physics, one image per second."""
 INDEX, DRIVES = "dataset.json", "drives"
 FORMAT: Final = 1
-VAL_EVERY: Final = 8  # one layout in so many is for validation
-_KEY: Final = "drive"  # the file's one metadata key: with two, the writer's order would be left to chance
+VAL_EVERY: Final = 8  # one layout in this many is held out for validation
+_KEY: Final = "drive"  # the file's only metadata key: the order of several keys would not be reproducible
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", re.ASCII)
 _ARRAYS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
     "jpeg_end": ("int64", ()),
@@ -56,11 +60,11 @@ class DriveError(ValueError):
 
 @dataclass(frozen=True)
 class About:
-    """What holds for a whole drive.
+    """Properties of a whole drive.
 
-    `driver`: expert, expert-noise, tour, policy:<sha of the artifacts' manifest>, or imported. `outcome`: how it ended
-    (reached, fell, timeout, cut, imported). `told`: the steps of the told way, as LABELS' scenarios write them.
-    `traces`: one a second, {k, situation, objects, motion, progress {step, steps, passed}, plan}.
+    `driver`: expert, expert-noise, tour, policy:<hash of the artifacts' manifest>, or imported. `outcome`: reached,
+    fell, timeout, cut or imported. `told`: steps of the described route (`Scenario.told_json`). `traces`: one per
+    second, {k, situation, objects, motion, progress {step, steps, passed}, plan}.
     """
 
     id: str
@@ -82,27 +86,30 @@ class About:
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
-            raise DriveError(f"drive {self.id!r}: an id is made of letters, digits, '-', '_' and '.'")
+            raise DriveError(f"drive {self.id!r}: expected an id of letters, digits, '-', '_' and '.'")
         at = [trace.get("k") for trace in self.traces]
         if at != [TRACE_EVERY * i for i in range(len(at))]:
             raise DriveError(f"drive {self.id}: expected a trace every {TRACE_EVERY} frames from 0 on, found {at[:4]}")
 
     @property
     def is_val(self) -> bool:
-        """Whether it is for validation: by its layout, never by frame; the demo's corridor is for training."""
+        """Whether the drive is for validation, which depends on its layout; the demo's corridor is for training."""
         return self.kind != "corridor" and crc32(f"{self.kind}-{self.layout_seed}".encode()) % VAL_EVERY == 0
 
 
 @dataclass(frozen=True)
 class Drive:
-    """N frames at 10 Hz.
+    """A drive of N frames at 10 Hz.
 
-    `jpeg` uint8 [bytes], frame k ends before `jpeg_end[k]` (of a tour whole seconds alone have pictures); `pose`
-    [N, 3] true T_world_base and `pose_odom` [N, 3] T_odom_base, m and rad; `state` [N, 3] vx m/s, vy m/s, wz rad/s by
-    odometry; `future` [N, 50, 3] what the expert does, x m, y m, theta rad at 0.1 to 5.0 s in the robot's frame at k,
-    of which the first `future_steps[k]` are known and the rest repeat the last one; `plan_xy` [N, 3, 2] where it means
-    to be in 3, 6 and 9 s, m in the robot's frame; `by` [N] who commanded: EXPERT, NOISE or POLICY. `pose` and what is
-    made of it is truth: no policy may see it.
+    - `jpeg` uint8 [bytes]: image k ends before `jpeg_end[k]`; a tour has images at whole seconds alone.
+    - `pose` [N, 3]: true T_world_base; `pose_odom` [N, 3]: T_odom_base; m and rad.
+    - `state` [N, 3]: vx m/s, vy m/s, wz rad/s from odometry.
+    - `future` [N, 50, 3]: the expert's poses (x m, y m, theta rad) at 0.1 to 5.0 s in the robot frame at k; the first
+      `future_steps[k]` are known, the rest repeat the last known one.
+    - `plan_xy` [N, 3, 2]: the expert's planned positions in 3, 6 and 9 s, m in the robot frame.
+    - `by` [N]: source of the command: EXPERT, NOISE or POLICY.
+
+    `pose`, `future` and `plan_xy` are ground truth: no policy may use them as input.
     """
 
     about: About
@@ -134,7 +141,7 @@ class Drive:
         if self.about.driver == TOUR_DRIVER:
             lengths = np.where(np.arange(count) % TRACE_EVERY, lengths + 1, lengths)
         if np.any(lengths <= 0) or (len(self.jpeg) and self.jpeg_end[-1] != len(self.jpeg)):
-            raise DriveError(f"{what}: jpeg_end: expected growing ends up to {len(self.jpeg)}")
+            raise DriveError(f"{what}: jpeg_end: expected increasing values up to {len(self.jpeg)}")
         if np.any((self.future_steps < 0) | (self.future_steps > FUTURE_STEPS)):
             raise DriveError(f"{what}: future_steps: expected 0 to {FUTURE_STEPS}")
 
@@ -143,42 +150,42 @@ class Drive:
 
     @property
     def id(self) -> str:
-        """Its name in the data set."""
+        """The drive's id in the data set."""
         return self.about.id
 
     @property
     def wordings(self) -> tuple[str, ...]:
-        """Instructions that say the same."""
+        """Instructions with the same meaning."""
         return self.about.wordings
 
     @property
     def traces(self) -> tuple[Mapping[str, Any], ...]:
-        """One a second from frame 0 on; empty where nobody wrote any."""
+        """Traces at every second from frame 0 on; empty if the drive has none."""
         return self.about.traces
 
     def frame(self, k: int) -> NDArray[np.uint8]:
-        """Picture k, uint8 RGB [128, 128, 3]. Raises DriveError without pictures or when one cannot be decoded."""
+        """Decode image k as uint8 RGB [128, 128, 3]. Raises DriveError without images or if decoding fails."""
         if not len(self.jpeg):
-            raise DriveError(f"drive {self.id}: was loaded without its pictures")
+            raise DriveError(f"drive {self.id}: was loaded without its images")
         k = self._index(k)
         start = int(self.jpeg_end[k - 1]) if k else 0
         if start == self.jpeg_end[k]:
-            raise DriveError(f"drive {self.id}: there is no picture of frame {k}")
+            raise DriveError(f"drive {self.id}: frame {k} has no image")
         picture = cv2.imdecode(self.jpeg[start : int(self.jpeg_end[k])], cv2.IMREAD_COLOR)
         if picture is None or picture.shape != (PICTURE_PX, PICTURE_PX, 3):
-            raise DriveError(f"drive {self.id}: picture {k} is not a JPEG of {PICTURE_PX}x{PICTURE_PX}")
+            raise DriveError(f"drive {self.id}: image {k} is not a JPEG of {PICTURE_PX}x{PICTURE_PX}")
         return np.asarray(picture[..., ::-1].copy(), np.uint8)
 
     def T_world_base(self, k: int) -> SE2:  # noqa: N802  # a pose's name
-        """True pose at frame k."""
+        """Return the true pose at frame k."""
         return SE2(*(float(v) for v in self.pose[self._index(k)]))
 
     def T_odom_base(self, k: int) -> SE2:  # noqa: N802  # a pose's name
-        """Pose at frame k as odometry reported it."""
+        """Return the odometry's pose at frame k."""
         return SE2(*(float(v) for v in self.pose_odom[self._index(k)]))
 
     def trace_at(self, k: int) -> Mapping[str, Any] | None:
-        """The newest trace that was written at frame k or before; None where there is none."""
+        """Return the newest trace at or before frame k; None if there is none."""
         index = self._index(k) // TRACE_EVERY
         return self.traces[index] if index < len(self.traces) else None
 
@@ -188,7 +195,7 @@ class Drive:
         return int(k)
 
     def save(self, path: Path) -> None:
-        """Write the file as a whole (under another name, then renamed). Raises OSError."""
+        """Write the file atomically. Raises OSError."""
         arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in ("jpeg", *_ARRAYS)}
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         text = json.dumps({"format": FORMAT, **asdict(self.about)}, sort_keys=True, separators=(",", ":"))
@@ -197,7 +204,7 @@ class Drive:
 
     @staticmethod
     def load(path: Path, *, pictures: bool = True) -> Drive:
-        """A file that `save` has written, without its pictures if they are not needed. Raises DriveError."""
+        """Read a file that `save` wrote; `pictures` False leaves the images out. Raises DriveError."""
         try:
             with safe_open(path, framework="numpy") as file:
                 about = _about(path, (file.metadata() or {}).get(_KEY, ""))
@@ -212,7 +219,7 @@ def _about(path: Path, text: str) -> About:
     try:
         content = json.loads(text)
         if content.pop("format") != FORMAT:
-            raise DriveError(f"{path}: expected a drive of format {FORMAT}; collect it again")
+            raise DriveError(f"{path}: expected a drive of format {FORMAT}; record it again")
         if set(content) != {each.name for each in fields(About)}:
             raise DriveError(f"{path}: unknown or missing keys in its header, found {sorted(content)}")
         x, y = content["goal_xy"]
@@ -221,12 +228,12 @@ def _about(path: Path, text: str) -> About:
     except DriveError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DriveError(f"{path}: its header is not of a drive") from error
+        raise DriveError(f"{path}: the header is not a drive's") from error
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A drive as the index lists it: enough to choose by without opening the file."""
+    """Index entry of a drive: its hash and properties, readable without the file."""
 
     id: str
     sha256: str
@@ -242,7 +249,7 @@ class Entry:
 
     @staticmethod
     def of(drive: Drive, path: Path) -> Entry:
-        """Of a drive that has been saved there."""
+        """Build the entry of a drive that was saved at `path`."""
         about = drive.about
         return Entry(
             about.id, file_sha256(path), path.stat().st_size, len(drive), about.kind, about.layout_seed, about.robot,
@@ -252,14 +259,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Dataset:
-    """The drives of a folder, sorted by id."""
+    """Drives of a folder, sorted by id."""
 
     folder: Path
     entries: tuple[Entry, ...]
 
     @staticmethod
     def open(folder: Path, *, verify: bool = False) -> Dataset:
-        """By its index; `verify` hashes every file. Raises DriveError."""
+        """Read the index of a folder; `verify` also checks the hash of every file. Raises DriveError."""
         path = folder / INDEX
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -269,12 +276,12 @@ class Dataset:
         except DriveError:
             raise
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DriveError(f"{path}: not the index of a data set ({error!r}); make one with collect") from error
+            raise DriveError(f"{path}: not the index of a data set ({error!r}); record one with collect") from error
         dataset = Dataset(folder, tuple(sorted(entries, key=lambda entry: entry.id)))
         if verify:
             for entry in dataset.entries:
                 if not intact(dataset.path(entry.id), entry):
-                    raise DriveError(f"{dataset.path(entry.id)}: not the file that the index lists; collect again")
+                    raise DriveError(f"{dataset.path(entry.id)}: differs from the indexed file; collect again")
         return dataset
 
     def __len__(self) -> int:
@@ -282,48 +289,50 @@ class Dataset:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Of all drives, sorted."""
+        """Ids of all drives, sorted."""
         return tuple(entry.id for entry in self.entries)
 
     @property
     def train(self) -> tuple[str, ...]:
-        """Ids of the drives to learn from."""
+        """Ids of the training drives."""
         return tuple(entry.id for entry in self.entries if not entry.val)
 
     @property
     def val(self) -> tuple[str, ...]:
-        """Ids of the drives in layouts that are never learned from."""
+        """Ids of the validation drives, whose layouts have no training drive."""
         return tuple(entry.id for entry in self.entries if entry.val)
 
     def of(self, *prefixes: str) -> Dataset:
-        """The drives whose ids begin with one of these. Raises DriveError where there is none."""
+        """Return the drives whose ids begin with one of `prefixes`. Raises DriveError if there are none."""
         entries = tuple(entry for entry in self.entries if entry.id.startswith(prefixes))
         if not entries:
-            raise DriveError(f"{self.folder}: no drives whose names begin with {' or '.join(prefixes)}; collect again")
+            raise DriveError(
+                f"{self.folder}: no drives with ids that begin with {' or '.join(prefixes)}; collect again"
+            )
         return Dataset(self.folder, entries)
 
     @property
     def sha256(self) -> str:
-        """Of all drives: the same files give the same, in whatever order they were made."""
+        """Hash of all drives; it does not depend on the order of recording."""
         lines = "".join(f"{entry.id} {entry.sha256}\n" for entry in self.entries)
         return hashlib.sha256(lines.encode()).hexdigest()
 
     def path(self, drive_id: str) -> Path:
-        """Where a drive lies."""
+        """Return the path of a drive's file."""
         return self.folder / DRIVES / f"{drive_id}.safetensors"
 
     def load(self, drive_id: str, *, pictures: bool = True) -> Drive:
-        """One drive. Raises DriveError."""
+        """Load one drive. Raises DriveError."""
         return Drive.load(self.path(drive_id), pictures=pictures)
 
     def drives(self, ids: Sequence[str] | None = None, *, pictures: bool = True) -> Iterator[Drive]:
-        """One after the other, all by default; no more than one is in memory."""
+        """Yield drives one after the other, by default all; only one is in memory."""
         for drive_id in self.ids if ids is None else ids:
             yield self.load(drive_id, pictures=pictures)
 
 
 def file_sha256(path: Path) -> str:
-    """Of a file's bytes. Raises OSError."""
+    """Hash a file's content. Raises OSError."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -332,5 +341,5 @@ def file_sha256(path: Path) -> str:
 
 
 def intact(path: Path, entry: Entry) -> bool:
-    """Whether the file is there and is the one that was listed."""
+    """Return whether a file exists with the size and hash of its entry."""
     return path.is_file() and path.stat().st_size == entry.bytes and file_sha256(path) == entry.sha256

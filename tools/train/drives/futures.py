@@ -1,7 +1,7 @@
-"""What the action expert learns to do from a frame on: 5 s of poses, 0.1 s apart, in the robot's frame.
+"""Labels of the action expert: the next 5 s of poses, 0.1 s apart, in the robot frame.
 
-Either what the expert then drove, or what it had chosen: its own plan of 4 s, followed on along the way. The latter is
-the label wherever somebody else had a hand in what was driven.
+A label is either the expert's driven path or its plan: 4 s, extended along the route. The plan is the label wherever
+another source than the expert commanded within these 5 s.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ from sim_hil.benchmark.policies.expert_motion import STEP_S, Choice
 from sim_hil.benchmark.policies.expert_route import SPACING_M
 from tools.train.config.collect import RATE_HZ
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS
-from tools.train.drives.windows import relative
 
 Array = NDArray[np.float64]
 
-_ARRIVED_M: Final = 0.4  # of the way's end
-_STANDS_M: Final = 0.02  # a last step of this length is standing
+_ARRIVED_M: Final = 0.4  # distance to the route's end that counts as arrived
+_STANDS_M: Final = 0.02  # a last step shorter than this counts as standing
 
 
 def chosen_future(pose: SE2, choice: Choice, route: Array) -> Array:
-    """[50, 3] in the robot's frame at `pose`: the plan that was chosen there, then on along `route` ([n, 2] m, world).
+    """Return the expert's plan at `pose`, extended along `route` ([n, 2] m, world): [50, 3] in the robot frame.
 
-    Beyond the plan's end it keeps the plan's last speed and distance to the way; at the way's end it stands.
+    Beyond the plan's end it keeps the plan's last speed and distance to the route; at the route's end it stands.
     """
     here = np.array(pose.as_tuple())
     plan = np.column_stack((choice.future, choice.headings_rad))
@@ -38,7 +37,7 @@ def chosen_future(pose: SE2, choice: Choice, route: Array) -> Array:
     on_plan = wanted <= times[-1] + 1e-9
     future = np.stack([np.interp(wanted, times, known[:, axis]) for axis in range(3)], axis=1)
     future[~on_plan] = _followed(known[-2], known[-1], wanted[~on_plan] - times[-1], route)
-    # Who has arrived stands: the plan, made to drive on, would turn on the spot there.
+    # After arrival the robot stands: the plan, made for driving on, would turn on the spot.
     arrived = np.flatnonzero(np.hypot(*(future[:, :2] - route[-1]).T) < _ARRIVED_M)
     if len(arrived) and len(route) > 1:
         future[arrived[0] :] = future[arrived[0]]
@@ -46,7 +45,7 @@ def chosen_future(pose: SE2, choice: Choice, route: Array) -> Array:
 
 
 def _followed(before: Array, end: Array, later_s: Array, route: Array) -> Array:
-    """[n, 3] in the world: where one is `later_s` after the pose `end`, going on along the way as since `before`."""
+    """Return poses [n, 3] in the world `later_s` after `end`, along the route with the speed from `before` to `end`."""
     step = end[:2] - before[:2]
     ahead = float(step @ (np.cos(end[2]), np.sin(end[2])))
     still = np.repeat(end[None], len(later_s), axis=0)
@@ -59,22 +58,25 @@ def _followed(before: Array, end: Array, later_s: Array, route: Array) -> Array:
     on_way = np.stack([np.interp(marks, along, route[:, axis]) for axis in range(2)], axis=1)
     ways = np.diff(route, axis=0, append=2 * route[-1:] - route[-2:-1])
     turns = np.unwrap(np.arctan2(ways[:, 1], ways[:, 0]))
-    # It keeps beside the way as it was, and turns as the way does.
+    # It keeps its lateral offset to the route and turns with the route.
     turned = np.interp(marks, along, turns) - turns[nearest]
     return np.column_stack((on_way + (end[:2] - route[nearest]), end[2] + turned))
 
 
 def driven_future(pose: Array, k: int, last: int) -> Array:
-    """[n, 3] in the robot's frame at k: the poses ([N, 3] in the world) of frames k + 1 up to `last`, 50 at most."""
+    """Return poses [n, 3] of frames k + 1 to `last`, at most 50, in the robot frame at k.
+
+    `pose` [N, 3]: all poses of the drive in the world.
+    """
     return relative(pose[k], pose[k + 1 : min(k + FUTURE_STEPS, last) + 1])
 
 
 def label_futures(pose: Array, chosen: Array, by: NDArray[np.uint8], *, goes_on: bool) -> tuple[Array, Array]:
-    """Labels of a whole drive: futures [N, 50, 3], and how many steps of each are known [N].
+    """Compute the labels of a whole drive: futures [N, 50, 3] and the number of known steps of each [N].
 
-    `pose` [N, 3] driven; `chosen` [N, 50, 3] what the expert chose at each frame; `by` [N] who commanded. Frames whose
-    next 5 s were all the expert's take what was driven; at the drive's end what it had chosen there goes on if
-    `goes_on`, else the rest is not known.
+    `pose` [N, 3]: driven poses; `chosen` [N, 50, 3]: the expert's plan at each frame; `by` [N]: source of each command.
+    Frames whose next 5 s were commanded by the expert take the driven path. At the drive's end the last plan continues
+    it if `goes_on`, else the rest is unknown.
     """
     count = len(pose)
     futures = np.zeros((count, FUTURE_STEPS, 3))
@@ -95,8 +97,17 @@ def label_futures(pose: Array, chosen: Array, by: NDArray[np.uint8], *, goes_on:
 
 
 def _seen_from(here: Array, there: Array, poses: Array) -> Array:
-    """[n, 3]: poses in the frame of `there`, a pose in the world, as seen from `here`."""
+    """Transform poses [n, 3] from the frame of `there` to that of `here`; both are poses in the world."""
     c, s = np.cos(there[2]), np.sin(there[2])
     x = there[0] + c * poses[:, 0] - s * poses[:, 1]
     y = there[1] + s * poses[:, 0] + c * poses[:, 1]
     return relative(here, np.stack((x, y, there[2] + poses[:, 2]), axis=1))
+
+
+def relative(origin: Array, poses: Array) -> Array:
+    """Transform poses [n, 3] (x m, y m, theta rad) to the frame of `origin` [3], a pose in the same frame."""
+    poses = np.asarray(poses, np.float64).reshape(-1, 3)
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    dx, dy = poses[:, 0] - origin[0], poses[:, 1] - origin[1]
+    turned = (poses[:, 2] - origin[2] + np.pi) % (2 * np.pi) - np.pi
+    return np.stack((c * dx + s * dy, c * dy - s * dx, turned), axis=1)

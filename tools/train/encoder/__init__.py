@@ -1,1 +1,1 @@
-"""Stage 0: trains the vision encoder on rendered pictures with known labels."""
+"""Stage 0: training of the vision encoder on rendered images with known labels."""

@@ -1,7 +1,7 @@
-"""Training pictures of the encoder on disk: shards of one scene each, with labels, each keyed by what it was made with.
+"""The encoder's training images on disk: shards of one scene each, with labels and a key of their configuration.
 
-A shard is `NAME.safetensors` and, written after it, `NAME.json` with its key and hash: a file without its JSON, or of
-another key, is made again. `fill` makes what is missing in processes of their own.
+A shard is `NAME.safetensors` and `NAME.json`, written after it, with key and hash. A shard without JSON file or with
+another key is rendered again. `fill` renders missing shards in worker processes.
 """
 
 from __future__ import annotations
@@ -34,23 +34,22 @@ from tools.train.samples.augment import Picture, decoded
 FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder.worker"
 FIRST_LAYOUT: Final = 10_000_000_000
-"""Of layouts that pictures are taken in: above every seed that drives are recorded in
-(`tools.train.scenes.scenarios`)."""
-_OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts
+"""First seed of the layouts, above all seeds of drives (`tools.train.scenes.scenarios`)."""
+_OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts per stage seed, and the first held-out one
 _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
-_CORRIDOR_MOST: Final = 12
-_LEAST_HELD: Final = 32  # pictures of a scene, which takes seconds to build
-_EMPTY_SHARE: Final = 0.12  # of scenes indoors
+_CORRIDOR_MOST: Final = 12  # most people in the corridor
+_LEAST_HELD: Final = 32  # fewest images of a held-out scene, because a scene takes seconds to build
+_EMPTY_SHARE: Final = 0.12  # share of indoor scenes without people
 
 
 class FramesError(ValueError):
-    """Training pictures that cannot be made or read; one line."""
+    """Training images that cannot be rendered or read; one line."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One scene's pictures: where, which robot, how many people and pictures. `side`: of the tokens' square."""
+    """Configuration of one scene's images; `side`: visual tokens along one side of an image."""
 
     name: str
     kind: str
@@ -69,7 +68,7 @@ class Shard:
 
     @property
     def key(self) -> str:
-        """Hash of all that decides what is in it, apart from the code that draws."""
+        """Hash of everything that determines the content, except the rendering code."""
         made = {
             "format": FORMAT,
             "shard": plain(self),
@@ -82,13 +81,13 @@ class Shard:
 
     @staticmethod
     def of_json(content: dict[str, Any]) -> Shard:
-        """What `plain` has written; raises FieldError."""
+        """Build a shard from `plain` content. Raises FieldError."""
         return build(Shard, content, "shard")
 
 
 @dataclass(frozen=True)
 class Made:
-    """A shard that is there."""
+    """Index entry of a rendered shard."""
 
     name: str
     key: str
@@ -97,14 +96,14 @@ class Made:
 
 
 def plan(config: FramesConfig, seed: int, side: int) -> list[Shard]:
-    """All shards of a stage: those to learn from, then the held-out ones. The same arguments give the same."""
+    """Return all shards of a stage: training shards, then held-out ones. Depends on the arguments alone."""
     return _planned(config, seed, side, held=False) + _planned(config, seed, side, held=True)
 
 
 def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[Shard]:
     kinds = [kind for kind in config.kinds if not (held and kind == CORRIDOR)]
     left = config.held if held else config.count
-    # Held-out pictures come from many layouts: they tell more about new ones than many pictures of one.
+    # Held-out images come from many layouts, which estimates the error on new layouts better.
     per_scene = config.per_scene
     if held and left:
         per_scene = min(per_scene, max(_LEAST_HELD, -(-left // (4 * len(set(kinds))))))
@@ -115,7 +114,7 @@ def _planned(config: FramesConfig, seed: int, side: int, *, held: bool) -> list[
         kind = kinds[(number + number // len(kinds)) % len(kinds)]
         layout_seed = FIRST_LAYOUT + seed % 1_000 * _OF_A_SEED + (_HELD_FROM if held else 0) + number
         frames = min(per_scene, left)
-        # In turn within each kind: by chance one would have most of the scenes of one kind.
+        # Robots alternate within each kind, so that each has the same number of scenes.
         robot = ROBOTS[sum(shard.kind == kind for shard in shards) % len(ROBOTS)]
         people = _people(config, kind, rng)
         name = f"{'held' if held else 'train'}-{number:04d}-{kind}-{robot}"
@@ -137,7 +136,7 @@ def _people(config: FramesConfig, kind: str, rng: np.random.Generator) -> int:
 
 
 def made(folder: Path, shard: Shard) -> Made | None:
-    """What the folder has of a shard: None unless it was made with the same numbers and is whole."""
+    """Return a shard's entry; None unless it is complete and has the same configuration."""
     try:
         content = Made(**json.loads((folder / f"{shard.name}.json").read_text(encoding="utf-8")))
         whole = path_of(folder, shard.name).stat().st_size == content.bytes
@@ -147,14 +146,14 @@ def made(folder: Path, shard: Shard) -> Made | None:
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Where a shard's pictures and labels lie."""
+    """Return the path of a shard's file."""
     return folder / f"{name}.safetensors"
 
 
 def fill(
     folder: Path, shards: Sequence[Shard], jobs: int, progress: StageProgress, should_stop: Callable[[], bool]
 ) -> None:
-    """Make the shards that the folder lacks. Raises FramesError, OSError; KeyboardInterrupt when told to stop."""
+    """Render missing shards. Raises FramesError, OSError, KeyboardInterrupt if `should_stop`."""
     logs = folder / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     for partial in folder.glob("*.partial"):
@@ -192,21 +191,21 @@ def _note(told: Told, taken: dict[str, int]) -> None:
 
 
 def frames_sha256(folder: Path, shards: Sequence[Shard]) -> str:
-    """Of all shards: the same pictures give the same, in whatever order they were made. Raises FramesError."""
+    """Hash all shards; it does not depend on the order of rendering. Raises FramesError for a missing shard."""
     lines = []
     for shard in shards:
         there = made(folder, shard)
         if there is None:
-            raise FramesError(f"{path_of(folder, shard.name)}: missing, or made with other numbers")
+            raise FramesError(f"{path_of(folder, shard.name)}: missing, or of another configuration")
         lines.append(f"{there.name} {there.sha256}\n")
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 class FrameSet:
-    """Pictures of some shards as one list; labels are in memory, pictures are read as they are asked for."""
+    """Images of some shards as one sequence; labels are in memory, images are read on access."""
 
     def __init__(self, folder: Path, shards: Sequence[Shard]) -> None:
-        """Opens all shards, which must be there. Raises FramesError."""
+        """Open all shards. Raises FramesError for a missing one."""
         self._files: list[Any] = []
         self._ends: list[NDArray[np.int64]] = []
         parts: dict[str, list[NDArray[np.generic]]] = {}
@@ -217,7 +216,7 @@ class FrameSet:
                 labels = {name: file.get_tensor(name) for name in label_shapes(shard.side)}
                 ends = file.get_tensor("jpeg_end")
             except (OSError, SafetensorError) as error:
-                raise FramesError(f"{path}: not readable ({error}); delete it and go on with --resume") from error
+                raise FramesError(f"{path}: not readable ({error}); delete it and continue with --resume") from error
             for name, (kind, shape) in label_shapes(shard.side).items():
                 if labels[name].shape != (shard.frames, *shape) or labels[name].dtype != kind:
                     raise FramesError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
@@ -231,7 +230,7 @@ class FrameSet:
         return int(self._starts[-1])
 
     def picture(self, index: int) -> Picture:
-        """Picture number `index`, uint8 RGB [px, px, 3]."""
+        """Decode image number `index` as uint8 RGB [px, px, 3]."""
         if not 0 <= index < len(self):
             raise IndexError(f"pictures: expected a number of 0 to {len(self) - 1}, found {index}")
         shard = int(np.searchsorted(self._starts, index, side="right")) - 1
@@ -241,7 +240,7 @@ class FrameSet:
 
 
 def finish(folder: Path, shard: Shard) -> Made:
-    """Say that a shard's file has been written as a whole; what `made` then finds. Raises OSError."""
+    """Write the entry of a completely written shard and return it. Raises OSError."""
     path = path_of(folder, shard.name)
     done = Made(shard.name, shard.key, file_sha256(path), path.stat().st_size)
     write_whole(folder / f"{shard.name}.json", json.dumps(asdict(done), sort_keys=True) + "\n")

@@ -1,10 +1,10 @@
-"""Stage 0: the vision encoder learns to see what a navigator needs, from pictures whose truth the simulator knows.
+"""Stage 0: the vision encoder learns features for navigation from rendered images with the simulator's labels.
 
-Linear heads on its tokens tell class, distance, colour and heading of what each cell shows, how far the floor is free
-in each direction and what it leads into. The heads are thrown away; the encoder is frozen from here on.
+Linear heads on its tokens predict class, distance, colour and heading of each cell's content, the free distance in each
+direction and the area that it leads into. The heads are discarded; later stages keep the encoder frozen.
 
-Which pictures are in a batch and how each is changed is a pure function of seed, epoch and number, so a run that was
-ended goes on exactly, and any number of ranks learns from the same batches.
+Batches and augmentation are functions of seed, epoch and image number. An interrupted run resumes exactly, and the
+number of ranks does not change the batches.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _HEADS, _AUGMENT, _LOOK = 0xE0C2, 0xE0C3, 0xE0C4
 
 
 class EncoderError(ValueError):
-    """A network, pictures or a checkpoint that cannot be learned from; one line."""
+    """An unsuitable network, unusable images, or a checkpoint of another run; one line."""
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """(what, number of samples, key of the throughput) of a run of this stage."""
+    """Return (description, number of samples, key of the throughput) of this stage's work."""
     if recipe.encoder is None:
         return []
     frames = recipe.encoder.frames
@@ -59,14 +59,17 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Render, train, evaluate; leaves the network with its new encoder. Raises EncoderError, FramesError, OSError."""
+    """Render, train, evaluate, and write the network with its new encoder.
+
+    Raises EncoderError, FramesError, OSError.
+    """
     config = _config(job)
     network = start_network(job, STAGE)
     result: dict[str, Any] = {"steps": 0}
     if config.frames.count:
         result = _train(job, config, network)
     else:
-        job.progress.say("frames.count is 0: the encoder stays as it is")
+        job.progress.say("frames.count is 0: the encoder is not trained")
     if job.ranks.first:
         finish_network(job, STAGE, network)
     job.ranks.barrier()
@@ -85,11 +88,11 @@ def _train(job: StageJob, config: EncoderConfig, network: TicVla) -> dict[str, A
     heads = EncoderHeads(network.config.vision.token_dim, side)
     heads.initialise(job.generator(_HEADS))
     heads.to(job.device)
-    pupil = _Pupil(job, config, network, heads, balance, frames_sha256(folder, shards))
-    numbers = pupil.learn(data, held)
-    result: dict[str, Any] = {"pictures": len(data), "frames_sha256": pupil.frames, **numbers}
+    trainer = _Trainer(job, config, network, heads, balance, frames_sha256(folder, shards))
+    numbers = trainer.train(data, held)
+    result: dict[str, Any] = {"pictures": len(data), "frames_sha256": trainer.frames, **numbers}
     if job.ranks.first and len(held):
-        loss, score = pupil.look(held, range(len(held)))
+        loss, score = trainer.evaluate(held, range(len(held)))
         fixed = Score()
         fixed.add(Fixed(data.labels).of(len(held)), held.labels)
         result |= {"held_loss": loss, "held_out": score.result(), "fixed_answer": fixed.result()}
@@ -98,22 +101,22 @@ def _train(job: StageJob, config: EncoderConfig, network: TicVla) -> dict[str, A
 
 
 def token_side(network: TicVla) -> int:
-    """Tokens along one side of a picture; raises EncoderError where labels cannot be made for so many."""
+    """Return the number of tokens along one side of an image. Raises EncoderError if labels cannot be made for it."""
     side = isqrt(network.config.vision.tokens)
     if PIXELS % side or COLUMNS % side:
-        raise EncoderError(f"the encoder has {side} x {side} tokens; labels are made for 1, 2, 4, 8, 16 or 32 a side")
+        raise EncoderError(f"the encoder has {side} x {side} tokens; expected 1, 2, 4, 8, 16 or 32 tokens a side")
     return side
 
 
 def _render(job: StageJob, config: EncoderConfig, folder: Path, shards: Sequence[Shard]) -> None:
-    """The first rank has the pictures made; the others wait."""
+    """Render missing images in the first rank; the others wait."""
     with job.ranks.by_first() as here:
         if here:
             fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.asked)
 
 
-class _Pupil:
-    """Encoder and heads while they learn."""
+class _Trainer:
+    """Trains encoder and heads."""
 
     def __init__(
         self, job: StageJob, config: EncoderConfig, network: TicVla, heads: EncoderHeads, balance: Balance, frames: str
@@ -122,7 +125,7 @@ class _Pupil:
         self._vision, self._heads = network.vision, heads
         self._px = network.config.vision.image_px
         self.frames = frames
-        """Hash of the pictures."""
+        """Hash of the images."""
         self._parameters = [*self._vision.parameters(), *heads.parameters()]
         self._path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
         numbers = asdict(config)
@@ -130,8 +133,8 @@ class _Pupil:
         made_with = {"config": numbers, "frames": frames, "vision": asdict(network.config.vision), "seed": job.seed}
         self._key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()
 
-    def learn(self, data: FrameSet, held: FrameSet) -> dict[str, Any]:
-        """All steps that are left; the last numbers."""
+    def train(self, data: FrameSet, held: FrameSet) -> dict[str, Any]:
+        """Run all remaining steps and return the last loss."""
         job, config = self._job, self._config
         order = BatchOrder(len(data), config.batch, config.epochs, job.seed)
         job.ranks.copy_parameters(self._parameters)
@@ -146,7 +149,7 @@ class _Pupil:
                 if job.ranks.first:
                     job.run_dir.log(STAGE, step, loss=loss, lr=lr)
                 if (step % config.look_steps == 0 or step == order.steps) and len(look) and job.ranks.first:
-                    held_loss, score = self.look(held, look)
+                    held_loss, score = self.evaluate(held, look)
                     job.run_dir.log(STAGE, step, held_loss=held_loss, **_watched(score))
                 job.progress.update(step, order.steps, loss=loss, held_loss=held_loss)
                 if job.should_stop():
@@ -157,8 +160,8 @@ class _Pupil:
         return {"steps": order.steps, "loss": loss}
 
     @torch.no_grad()
-    def look(self, frames: FrameSet, which: Sequence[int] | NDArray[np.int64]) -> tuple[float, Score]:
-        """Loss and score of some pictures as they are, in float32."""
+    def evaluate(self, frames: FrameSet, which: Sequence[int] | NDArray[np.int64]) -> tuple[float, Score]:
+        """Compute loss and score of some images without augmentation, in float32."""
         chosen, cost, score = np.asarray(which, np.int64), 0.0, Score()
         for start in range(0, len(chosen), self._config.batch):
             part = chosen[start : start + self._config.batch]
@@ -170,7 +173,7 @@ class _Pupil:
         return cost / max(len(chosen), 1), score
 
     def _step(self, optimiser: Optimiser, pictures: NDArray[np.uint8], labels: Mapping[str, Any]) -> float:
-        """One update from this rank's share of a batch; the mean loss of all ranks."""
+        """Update once with this rank's share of a batch and return the mean loss over all ranks."""
         job, count, value = self._job, len(pictures), 0.0
         if count:
             with autocast(job.device, self._config.optim.bf16):
@@ -191,7 +194,7 @@ class _Pupil:
             checkpoint.save(self._path, {**weights, **optimiser.tensors()}, meta)
 
     def _load(self, optimiser: Optimiser) -> tuple[float, float]:
-        """Go on if asked to and able to; the last loss and that of held-out pictures. Raises EncoderError."""
+        """Resume if requested and possible; return the last training and held-out losses. Raises EncoderError."""
         job = self._job
         if not (job.resume and self._path.exists()):
             if job.ranks.first:
@@ -199,7 +202,7 @@ class _Pupil:
             return float("nan"), float("nan")
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
-            raise EncoderError(f"{self._path}: of other pictures or another recipe; delete it to begin anew")
+            raise EncoderError(f"{self._path}: checkpoint of other images or another recipe; delete it to start again")
         self._vision.load_state_dict(checkpoint.under("vision", tensors))
         self._heads.load_state_dict(checkpoint.under("heads", tensors))
         optimiser.restore(tensors)
@@ -209,7 +212,7 @@ class _Pupil:
 
 
 class _Batches:
-    """This rank's shares of the batches; the next one is made while the network learns from one."""
+    """This rank's shares of the batches; the next one is prepared while the network trains."""
 
     def __init__(self, job: StageJob, data: FrameSet, order: BatchOrder, config: EncoderConfig, px: int) -> None:
         self._job, self._data, self._order, self._px = job, data, order, px
@@ -224,7 +227,7 @@ class _Batches:
         self._pool.shutdown(cancel_futures=True)
 
     def at(self, step: int) -> tuple[NDArray[np.uint8], Mapping[str, Any]]:
-        """Pictures uint8 [n, px, px, 3] and their labels, [n, ...] each."""
+        """Return the images uint8 [n, px, px, 3] of a step and their labels, [n, ...] each."""
         ahead, self._ahead = self._ahead, None
         batch = ahead[1].result() if ahead is not None and ahead[0] == step else self._make(step)
         if step + 1 < self._order.steps:
@@ -247,7 +250,7 @@ class _Batches:
 
 
 def _watched(score: Score) -> dict[str, float]:
-    """What is worth a curve."""
+    """Select the scores that are plotted as curves."""
     names = ("landmark_bearing", "landmark_recall", "person_recall", "opening_recall", "free_relative_error")
     found = score.result()
     return {name: float(found[name]) for name in names if found[name] is not None}

@@ -1,8 +1,7 @@
-"""Heads on the visual tokens that are thrown away after the encoder's training, and what they are to learn.
+"""Linear heads on the visual tokens, used only during the encoder's training, and their losses.
 
-They are linear: what they can tell is in the tokens for whoever reads them next. Every loss is a sum over a picture's
-cells or columns with weights that are fixed beforehand, so that a batch's loss is the mean over its pictures, however
-they are shared out among processes.
+The heads are linear so that the tokens themselves contain the predicted quantities. Every loss is a sum over an image's
+cells or columns with fixed weights: a batch's loss is the mean over its images, for any distribution among processes.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(
         "free_m": 1.0, "open_kind": 0.8, "open_m": 0.3, "place": 0.2,
     }
 )  # fmt: skip
-"""How much each label's loss counts."""
+"""Weight of each label's loss."""
 _CHOICES: Final = {
     "main": len(CLASSES), "thing": len(CLASSES), "colour": len(COLOUR_WORDS), "facing": OCTANTS,
 }  # fmt: skip
-_MOST_WEIGHT: Final = 6.0  # of a rare class: a few noisy cells must not rule
-_LEAST_SHARE: Final = 0.01
-_BETA: Final = 0.1  # where the loss of a distance turns from square to linear, in its logarithm
+_MOST_WEIGHT: Final = 6.0  # largest weight of a rare class, so that a few noisy cells do not dominate
+_LEAST_SHARE: Final = 0.01  # smallest share of labelled cells that a loss is divided by
+_BETA: Final = 0.1  # error of a log distance at which the loss changes from quadratic to linear
 
 Predictions = Mapping[str, Tensor]
 
 
 class EncoderHeads(nn.Module):
-    """Tokens [n, side², dim], row by row from the top left, to predictions of every label."""
+    """Maps tokens [n, side², dim], row by row from the top left, to predictions of every label."""
 
     def __init__(self, dim: int, side: int) -> None:
         super().__init__()
@@ -51,23 +50,24 @@ class EncoderHeads(nn.Module):
         self.place = nn.Linear(dim, len(OPENINGS))
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Weights that the generator names."""
+        """Initialise the weights from a generator."""
         with torch.no_grad():
             for layer in (self.cells, self.columns, self.place):
                 layer.weight.normal_(0.0, layer.in_features**-0.5, generator=generator)
                 layer.bias.zero_()
 
     def forward(self, tokens: Tensor) -> dict[str, Tensor]:
-        """Scores [n, side, side, choices] of `main`, `thing`, `colour`, `facing`; [n, 32, kinds] of `open_kind`.
+        """Compute the predictions.
 
-        [n, kinds] of `place`; logarithms of `near_m`, `thing_m` [n, side, side] and of 1 + `free_m`, `open_m` [n, 32].
+        Scores: `main`, `thing`, `colour`, `facing` [n, side, side, choices], `open_kind` [n, 32, kinds], `place`
+        [n, kinds]. Logarithms: `near_m`, `thing_m` [n, side, side], and of 1 + `free_m`, 1 + `open_m` [n, 32].
         """
         n, side = tokens.shape[0], self.side
         seen = self.norm(tokens)
         grid = seen.reshape(n, side, side, -1)
         cells = self.cells(grid).float()
         *scores, distances = cells.split([*_CHOICES.values(), 2], dim=-1)
-        # A column of the picture, top to bottom, knows what stands there and where the floor ends.
+        # A column of the image, top to bottom, shows what stands there and where the floor ends.
         upright = grid.transpose(1, 2).reshape(n, side, -1)
         columns = self.columns(upright).float().reshape(n, COLUMNS, len(OPENINGS) + 2)
         return {
@@ -83,7 +83,7 @@ class EncoderHeads(nn.Module):
 
 @dataclass(frozen=True)
 class Balance:
-    """Weights of classes, and shares of cells and columns that have a label, from the pictures to learn from.
+    """Weights of classes, and shares of labelled cells and columns, from the training images.
 
     `classes`: float32 weights of `main`, `thing` and `open_kind` by class, 1 on average over the data.
     """
@@ -93,7 +93,7 @@ class Balance:
 
     @staticmethod
     def of(labels: Mapping[str, NDArray[np.generic]]) -> Balance:
-        """From all labels of a data set, arrays [N, ...]."""
+        """Compute the balance from all labels of a data set, arrays [N, ...]."""
         classes = {
             name: _weights(np.bincount(labels[name].ravel(), minlength=count).astype(np.float64))
             for name, count in (("main", len(CLASSES)), ("thing", len(CLASSES)), ("open_kind", len(OPENINGS)))
@@ -108,7 +108,7 @@ class Balance:
 
 
 def as_tensors(labels: Mapping[str, NDArray[np.generic]], device: str) -> dict[str, Tensor]:
-    """Labels of a batch as float32 where they are distances, m, and as int64 elsewhere."""
+    """Convert a batch's labels to tensors: distances, m, as float32, others as int64."""
     return {
         name: torch.from_numpy(array.astype(np.float32 if array.dtype == np.float16 else np.int64)).to(device)
         for name, array in labels.items()
@@ -116,7 +116,7 @@ def as_tensors(labels: Mapping[str, NDArray[np.generic]], device: str) -> dict[s
 
 
 def losses(predicted: Predictions, labels: Mapping[str, Tensor], balance: Balance) -> dict[str, Tensor]:
-    """[n] of each label: what a picture's predictions cost, before `WEIGHTS`."""
+    """Compute the loss of each label for every image [n], before `WEIGHTS`."""
     found = {
         name: _choice(predicted[name], labels[name], balance.classes[name]) for name in ("main", "thing", "open_kind")
     }
@@ -133,12 +133,12 @@ def losses(predicted: Predictions, labels: Mapping[str, Tensor], balance: Balanc
 
 
 def total(parts: Mapping[str, Tensor]) -> Tensor:
-    """[n]: the weighted sum."""
+    """Return the weighted sum of the losses [n]."""
     return torch.stack([WEIGHTS[name] * part for name, part in sorted(parts.items())]).sum(dim=0)
 
 
 def _choice(scores: Tensor, wanted: Tensor, weights: NDArray[np.float32] | None) -> Tensor:
-    """[n]: mean over all cells of the cross-entropy; cells that have NONE cost nothing."""
+    """Compute the mean cross-entropy over all cells [n]; cells with NONE have no loss."""
     weight = None if weights is None else torch.from_numpy(weights).to(scores.device)
     cost = F.cross_entropy(
         scores.reshape(-1, scores.shape[-1]), wanted.reshape(-1), weight=weight, ignore_index=NONE, reduction="none"
@@ -147,7 +147,7 @@ def _choice(scores: Tensor, wanted: Tensor, weights: NDArray[np.float32] | None)
 
 
 def _far(predicted: Tensor, wanted: Tensor, where: Tensor | None) -> Tensor:
-    """[n]: mean over all cells of what logarithms of distances are off by; nothing where there is no such distance."""
+    """Compute the mean error of log distances over all cells [n]; cells outside `where` have no loss."""
     cost = F.smooth_l1_loss(predicted, wanted, beta=_BETA, reduction="none")
     if where is not None:
         cost = cost * where
@@ -155,9 +155,9 @@ def _far(predicted: Tensor, wanted: Tensor, where: Tensor | None) -> Tensor:
 
 
 def _weights(counts: NDArray[np.float64]) -> NDArray[np.float32]:
-    """By the square root of how rare a class is, 1 on average over what is there."""
+    """Compute class weights proportional to share^-0.5, with mean 1 over the data and a cap."""
     shares = counts / max(counts.sum(), 1.0)
-    # A class that is nowhere has no say: it gets what the rarest has.
+    # A class that does not occur gets the weight of the rarest class.
     rare = np.maximum(shares, shares[shares > 0].min(initial=1.0)) ** -0.5
     for _ in range(4):  # the cap lowers the mean, which raises the rest
         rare = np.minimum(rare / (shares * rare).sum(), _MOST_WEIGHT)

@@ -1,4 +1,4 @@
-"""A scene's twin in which every thing has one flat colour, its number: what is where in a picture, to the pixel."""
+"""Instance images: a copy of a scene in which every object has one flat colour that encodes its number."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ Array = NDArray[np.float64]
 Ids = NDArray[np.int32]
 
 SKY, FLOOR, CEILING = 0, 1, 2
-"""Numbers that are the same in every scene; terrain, walls, objects and people follow, each in the scene's order."""
+"""Numbers that are equal in every scene; terrain, walls, objects and people follow, each in the scene's order."""
 FIRST: Final = 3
-_LIT: Vec3 = (-3 / 7, 2 / 7, 6 / 7)  # towards the renderer's sun: no shade, so that a colour stays itself
-_BITS, _STEP = 5, 8  # of a colour's channel: numbers are written in steps of 8, in the middle of each
-_PERSON_M, _FAR_PERSON_M = 0.9, 30.0  # labels end there; the camera shows a pixel or two of who is further away
-_UPRIGHT: Final = 0.9
-_DETAIL: Final = 0.4  # of people: nobody sees the buttons
+_LIT: Vec3 = (-3 / 7, 2 / 7, 6 / 7)  # normal towards the renderer's sun: without shading, colours are exact
+_BITS, _STEP = 5, 8  # bits per colour channel, and the step between two levels
+_PERSON_M, _FAR_PERSON_M = 0.9, 30.0  # half size of a person's bounds; people farther away have no labels
+_UPRIGHT: Final = 0.9  # least vertical component of the camera's up vector for visibility culling
+_DETAIL: Final = 0.4  # level of detail of people
 
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera is and how it looks: point m, unit vectors ahead, to the right and above, in the world.
+    """Pose and field of view of a camera: position m, unit vectors ahead, right and above, in the world.
 
-    `half_width` and `half_height` are the tangents of half of what it sees across and up.
+    `half_width` and `half_height` are the tangents of half the horizontal and vertical field of view.
     """
 
     eye: Array
@@ -54,14 +54,14 @@ class View:
     half_height: float
 
     def rays(self, px: int) -> Array:
-        """[px, px, 3]: directions of the pixels' middles in the world, 1 long along `ahead`, the top row first."""
+        """Return the pixels' directions [px, px, 3] in the world, of length 1 along `ahead`, top row first."""
         steps = (np.arange(px) + 0.5) / px * 2 - 1
         across, up = steps * self.half_width, -steps * self.half_height
         return self.ahead + across[None, :, None] * self.right + up[:, None, None] * self.above
 
 
 def view_of(render_state: Array, mount: Mount) -> View:
-    """What the camera of a robot in this state sees in a picture of 16:9, squeezed or not."""
+    """Return the view of a robot's camera in this render state, for an image of 16:9."""
     rotation = rotation_matrix(tuple(float(v) for v in render_state[3:7]))
     ahead = rotation @ (cos(mount.pitch_rad), 0.0, -sin(mount.pitch_rad))
     right = np.cross(ahead, rotation[:, 2])
@@ -72,7 +72,7 @@ def view_of(render_state: Array, mount: Mount) -> View:
 
 
 class IdWorld:
-    """Renders the numbers of what a robot's camera sees, for the same render states as a CameraWorld."""
+    """Renders instance images of a robot's camera, for the same render states as a CameraWorld."""
 
     def __init__(self, scene: Scene, looks: Sequence[Appearance], robot: str) -> None:
         self.mount = MOUNTS[robot]
@@ -93,7 +93,7 @@ class IdWorld:
             raise ValueError(f"{scene.name}: more things than there are colours")
 
     def ids(self, render_state: Array, px: int) -> Ids:
-        """[px, px]: the number of what each pixel shows, the top row first."""
+        """Return the number of the object in each pixel [px, px], top row first."""
         view = view_of(render_state, self.mount)
         up = np.cross(view.right, view.ahead)
         sight = self._sight(view, up)
@@ -106,11 +106,11 @@ class IdWorld:
         return ids
 
     def close(self) -> None:
-        """Release the renderer; may be called twice."""
+        """Release the renderer; repeated calls have no effect."""
         self._renderer.close()
 
     def _painted(self, scene: Scene) -> list[MeshBuilder]:
-        """The scene's meshes as `build_scene` makes them, in flat colours."""
+        """Build the scene's meshes as `build_scene` does, in flat colours."""
         pieces = Pieces(8.0 if scene.ceiling_height_m > 0 else 16.0, lambda: _Painted(self._pen))
         self._pen.number = FLOOR
         add_floor(pieces, scene)
@@ -163,7 +163,7 @@ class _Pen:
 
 
 class _Painted(MeshBuilder):
-    """Takes every face in the pen's colour, pictures too."""
+    """A mesh whose faces and textures all have the pen's colour."""
 
     def __init__(self, pen: _Pen) -> None:
         super().__init__()
@@ -183,7 +183,7 @@ class _Painted(MeshBuilder):
 
 
 class _Repainted(MeshBuilder):
-    """A mesh that was built in its own colours, as one of the pen's."""
+    """A copy of a mesh in the pen's colour."""
 
     def __init__(self, mesh: MeshBuilder, pen: _Pen) -> None:
         super().__init__()
@@ -198,7 +198,7 @@ class _Repainted(MeshBuilder):
 
 
 class _PaintStage:
-    """Shows what is added to it in the pen's colour."""
+    """A stage that shows added meshes in the pen's colour."""
 
     def __init__(self, renderer: Renderer, pen: _Pen) -> None:
         self._renderer, self._pen = renderer, pen

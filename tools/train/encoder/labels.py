@@ -1,6 +1,6 @@
-"""What a robot's picture shows, cell by cell and column by column, from the twin's numbers and the scene's truth.
+"""Labels of an image by cell and by column, from the instance image and the scene.
 
-A cell is what one visual token looks at. Distances are along the floor from the camera, m.
+A cell is the image area of one visual token. Distances are measured along the floor from the camera, m.
 """
 
 from __future__ import annotations
@@ -22,42 +22,41 @@ Array = NDArray[np.float64]
 Labels = Mapping[str, NDArray[np.generic]]
 
 PIXELS: Final = 64
-"""Side of the picture of numbers that labels are made of."""
+"""Width and height of the instance image, px."""
 COLUMNS: Final = 32
-"""Directions, from left to right across the picture, in which the free way is told."""
+"""Directions from left to right across the image for which the free distance is labelled."""
 CLASSES: Final = ("sky", "floor", "ceiling", "terrain", "wall", "person", *sorted(KINDS))
-"""What a pixel can show: kinds of objects by their name in `sim_hil.scene.scene`."""
+"""Classes of pixels; kinds of objects as in `sim_hil.scene.scene`."""
 PERSON: Final = CLASSES.index("person")
 COLOUR_WORDS: Final = tuple(COLOURS)
 OPENINGS: Final = ("none", *sorted(AREA_KINDS))
-"""What a way leads into: a kind of area, or nothing but where one is already."""
+"""Kind of area that a direction leads into; none if it stays in the current area."""
 OCTANTS: Final = 8
-"""Of how a person faces, as the camera sees it: 0 away from it, 2 to the left, 4 towards it, 6 to the right."""
+"""Directions that a person faces, seen from the camera: 0 away from it, 2 left, 4 towards it, 6 right."""
 NONE: Final = 255
 FAR_M: Final = 30.0
 FREE_M: Final = 12.0
 NEAREST_M: Final = 0.1
 BACKGROUND, THING, DOOR, LANDMARK, SOMEBODY = range(5)
-"""How much a cell's things matter: the highest that is there names the cell's `thing`."""
+"""Ranks of objects; the object with the highest rank in a cell is the cell's `thing`."""
 
 _DOORS: Final = frozenset(("door", "double_door", "elevator", "loading_door"))
-_CLEAR_M: Final = 0.2  # of a free way to each side
-_RAYS: Final = 5  # of a column: a doorway far ahead at the side is narrower than one
-_THROUGH_M: Final = 0.05  # to each side of a look through an opening
-_STEP_M: Final = 0.1
-_BEYOND: Final = 1  # steps that a look goes on into an opening
-_PERSON_HALF_M: Final = 0.15
-_PIXEL: Final = 0.04  # of the twin's pictures, m at a distance of 1 m
-_NOWHERE: Final = (1e9, 1e9, 1e9, 1.0, 0.0, 0.0, 0.0, 0.0)  # a box that no ray meets
+_CLEAR_M: Final = 0.2  # clearance of free floor to each side
+_RAYS: Final = 5  # rays per column, because a distant doorway is narrower than a column
+_THROUGH_M: Final = 0.05  # clearance of a ray through an opening
+_STEP_M: Final = 0.1  # spacing of points along a ray
+_BEYOND: Final = 1  # steps that a ray must continue into an opening
+_PERSON_HALF_M: Final = 0.15  # half the depth of a person
+_PIXEL: Final = 0.04  # size of a pixel of the instance image at a distance of 1 m, m
+_NOWHERE: Final = (1e9, 1e9, 1e9, 1.0, 0.0, 0.0, 0.0, 0.0)  # a box that no ray hits
 
 
 def label_shapes(side: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Type and shape of each label of a picture whose tokens are `side` x `side`.
+    """Return dtype and shape of each label of an image with `side` x `side` tokens.
 
-    `main`: class of most of a cell; `thing`: class of what matters most in it, `rank` how much, `thing_m` how far away
-    it is, `colour` and `facing` (of people) or NONE; `near_m`: what is nearest in the cell. By column: `free_m`, how
-    far the floor is free, `open_kind` and `open_m`, what other area that way first leads into and where. `place`: the
-    kind of area here.
+    By cell: `main`, most frequent class; `thing`, class of the highest rank, with its `rank`, distance `thing_m`,
+    `colour` and `facing` (of people), or NONE; `near_m`, smallest distance. By column: `free_m`, free distance;
+    `open_kind` and `open_m`, kind and distance of the first other area. `place`: kind of the current area.
     """
     cells = (side, side)
     return {
@@ -70,7 +69,7 @@ def label_shapes(side: int) -> dict[str, tuple[str, tuple[int, ...]]]:
 
 
 class SceneLabels:
-    """Tables of one scene by the twin's numbers. `grid` is the floor that is free for the robot."""
+    """Computes labels in one scene. `grid`: floor that is free for the robot."""
 
     def __init__(self, scene: Scene, grid: NavGrid, side: int) -> None:
         if side < 1 or PIXELS % side:
@@ -104,7 +103,7 @@ class SceneLabels:
             colours.append(words.get(thing.colour, NONE))
         self._classes, self._ranks, self._colours = (np.array(each, np.int64) for each in (classes, ranks, colours))
         most = max((len(each) for each in boxes), default=1)
-        # The last box of each is the one around it all: it stands in where a ray meets none of the parts.
+        # The last box encloses the whole object; it is used if a ray hits none of the parts.
         self._boxes = np.array([_rows([], most)] * FIRST + [_rows(each, most) for each in boxes], np.float64).reshape(
             -1, most, 8
         )
@@ -112,11 +111,11 @@ class SceneLabels:
         self._kinds = np.array([OPENINGS.index(area.kind) for area in scene.areas] + [0], np.int64)
 
     def of(self, ids: Ids, view: View, people: Array, base_xy: tuple[float, float]) -> Labels:
-        """Labels of `ids` [PIXELS, PIXELS] seen by `view` from a robot at `base_xy`; `people`: render rows."""
+        """Compute the labels of an instance image `ids` [PIXELS, PIXELS]; `people`: rows of the render state."""
         flat = ids.ravel().astype(np.int64)
         who = flat - self.first_person
         if flat.max(initial=0) >= self.first_person + len(people):
-            raise ValueError(f"labels: a number of {flat.max()} in the picture, of a person that is not there")
+            raise ValueError(f"labels: the image contains number {flat.max()}, which no person has")
         is_person = who >= 0
         known = np.where(is_person, 0, flat)
         classes = np.where(is_person, PERSON, self._classes[known])
@@ -134,7 +133,7 @@ class SceneLabels:
         }
 
     def _ranges(self, flat: NDArray[np.int64], view: View, people: Array) -> Array:
-        """[n]: how far away each pixel's point is along the floor, m."""
+        """Compute the distance of each pixel's point along the floor [n], m."""
         rays = view.rays(PIXELS).reshape(-1, 3)
         along = np.full(len(flat), np.inf)  # in lengths of the ray
         drop = rays[:, 2]
@@ -167,7 +166,7 @@ class SceneLabels:
         cells, kinds = side * side, len(CLASSES)
         counts = np.bincount(cell * kinds + classes, minlength=cells * kinds).reshape(cells, kinds)
         by_rank = np.bincount(cell * 5 + ranks, minlength=cells * 5).reshape(cells, 5)
-        # One pixel of a cell is chance; where cells are small it is all there is.
+        # A single pixel of a large cell is ignored.
         there = by_rank >= max(1, block * block // 32)
         best = 4 - np.argmax(there[:, ::-1], axis=1)
         chosen = ranks == best[cell]
@@ -207,7 +206,7 @@ class SceneLabels:
         areas = self._area_at(points)
         own = int(self._area_at(view.eye[None, :2])[0])
         leads = (areas != own) & (areas >= 0) & (np.arange(len(gone)) + _BEYOND < first[:, None])
-        # Of a column's rays the one that comes into another area soonest.
+        # Use the column's ray that reaches another area first.
         nearest = np.arange(COLUMNS) * _RAYS + _first(leads).reshape(COLUMNS, _RAYS).argmin(axis=1)
         opens, at = leads[nearest].any(axis=1), leads[nearest].argmax(axis=1)
         kinds = self._kinds[areas[nearest, at]]
@@ -220,7 +219,7 @@ class SceneLabels:
         }
 
     def _area_at(self, points: Array) -> NDArray[np.int64]:
-        """[...]: number of the area at points [..., 2]; -1 where there is none."""
+        """Return the number of the area at points [..., 2]; -1 outside all areas."""
         grid = self._grid
         cells = np.floor((points - np.array(grid.origin_m)) / grid.resolution_m).astype(np.int64)
         column, row = cells[..., 0], cells[..., 1]
@@ -230,13 +229,13 @@ class SceneLabels:
 
 
 def _first(there: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """[n]: where a row of [n, m] is true first; m where it never is."""
+    """Return the index of the first True in each row of [n, m]; m if there is none."""
     found: NDArray[np.int64] = np.where(there.any(axis=1), there.argmax(axis=1), there.shape[1])
     return found
 
 
 def mirrored_label(name: str, label: NDArray[np.generic]) -> NDArray[np.generic]:
-    """A picture's label of a `label_shapes` name as it is of the mirrored picture."""
+    """Return an image's label for the mirrored image; `name` as in `label_shapes`."""
     flipped = label[..., ::-1] if label.ndim else label
     if name != "facing":
         return flipped
@@ -245,7 +244,7 @@ def mirrored_label(name: str, label: NDArray[np.generic]) -> NDArray[np.generic]
 
 
 def area_map(scene: Scene, grid: NavGrid) -> NDArray[np.int64]:
-    """[rows, columns] of the grid: number of the first area around each cell's middle; -1 where there is none."""
+    """Return the number of the first area at each grid cell's centre [rows, columns]; -1 outside all areas."""
     found = np.full(grid.shape, -1, np.int64)
     (x0, y0), cell = grid.origin_m, grid.resolution_m
     for number, area in reversed(list(enumerate(scene.areas))):
@@ -260,12 +259,12 @@ def area_map(scene: Scene, grid: NavGrid) -> NDArray[np.int64]:
 
 
 def bearing_rad(view_half_width: float, column: float, columns: int) -> float:
-    """Angle to the left of straight ahead of the middle of a column, counted from the left edge."""
+    """Return the bearing of a column's centre, rad, positive to the left; columns count from the left edge."""
     return -atan2(((column + 0.5) / columns * 2 - 1) * view_half_width, 1.0)
 
 
 def _inside(area: Area, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points lie in a polygon, by the even-odd rule."""
+    """Return whether points lie in an area's polygon, by the even-odd rule."""
     inside = np.zeros(np.broadcast_shapes(x.shape, y.shape), bool)
     corners = area.polygon
     for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
@@ -280,14 +279,14 @@ def _rows(boxes: list[Box], most: int) -> list[tuple[float, ...]]:
 
 
 def _met(boxes: Array, eye: Array, rays: Array) -> Array:
-    """[n]: where rays [n, 3] from the eye meet one of their boxes [n, k, 8], in lengths of the ray; inf for none.
+    """Intersect rays [n, 3] from the eye with their boxes [n, k, 8]; return ray lengths [n], inf without a hit.
 
-    The last box is the whole's: for rays that meet no part, or pass an edge by about a pixel.
+    The last box encloses the others; it is used for rays that hit no part or miss an edge by about a pixel.
     """
     enter, leave = _spans(boxes, eye, rays)
     met = np.where((enter <= leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
     found = met[:, :-1].min(axis=1, initial=np.inf)
-    # What is around the eye (a parasol, a tree's crown) is seen where the ray leaves it.
+    # An object around the eye (a parasol, a tree's crown) is seen where the ray leaves it.
     found = np.where(np.isfinite(found), found, np.where(enter[:, -1] > 0, met[:, -1], _left(enter, leave)))
     missed = ~np.isfinite(found)
     if missed.any():
@@ -299,7 +298,7 @@ def _met(boxes: Array, eye: Array, rays: Array) -> Array:
 
 
 def _gaps(boxes: Array, eye: Array) -> Array:
-    """[n, k]: from the eye to the nearest side of each box, along the floor, m."""
+    """Return the distance from the eye to the nearest side of each box along the floor [n, k], m."""
     x, y = eye[0] - boxes[..., 0], eye[1] - boxes[..., 1]
     c, s = boxes[..., 3], boxes[..., 4]
     along, across = np.abs(x * c + y * s) - boxes[..., 5] / 2, np.abs(y * c - x * s) - boxes[..., 6] / 2
@@ -308,12 +307,12 @@ def _gaps(boxes: Array, eye: Array) -> Array:
 
 
 def _left(enter: Array, leave: Array) -> Array:
-    """[n]: where rays leave the last of their boxes; inf where they are never in it."""
+    """Return the ray lengths [n] at which rays leave their last box; inf if they never enter it."""
     return np.where((enter <= leave) & (leave > 0), leave, np.inf)[:, -1]
 
 
 def _spans(boxes: Array, eye: Array, rays: Array) -> tuple[Array, Array]:
-    """[n, k] each: where rays come into their boxes and leave them, in lengths of the ray (out of order: never)."""
+    """Return the ray lengths [n, k] at which rays enter and leave their boxes (enter > leave: no hit)."""
     offset = eye - boxes[..., :3]
     c, s, half = boxes[..., 3], boxes[..., 4], boxes[..., 5:] / 2
     start = np.stack(

@@ -1,6 +1,6 @@
-"""Where training pictures are taken from: along ways, before things, near people, at walls, anywhere on free floor.
+"""Camera poses of training images: in passages, in front of objects, near people, at walls, anywhere on free floor.
 
-Nothing is simulated: a pose is drawn, and the body sways about it as a walking one does.
+Poses are drawn without physics; the body sways about them as a walking robot's does.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ Array = NDArray[np.float64]
 Pose = tuple[float, float, float]  # x m, y m, heading rad
 
 SHARES: Final = (("way", 0.50), ("anywhere", 0.14), ("thing", 0.20), ("person", 0.12), ("wall", 0.04))
-"""How often a pose of each sort is drawn."""
-_TRIES: Final = 24  # of one sort, before another is taken
-_MORE_TRIES: Final = 200
-_ROOM_M: Final = 0.6  # between the robot's middle and a person's
-_OFF_WAY_RAD: Final = 0.3
-_AIM_RAD: Final = 0.75  # what is looked at is within this of the middle: the camera sees 0.87 to each side
-_FRONT_RAD: Final = 0.8
-_THING_M: Final = (0.8, 12.0)
-_PERSON_M: Final = (0.7, 5.0)
-_WALL_M: Final = 0.25  # beyond what the robot needs
-# A robot on its way seldom faces a wall: of poses with no way ahead most are drawn again.
+"""Share of each kind of pose."""
+_TRIES: Final = 24  # attempts with one kind before `anywhere` is used
+_MORE_TRIES: Final = 200  # attempts in total
+_ROOM_M: Final = 0.6  # least distance between the centres of robot and person
+_OFF_WAY_RAD: Final = 0.3  # standard deviation of the heading in a passage
+_AIM_RAD: Final = 0.75  # largest bearing of the target; the camera's half field of view is 0.87
+_FRONT_RAD: Final = 0.8  # standard deviation of the direction from which an object is seen
+_THING_M: Final = (0.8, 12.0)  # range of the distance to an object
+_PERSON_M: Final = (0.7, 5.0)  # range of the distance to a person
+_WALL_M: Final = 0.25  # clearance at walls beyond what the robot needs
+# A driving robot rarely faces a wall: most poses without free floor ahead are drawn again.
 _AHEAD_RAD: Final = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _AHEAD_M: Final = 2.0
 _AHEAD_CLEAR_M: Final = 0.2
@@ -37,11 +37,11 @@ _BLIND_SHARE: Final = 0.2
 _STEP_M: Final = 0.1
 # Height of the base above the ground, m, how it bobs, and how far roll and pitch sway, rad (one standard deviation).
 _BODIES: Final = {"go2": (0.31, 0.012, 0.020, 0.025), "carter": (0.0, 0.0, 0.006, 0.008)}
-_ROUGH_SHARE, _ROUGH = 0.1, 3.0  # of the time it sways so much more: steps, ramps, being pushed
+_ROUGH_SHARE, _ROUGH = 0.1, 3.0  # share of poses with stronger sway (steps, ramps, pushes), and its factor
 
 
 class Poses:
-    """Draws poses in one scene for one robot; `grid` is the floor that is free for it."""
+    """Draws poses in one scene for one robot; `grid`: floor that is free for it."""
 
     def __init__(self, scene: Scene, grid: NavGrid, rng: np.random.Generator) -> None:
         self._scene, self._grid, self._rng = scene, grid, rng
@@ -55,14 +55,14 @@ class Poses:
         self._things = [thing for thing in scene.objects if thing.kind != "light"]
 
     def draw(self, people: Array) -> Pose:
-        """A pose that leaves room to everybody; `people` [n, 2 or more]: x m, y m."""
+        """Draw a pose with room to all people; `people` [n, 2 or more]: x m, y m."""
         shares = dict(SHARES)
         sort = str(self._rng.choice(list(shares), p=list(shares.values())))
         for attempt in range(_MORE_TRIES):
             pose = self._drawn(sort if attempt < _TRIES else "anywhere", people)
             if self._grid.is_free(pose[0], pose[1]) and _roomy(pose, people) and self._worth_seeing(pose):
                 return pose
-        return self._cell(self._cells)  # so full that somebody is close wherever one is
+        return self._cell(self._cells)  # the scene is so crowded that no pose has room
 
     def _drawn(self, sort: str, people: Array) -> Pose:
         rng = self._rng
@@ -98,7 +98,7 @@ class Poses:
         return self._towards(x, y, thing.heading_rad + float(self._rng.normal(0.0, _FRONT_RAD)), gap)
 
     def _towards(self, x: float, y: float, side_rad: float, gap_m: float) -> Pose:
-        """From a gap away on one side of a point, looking about there."""
+        """Return a pose at distance `gap_m` on one side of a point that looks roughly at it."""
         px, py = x + gap_m * cos(side_rad), y + gap_m * sin(side_rad)
         return (px, py, atan2(y - py, x - px) + float(self._rng.uniform(-_AIM_RAD, _AIM_RAD)))
 
@@ -113,7 +113,7 @@ class Poses:
 
 
 def body_state(scene: Scene, robot: str, pose: Pose, rng: np.random.Generator) -> Array:
-    """[7]: position m and quaternion xyzw of a swaying body; what begins a render state."""
+    """Draw position m and quaternion xyzw [7] of a swaying body: the first entries of a render state."""
     x, y, heading = pose
     height, bob, roll, pitch = _BODIES[robot]
     sway = _ROUGH if rng.uniform() < _ROUGH_SHARE else 1.0
@@ -122,7 +122,7 @@ def body_state(scene: Scene, robot: str, pose: Pose, rng: np.random.Generator) -
 
 
 def quaternion_xyzw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
-    """A turn about x, then y, then z of the world (positive pitch looks down)."""
+    """Return the rotation about x, then y, then z of the world (positive pitch looks down)."""
     (cr, sr), (cp, sp), (cy, sy) = ((cos(a / 2), sin(a / 2)) for a in (roll_rad, pitch_rad, yaw_rad))
     return (
         sr * cp * cy - cr * sp * sy,

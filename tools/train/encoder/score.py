@@ -1,4 +1,4 @@
-"""How well an encoder sees: what its heads say of held-out pictures against the truth, and against a fixed answer."""
+"""Scores of an encoder: predictions of its heads on held-out images against the labels and a constant baseline."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Arrays = Mapping[str, NDArray[Any]]
 BEARING_RAD: Final = radians(10.0)
 _NEAR_BINS: Final = (0.0, 2.0, 5.0, 10.0, inf)  # m
 _FREE_BINS: Final = (0.0, 2.0, 5.0, 8.0, inf)
-_LEAST_CELLS: Final = 20  # fewer say nothing of a class
+_LEAST_CELLS: Final = 20  # classes with fewer cells are not reported
 _HALF_WIDTH: Final = float(np.tan(CAMERA_HFOV_RAD / 2))
 
 
 def decide(predicted: Predictions) -> dict[str, NDArray[Any]]:
-    """Labels as the heads would have them, and `share` [n, side, side, classes], how likely each cell is what."""
+    """Convert predictions to labels, and to `share` [n, side, side, classes], the probabilities of each cell."""
     scores = {name: predicted[name].argmax(dim=-1) for name in ("main", "thing", "colour", "facing", "open_kind")}
     scores["place"] = predicted["place"].argmax(dim=-1)
     distances = {name: predicted[name].exp() for name in ("near_m", "thing_m")}
@@ -46,10 +46,10 @@ def decide(predicted: Predictions) -> dict[str, NDArray[Any]]:
 
 
 class Fixed:
-    """The best answer that does not look: what is most common, or in the middle, at each place of the picture."""
+    """Constant baseline: the most frequent or median label at each position of the image."""
 
     def __init__(self, labels: Arrays) -> None:
-        """From all labels to learn from, arrays [N, ...]."""
+        """Compute the baseline from all training labels, arrays [N, ...]."""
         share = np.stack([(labels["thing"] == c).mean(axis=0) for c in range(len(CLASSES))], axis=-1)
         there = labels["rank"] > BACKGROUND
         opens = labels["open_kind"] > 0
@@ -68,12 +68,12 @@ class Fixed:
         }
 
     def of(self, count: int) -> dict[str, NDArray[Any]]:
-        """The answer to `count` pictures."""
+        """Return the baseline's labels for `count` images."""
         return {name: np.broadcast_to(one, (count, *np.shape(one))) for name, one in self._one.items()}
 
 
 class Score:
-    """Gathers answers and truth batch by batch."""
+    """Accumulates predictions and labels batch by batch."""
 
     def __init__(self) -> None:
         self._confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
@@ -81,31 +81,31 @@ class Score:
         self._pairs: dict[str, list[NDArray[np.float32]]] = {}
         self._pictures = 0
 
-    def add(self, said: Arrays, labels: Arrays) -> None:
-        """Answers and truth of some pictures, arrays [n, ...]."""
+    def add(self, found: Arrays, labels: Arrays) -> None:
+        """Add predictions and labels of some images, arrays [n, ...]."""
         self._pictures += len(labels["thing"])
         thing, rank = labels["thing"], labels["rank"]
-        np.add.at(self._confusion, (thing.ravel(), said["thing"].ravel()), 1)
-        right = said["thing"] == thing
-        self._share("main_accuracy", said["main"] == labels["main"])
+        np.add.at(self._confusion, (thing.ravel(), found["thing"].ravel()), 1)
+        right = found["thing"] == thing
+        self._share("main_accuracy", found["main"] == labels["main"])
         self._share("landmark_recall", right[rank == LANDMARK])
         self._share("door_recall", right[rank == DOOR])
-        self._share("colour_accuracy", (said["colour"] == labels["colour"])[labels["colour"] != NONE])
-        self._share("place_accuracy", said["place"] == labels["place"])
-        turned = (said["facing"].astype(int) - labels["facing"].astype(int)) % OCTANTS
+        self._share("colour_accuracy", (found["colour"] == labels["colour"])[labels["colour"] != NONE])
+        self._share("place_accuracy", found["place"] == labels["place"])
+        turned = (found["facing"].astype(int) - labels["facing"].astype(int)) % OCTANTS
         self._share("facing_within_octant", np.isin(turned, (0, 1, OCTANTS - 1))[labels["facing"] != NONE])
-        opens, told = labels["open_kind"] > 0, said["open_kind"] > 0
-        self._share("opening_recall", told[opens])
-        self._share("opening_precision", opens[told])
-        self._share("opening_kind_accuracy", (said["open_kind"] == labels["open_kind"])[opens])
-        self._share("landmark_bearing", _bearings(said["share"], thing, rank))
-        self._pair("near", said["near_m"], labels["near_m"])
-        self._pair("thing", said["thing_m"][rank > BACKGROUND], labels["thing_m"][rank > BACKGROUND])
-        self._pair("free", said["free_m"], labels["free_m"])
-        self._pair("open", said["open_m"][opens], labels["open_m"][opens])
+        opens, predicted = labels["open_kind"] > 0, found["open_kind"] > 0
+        self._share("opening_recall", predicted[opens])
+        self._share("opening_precision", opens[predicted])
+        self._share("opening_kind_accuracy", (found["open_kind"] == labels["open_kind"])[opens])
+        self._share("landmark_bearing", _bearings(found["share"], thing, rank))
+        self._pair("near", found["near_m"], labels["near_m"])
+        self._pair("thing", found["thing_m"][rank > BACKGROUND], labels["thing_m"][rank > BACKGROUND])
+        self._pair("free", found["free_m"], labels["free_m"])
+        self._pair("open", found["open_m"][opens], labels["open_m"][opens])
 
     def result(self) -> dict[str, Any]:
-        """Shares from 0 to 1 and distances in m; None where there was nothing to be right about."""
+        """Return shares from 0 to 1 and distances in m; None for scores without cases."""
         found: dict[str, Any] = {name: _mean(counts) for name, counts in sorted(self._shares.items())}
         found["landmarks"] = self._shares.get("landmark_bearing", [0, 0])[1]
         found["pictures"] = self._pictures
@@ -121,8 +121,8 @@ class Score:
             if self._confusion[c].sum() >= _LEAST_CELLS
         }
         for name, bins in (("near", _NEAR_BINS), ("thing", _NEAR_BINS), ("free", _FREE_BINS), ("open", _FREE_BINS)):
-            said, true = self._distances(name)
-            off = np.abs(said - true)
+            predicted, true = self._distances(name)
+            off = np.abs(predicted - true)
             found[f"{name}_relative_error"] = float(np.median(off / np.maximum(true, 0.1))) if len(true) else None
             found[f"{name}_error_m"] = {
                 (f"{low:g}+" if isinf(high) else f"{low:g}-{high:g}"): float(off[inside].mean())
@@ -136,8 +136,8 @@ class Score:
         counts[0] += int(right.sum())
         counts[1] += int(right.size)
 
-    def _pair(self, name: str, said: NDArray[Any], true: NDArray[Any]) -> None:
-        both = np.stack((said.ravel(), true.ravel())).astype(np.float32)
+    def _pair(self, name: str, predicted: NDArray[Any], true: NDArray[Any]) -> None:
+        both = np.stack((predicted.ravel(), true.ravel())).astype(np.float32)
         self._pairs.setdefault(name, []).append(both)
 
     def _distances(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -146,7 +146,7 @@ class Score:
 
 
 def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> NDArray[np.bool_]:
-    """For every kind of landmark in every picture: whether the likeliest cell lies within 10 degrees of a true one."""
+    """Return for every kind of landmark in every image whether its most probable cell is within 10° of a true one."""
     side = thing.shape[1]
     angles = np.array([bearing_rad(_HALF_WIDTH, column, side) for column in range(side)])
     hits: list[bool] = []
@@ -154,13 +154,13 @@ def _bearings(share: NDArray[Any], thing: NDArray[Any], rank: NDArray[Any]) -> N
         named = ranks == LANDMARK
         for kind in np.unique(kinds[named]):
             true = np.flatnonzero((named & (kinds == kind)).any(axis=0))
-            said = int(one[..., kind].argmax()) % side
-            hits.append(bool(np.abs(angles[true] - angles[said]).min() <= BEARING_RAD))
+            best = int(one[..., kind].argmax()) % side
+            hits.append(bool(np.abs(angles[true] - angles[best]).min() <= BEARING_RAD))
     return np.array(hits, bool)
 
 
 def _most_common(values: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """[...]: of [N, ...] the most common number below `count` at each place."""
+    """Return the most frequent number below `count` at each position [...] of [N, ...]."""
     winners: NDArray[np.int64] = np.stack([(values == c).sum(axis=0) for c in range(count)], axis=-1).argmax(axis=-1)
     return winners
 

@@ -1,6 +1,6 @@
-"""The process that renders one shard of the encoder's training pictures: a scene, a crowd, many poses, labels.
+"""The worker process that renders one shard of the encoder's training images with labels.
 
-What comes out depends on the shard's numbers alone.
+The result depends on the shard's configuration alone.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ Array = NDArray[np.float64]
 
 _TAG: Final = 0xE0C1
 _LAYOUT_TRIES: Final = 8
-_SAY_EVERY: Final = 50
-_THINNED_SHARE: Final = 0.5  # of moments in which some of the people are not there
+_SAY_EVERY: Final = 50  # images between two progress messages
+_THINNED_SHARE: Final = 0.5  # share of moments in which some people are removed
 _AWAY_M: Final = -1e5
 
 
 def messages(job: Message) -> Iterator[Mapping[str, Any]]:
-    """`{"frames": n}` now and then and at the end, of `{"folder": path, "shard": Shard}`."""
+    """Render the job `{"folder": path, "shard": Shard}`; yield `{"frames": n}` as progress and at the end."""
     for done in render(Path(job["folder"]), Shard.of_json(job["shard"])):
         yield {"frames": done}
 
 
 def render(folder: Path, shard: Shard) -> Iterator[int]:
-    """Render a shard and write it; how many pictures there are so far. Raises LayoutError, OSError."""
+    """Render and write a shard; yield the number of images so far. Raises LayoutError, OSError."""
     site = _site(shard)
     scene, grid = site.scene, site.robot_grid(shard.robot)
     rng = np.random.default_rng((shard.seed, _TAG))
@@ -92,7 +92,7 @@ def render(folder: Path, shard: Shard) -> Iterator[int]:
 
 
 class _Crowd:
-    """The people of a shard, moved on now and then; `rows` are a render state's, `present` those who are there."""
+    """The people of a shard; `rows` are those of a render state, `present` those of people who are not removed."""
 
     def __init__(self, scene: Scene, shard: Shard, rng: np.random.Generator) -> None:
         self.count = shard.people
@@ -101,7 +101,7 @@ class _Crowd:
                 self._people = People(scene, self.count, shard.seed)
                 break
             except ValueError:
-                # A small layout has no room for so many; for none there always is.
+                # A small layout has no room for that many people; try half of them.
                 if self.count == 0:
                     raise
                 self.count //= 2
@@ -112,7 +112,7 @@ class _Crowd:
         self.present = self.rows
 
     def move_on(self) -> None:
-        """Let everybody walk for a moment, the robot standing where it was last."""
+        """Let the people walk for one moment with the robot at its last position."""
         for _ in range(self._steps if self.count else 0):
             self._people.step(*self.robot)
         rows = self._people.render_rows().copy()

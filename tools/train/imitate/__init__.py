@@ -1,1 +1,1 @@
-"""Stage 2: the action expert learns to drive from semantic states that are seconds old."""
+"""Stage 2: the action expert learns to drive with delayed semantic states."""

@@ -1,11 +1,11 @@
-"""Samples of imitation under delay (paper, Algorithm 1): a frame, an older semantic state, and how far apart they are.
+"""Samples of imitation under delay (paper, Algorithm 1): a frame, an older semantic state, their delay and offset.
 
-Frame k is drawn by weight, the age Δt from its distribution, and the state is that of frame k - 10 Δt: one that has a
-state, so that Δt and the motion offset are exact. Before a drive's first frame the robot stood there: an age that
-reaches beyond it meets the first state, as every instruction's first generation does. Frames that act on one state are
-drawn together, because they share its keys and values.
+Frame k is drawn by weight and the delay Δt from its distribution; the semantic state belongs to frame k - 10 Δt, where
+one is cached, so that Δt and the motion offset are exact. The robot stood before a drive's first frame: a delay that
+reaches beyond it uses the first state, as in the first generation of every instruction. Frames that share a state are
+drawn together.
 
-A sample's inputs are of frame k and before; only its label is of the future.
+Inputs come from frame k and earlier; only the label lies in the future.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ Array = NDArray[np.float64]
 
 
 class SampleError(ValueError):
-    """Drives that give no samples, or a network that cannot learn from them; one line."""
+    """Drives without samples, or a network that cannot be trained on them; one line."""
 
 
 class States(Protocol):
-    """Semantic states of drives, as `KvCache` has them."""
+    """Cached semantic states of drives (see `KvCache`)."""
 
     draws: int
-    """States of each anchor."""
+    """Number of states of each anchor."""
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Frames that have a state, evenly spaced."""
+        """Return the frames that have a state, evenly spaced."""
         ...
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
-        """The state of a generation whose newest frame is k."""
+        """Return state number `draw` of the generation whose newest frame is k."""
         ...
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """Frames `ks` of drive number `drive` that act on the state of frame `anchor`, `ages` tenths of a second old."""
+class SampleChoice:
+    """Frames `ks` of drive number `drive` with the state of frame `anchor`, and their delays `ages` in 0.1 s."""
 
     drive: int
     anchor: int
@@ -64,7 +64,7 @@ class Chosen:
 
 
 class Samples:
-    """Draws groups of samples; all that is random comes from the generator that is given, and in a fixed order."""
+    """Draws groups of samples; all random numbers come from the given generator, in a fixed order."""
 
     def __init__(
         self,
@@ -77,16 +77,16 @@ class Samples:
         *,
         drop: bool = True,
     ) -> None:
-        """`drop`: with the network's dropouts of K‖V and state. Raises SampleError where there is nothing to draw."""
+        """`drop`: apply the network's dropout of K‖V and state. Raises SampleError if no frame can be drawn."""
         if round(model.action.step_s * RATE_HZ, 6) != 1:
-            raise SampleError(f"action.step_s: labels are 0.1 s apart, found {model.action.step_s:g}")
+            raise SampleError(f"action.step_s: expected 0.1, the spacing of the labels, found {model.action.step_s:g}")
         self.drives = tuple(drives)
         self.config = config
         self._tokens, self._states, self._delays = tokens, states, delays
         self._by_waypoints = model.action.semantic_interface == "waypoints"
         self._near_walls = any(drive.walls is not None for drive in self.drives)
         self._drop_kv, self._drop_state = (model.action.kv_dropout, model.action.state_dropout) if drop else (0.0, 0.0)
-        # Frames of one state that are all the same age are all the same frame.
+        # With a single possible delay, all frames of one state would be the same frame.
         self.group = config.group if np.count_nonzero(delays.mass) > 1 else 1
         self._share: list[Array] = []
         places: list[tuple[int, int, bool]] = []
@@ -103,10 +103,10 @@ class Samples:
         self._places = places
         self._upto = np.cumsum(chances)
         if not chances or self._upto[-1] <= 0:
-            raise SampleError("no frame has both a label and a semantic state that is as old as it should be")
+            raise SampleError("no frame has both a label and a semantic state at a possible delay")
 
     def _anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Frames with states that can guide: a text without waypoints cannot, where they are the guidance."""
+        """Return the frames with usable states; the semantic interface `waypoints` requires waypoints in the text."""
         anchors = self._states.anchors(drive_id)
         if not self._by_waypoints:
             return anchors
@@ -116,12 +116,16 @@ class Samples:
         )
 
     def _chances(self, drive: DriveFrames) -> tuple[Array, dict[int, float], float]:
-        """Each frame's weight by all chances to meet a state of it; chance of each state; that of standing starts."""
+        """Return probabilities of a drive.
+
+        They are each frame's weight divided by the probability of meeting a state, each state's probability, and the
+        probability of a delay that reaches before the first frame.
+        """
         mass, beyond = self._delays.mass, self._delays.beyond
         anchors = self._anchors(drive.id)
         if not anchors:
             return np.zeros(len(drive)), {}, 0.0
-        # One state stands for as many tenths of a second as there are up to the next one.
+        # One state represents all delays up to the next state.
         every = int(np.diff(anchors).min()) if len(anchors) > 1 else RATE_HZ
         met = np.zeros(len(drive))
         for anchor in anchors:
@@ -139,25 +143,25 @@ class Samples:
             of_anchor[anchor] = float(every * (span @ mass[: len(span)]))
         return share, of_anchor, float(share @ standing)
 
-    def choose(self, rng: np.random.Generator) -> Chosen:
-        """A state by its chance, then frames that act on it by theirs."""
+    def choose(self, rng: np.random.Generator) -> SampleChoice:
+        """Draw a state, then the frames that use it."""
         index, anchor, stood = self._places[_pick(self._upto, rng.uniform())]
         share, mass, beyond = self._share[index], self._delays.mass, self._delays.beyond
         if not stood:
             span = share[anchor : anchor + len(mass)]
             upto = np.cumsum(span * mass[: len(span)])
             ages = [_pick(upto, u) for u in rng.uniform(size=self.group)]
-            return Chosen(index, anchor, tuple(anchor + age for age in ages), tuple(ages))
+            return SampleChoice(index, anchor, tuple(anchor + age for age in ages), tuple(ages))
         span = share[: len(beyond)]
         upto = np.cumsum(span * beyond[: len(span)])
         ks = [_pick(upto, u) for u in rng.uniform(size=self.group)]
         older = [
             k + 1 + _pick(np.cumsum(mass[k + 1 :]), u) for k, u in zip(ks, rng.uniform(size=self.group), strict=True)
         ]
-        return Chosen(index, 0, tuple(ks), tuple(older))
+        return SampleChoice(index, 0, tuple(ks), tuple(older))
 
-    def take(self, chosen: Chosen, rng: np.random.Generator) -> Group:
-        """What the network is given of a choice, and the labels."""
+    def take(self, chosen: SampleChoice, rng: np.random.Generator) -> Group:
+        """Assemble the network's inputs and labels of a choice."""
         drive, count = self.drives[chosen.drive], len(chosen.ks)
         which, cut, end = rng.uniform(size=3)
         noise = rng.standard_normal((count, 3))
@@ -165,8 +169,8 @@ class Samples:
         state = self._states.at(drive.id, chosen.anchor, int(which * self._states.draws))
         ks = list(chosen.ks)
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
-        told_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
-        latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(told_s, offsets, strict=True)]
+        delays_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
+        latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(delays_s, offsets, strict=True)]
         guidance: NDArray[np.floating]
         if self._by_waypoints:
             guidance = self._waypoints(state, offsets)
@@ -196,29 +200,29 @@ class Samples:
 
     @staticmethod
     def _around(drive: DriveFrames, ks: list[int]) -> Around:
-        """Walls around the robot in some frames."""
+        """Return the walls around the robot in frames `ks`."""
         if drive.walls is None:
             return Around(nothing_near(len(ks)), np.zeros((len(ks), 2), np.float32))
         body = drive.walls.body
         return Around(drive.walls.patches(ks), np.full((len(ks), 2), (body.reach_m, body.radius_m), np.float32))
 
-    def said(self, chosen: Chosen) -> Waypoints | None:
-        """Waypoints of the state that a choice acts on, m in the anchor's robot frame; None where it has none."""
+    def waypoints_of(self, chosen: SampleChoice) -> Waypoints | None:
+        """Return the waypoints in a choice's state, m in the robot frame at the anchor; None if it has none."""
         return self._states.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
 
     def draw(self, rng: np.random.Generator) -> Group:
-        """Choose and take."""
+        """Draw a choice and assemble it."""
         return self.take(self.choose(rng), rng)
 
     def _length(self, state: CachedState, cut: float, end: float) -> int:
-        """Tokens of a state that the policy is given."""
-        said = len(state.kv) - state.prompt_tokens
+        """Return how many tokens of a state the policy receives."""
+        decoded = len(state.kv) - state.prompt_tokens
         if not self.config.reasoning or cut >= 1 - self.config.prompt_only:
             return state.prompt_tokens
-        return state.prompt_tokens + (int(end * (said + 1)) if cut < self.config.cut_text else said)
+        return state.prompt_tokens + (int(end * (decoded + 1)) if cut < self.config.cut_text else decoded)
 
     def _text_alone(self, cut: float) -> bool:
-        """Whether a state is given without its prompt; `cut` is what `_length` is given."""
+        """Return whether a state's prompt is masked; `cut` is the random number that `_length` uses."""
         return self.config.cut_text <= cut < self.config.cut_text + self.config.text_only
 
     def _offset(self, drive: DriveFrames, anchor: int, k: int, noise: Array) -> SE2:
@@ -229,29 +233,29 @@ class Samples:
 
     def _waypoints(self, state: CachedState, offsets: Sequence[SE2]) -> NDArray[np.float32]:
         points = state.waypoints
-        assert points is not None  # `_anchors` has left the others out
+        assert points is not None  # `_anchors` excludes states without waypoints
         return np.concatenate([waypoints_now(points, offset) for offset in offsets])
 
 
 def _pick(upto: Array, uniform: float) -> int:
-    """Index drawn by cumulated chances; `uniform` in [0, 1). One that has no chance is never drawn."""
+    """Return the index for `uniform` in [0, 1) by cumulative weights; an index of zero weight is never drawn."""
     return int(np.searchsorted(upto, uniform * upto[-1], side="right"))
 
 
 class NoStates:
-    """In a cache's place for a policy that is told nothing: every frame has a state, of one token without content."""
+    """Replaces the cache for a policy without semantics: every frame has a state of one token of zeros."""
 
     draws = 1
 
     def __init__(self, frames: Mapping[str, int], width: int) -> None:
-        """`frames`: how many each drive has."""
+        """`frames`: number of frames of each drive."""
         self._frames = frames
         self._state = CachedState(np.zeros((1, width), np.float16), 1, "", own=False)
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """All frames."""
+        """Return all frames."""
         return tuple(range(self._frames[drive_id]))
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
-        """The same for every frame."""
+        """Return the same state for every frame."""
         return self._state

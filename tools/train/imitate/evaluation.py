@@ -1,7 +1,7 @@
-"""How far a policy's plans are from the expert's in places it has not seen, by the age of what it was told.
+"""Errors of a policy's plans against the expert's on held-out drives, by the delay of the semantic state.
 
-Beside it stand plans that need no policy: to keep on moving as now, and to drive to the waypoints that were said at the
-anchor. And the policy itself with the words of another drive: what it loses by that is what the words give it.
+Baselines need no policy: keep the current velocity, or drive to the state's waypoints. The policy is also evaluated
+with the semantic state of another drive; the difference is what the policy gains from the semantic state.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints
 from edge.state.semantic import waypoints_now
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import ImitateEvalConfig
-from tools.train.imitate.data import Chosen, Samples
+from tools.train.imitate.data import SampleChoice, Samples
 from tools.train.samples.action_batch import ActionBatch, Group, collate
 from tools.train.scenes.walls import OPEN_M, room
 
 Array = NDArray[np.float64]
 Planner = Callable[[ActionBatch], Tensor]
-"""Trajectories [B, steps, 3] of a batch."""
+"""Maps a batch to trajectories [B, steps, 3]."""
 
 HORIZONS_S: Final = (1, 2, 3, 5)
-POLICY, KEEP, WAYPOINTS, OTHER_WORDS = "policy", "keep_state", "waypoints", "other_words"
+POLICY, KEEP, WAYPOINTS, OTHER_STATE = "policy", "keep_state", "waypoints", "other_words"
 _COLOURS: Final[Mapping[str, str]] = {
-    POLICY: "#1f6f8b", KEEP: "#5b6774", WAYPOINTS: "#2c8c4a", OTHER_WORDS: "#d1603d",
+    POLICY: "#1f6f8b", KEEP: "#5b6774", WAYPOINTS: "#2c8c4a", OTHER_STATE: "#d1603d",
 }  # fmt: skip
 _TAG: Final = 0xADE
 
 
 def keep_state(state: Array, steps: int) -> Array:
-    """[n, steps, 3]: on with the body velocity `state` [n, 3] (vx m/s, vy m/s, wz rad/s) as it is."""
+    """Return plans [n, steps, 3] that keep the body velocity `state` [n, 3] (vx m/s, vy m/s, wz rad/s)."""
     times = (np.arange(steps) + 1) / RATE_HZ
     turned = state[:, 2:] * times
-    # sin(a)/a and (1 - cos(a))/a: the mean direction on the arc so far.
+    # sin(a)/a and (1 - cos(a))/a: the mean direction along the arc.
     ahead = np.sinc(turned / np.pi)
     aside = np.sin(turned / 2) * np.sinc(turned / 2 / np.pi)
     vx, vy = state[:, :1] * times, state[:, 1:2] * times
@@ -53,9 +53,9 @@ def keep_state(state: Array, steps: int) -> Array:
 
 
 def to_waypoints(points: Array, age_s: float, steps: int) -> Array:
-    """[steps, 3]: straight from here to waypoints [3, 2] m in the current frame, each at the time it was said for.
+    """Return a plan [steps, 3] along straight lines to waypoints [3, 2] m in the current frame, each at its time.
 
-    `age_s`: since they were said. Waypoints whose time is over are left out, after the last one the robot stands.
+    `age_s`: time since the waypoints were predicted. Past waypoints are left out; after the last one the robot stands.
     """
     later = np.array(WAYPOINT_TIMES_S) - age_s
     open_ = later > 1e-9
@@ -76,7 +76,7 @@ def to_waypoints(points: Array, age_s: float, steps: int) -> Array:
 
 @dataclass
 class _Tally:
-    """Sums of one predictor's errors within one bin."""
+    """Sums of one predictor's errors in one delay bin."""
 
     count: int = 0
     speed: float = 0.0
@@ -85,7 +85,7 @@ class _Tally:
     last_m: dict[int, list[float]] = field(default_factory=dict)
 
     def add(self, planned: Array, target: Array, known: int) -> None:
-        """One plan [steps, 3] and the expert's, of which `known` steps are real (1 s of them at least)."""
+        """Add a plan [steps, 3] and the expert's, of which the first `known` steps are real (at least 1 s)."""
         errors = np.hypot(*(planned - target)[:, :2].T)
         for horizon in HORIZONS_S:
             upto = horizon * RATE_HZ
@@ -99,7 +99,7 @@ class _Tally:
         self.count += 1
 
     def numbers(self) -> dict[str, Any]:
-        """JSON values; means in m, m/s and rad/s."""
+        """Return the means in m, m/s and rad/s as JSON values."""
         if not self.count:
             return {"samples": 0}
         return {
@@ -112,7 +112,7 @@ class _Tally:
 
 
 def _command(plan: Array) -> tuple[float, float]:
-    """Speed and yaw rate that the controller would drive a plan with, before its limits."""
+    """Return the controller's speed and yaw rate for a plan, before its limits."""
     return arc_to(target_of(plan.astype(np.float32), 1 / RATE_HZ), TARGET_TIME_S)
 
 
@@ -122,7 +122,7 @@ class _Scores:
         self._tallies: dict[tuple[str, int], _Tally] = {}
 
     def add(self, predictor: str, age_s: float, planned: Array, target: Array, known: int) -> None:
-        """One plan, into its bin and into the whole (-1); an age beyond the bins counts for the whole alone."""
+        """Add a plan to its bin and to the total (-1); a delay outside the bins counts for the total alone."""
         bins = [-1]
         if self._edges_s[0] <= age_s <= self._edges_s[-1]:
             bins.append(min(int(np.searchsorted(self._edges_s, age_s, side="right")), len(self._edges_s) - 1) - 1)
@@ -130,7 +130,7 @@ class _Scores:
             self._tallies.setdefault((predictor, number), _Tally()).add(planned, target, known)
 
     def result(self) -> dict[str, Any]:
-        """Numbers over all ages, and by bin."""
+        """Return the errors over all delays and by bin."""
         predictors = sorted({predictor for predictor, _ in self._tallies})
 
         def numbers(bin_: int) -> dict[str, Any]:
@@ -147,9 +147,9 @@ def evaluate(
     *,
     seed: int,
     device: torch.device,
-    words: bool = True,
+    semantics: bool = True,
 ) -> dict[str, Any]:
-    """Errors of `planner` and of what stands beside it; `words` False: it is told none, so others change nothing."""
+    """Return the errors of `planner` and the baselines. `semantics` False: the planner uses no semantic state."""
     scores, into_walls = _Scores(config.edges_s), dict[str, list[NDArray[np.bool_]]]()
     groups = -(-config.samples // samples.group)
     each = max(2, config.batch // samples.group)
@@ -160,8 +160,8 @@ def evaluate(
         batch = collate(taken, device)
         with torch.no_grad():
             plans = {POLICY: planner(batch)}
-            if words and len(taken) > 1:
-                plans[OTHER_WORDS] = planner(_with_others_words(batch, len(taken)))
+            if semantics and len(taken) > 1:
+                plans[OTHER_STATE] = planner(_with_other_states(batch, len(taken)))
         arrays = {name: tensor.double().cpu().numpy() for name, tensor in plans.items()}
         _score(scores, samples, chosen, taken, arrays)
         for name, tensor in plans.items() if batch.around is not None else ():
@@ -171,7 +171,7 @@ def evaluate(
 
 
 def plans_into_walls(plans: Tensor, batch: ActionBatch) -> NDArray[np.bool_]:
-    """[n]: of the frames whose walls are known, whether the plan touches something where the expert's own does not."""
+    """Return, for the n frames with known walls, whether the plan touches a wall and the expert's does not: [n]."""
     assert batch.around is not None
     least = [
         room(each.float(), *batch.around).masked_fill(~batch.known, OPEN_M).amin(1) for each in (plans, batch.target)
@@ -180,39 +180,43 @@ def plans_into_walls(plans: Tensor, batch: ActionBatch) -> NDArray[np.bool_]:
     return found
 
 
-def _with_others_words(batch: ActionBatch, groups: int) -> ActionBatch:
-    """Every group with the semantic state of the one before it."""
+def _with_other_states(batch: ActionBatch, groups: int) -> ActionBatch:
+    """Give every group the semantic state of the previous group."""
     by = len(batch.guidance) // groups
     rolled = {name: torch.roll(getattr(batch, name), by, 0) for name in ("guidance", "real", "keep_guidance")}
     return ActionBatch(**{**vars(batch), **rolled})
 
 
 def _score(
-    scores: _Scores, samples: Samples, chosen: Sequence[Chosen], taken: Sequence[Group], plans: Mapping[str, Array]
+    scores: _Scores,
+    samples: Samples,
+    chosen: Sequence[SampleChoice],
+    taken: Sequence[Group],
+    plans: Mapping[str, Array],
 ) -> None:
     row = 0
     for one, group in zip(chosen, taken, strict=True):
         drive = samples.drives[one.drive]
         steps = group.target.shape[1]
         kept = keep_state(group.state.astype(np.float64), steps)
-        said = samples.said(one)
+        points = samples.waypoints_of(one)
         for i, (k, age) in enumerate(zip(one.ks, one.ages, strict=True)):
             target, known, age_s = group.target[i].astype(np.float64), int(group.known[i].sum()), age / RATE_HZ
             for name, arrays in plans.items():
                 scores.add(name, age_s, arrays[row], target, known)
             scores.add(KEEP, age_s, kept[i], target, known)
-            if said is not None:
-                straight = _straight(said, drive.offset(one.anchor, k), (k - one.anchor) / RATE_HZ, steps)
+            if points is not None:
+                straight = _straight(points, drive.offset(one.anchor, k), (k - one.anchor) / RATE_HZ, steps)
                 scores.add(WAYPOINTS, age_s, straight, target, known)
             row += 1
 
 
-def _straight(said: Waypoints, offset: SE2, since_s: float, steps: int) -> Array:
-    return to_waypoints(waypoints_now(said, offset)[0].astype(np.float64), since_s, steps)
+def _straight(points: Waypoints, offset: SE2, since_s: float, steps: int) -> Array:
+    return to_waypoints(waypoints_now(points, offset)[0].astype(np.float64), since_s, steps)
 
 
 def draw_errors(result: Mapping[str, Any], path: Path) -> None:
-    """A picture of the errors by age; the same numbers give the same picture. Raises OSError."""
+    """Plot the errors by delay as a PNG file. Raises OSError."""
     bins = result["by_delay"]
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -223,13 +227,13 @@ def draw_errors(result: Mapping[str, Any], path: Path) -> None:
         horizons = [horizon for row in rows if row["samples"] for horizon in row["fde_m"]]
         if not horizons:
             continue
-        shown = "3s" if "3s" in horizons else max(horizons)
+        horizon_name = "3s" if "3s" in horizons else max(horizons)
         for axis, values in (
-            (left, [row.get("fde_m", {}).get(shown, np.nan) for row in rows]),
+            (left, [row.get("fde_m", {}).get(horizon_name, np.nan) for row in rows]),
             (right, [row.get("yaw_rate_radps", np.nan) for row in rows]),
         ):
             axis.plot(ages, values, marker="o", markersize=3, label=name.replace("_", " "), color=_COLOURS[name])
-        left.set_ylabel(f"error after {shown[:-1]} s, m")
+        left.set_ylabel(f"error after {horizon_name[:-1]} s, m")
     right.set_ylabel("error of the yaw rate, rad/s")
     for axis in (left, right):
         axis.set_xlabel("age of the semantic state, s")

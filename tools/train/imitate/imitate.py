@@ -1,8 +1,8 @@
-"""Stage 2: the action expert learns to drive by what a frozen language model said seconds ago (Algorithm 1, eq. 4).
+"""Stage 2: the action expert learns to drive with delayed states of a frozen language model (Algorithm 1, eq. 4).
 
-Frames' tokens and generations' states come from caches, so that only the action expert computes. Every batch is a pure
-function of seed and step: a run that was ended goes on exactly, and any number of processes learns from the same ones.
-After a round of DAgger imitation goes on, over all drives, from what it was.
+Visual tokens and semantic states come from caches, so that only the action expert computes. Every batch is a function
+of seed and step: an interrupted run resumes exactly, and the number of processes does not change the batches. After a
+DAgger round imitation continues from its weights on all drives.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tools.train.imitate.mirror_drives import (
 from tools.train.imitate.mirror_drives import STATES as MIRRORED_STATES
 from tools.train.imitate.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
 from tools.train.imitate.steps import ImitateError, Training
-from tools.train.imitate.trainable_policies import ExpertPupil, PointGoalPupil, Pupil
+from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy, TrainablePolicy
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
 from tools.train.run.own_drives import drives_after
@@ -52,13 +52,13 @@ from tools.train.scenes.walls import Scenes
 
 STAGE: Final = "imitate"
 STATES: Final = "kv"
-"""Folder of the semantic states, beside the drives."""
+"""Folder of the semantic states, in the data set."""
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 _START: Final = 0x1A14
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """(what, how many, which measured rate) before there are drives: they are planned as for fine-tuning."""
+    """Return (description, number, key of the throughput) of this stage's work, from the planned number of drives."""
     config = recipe.imitate or ImitateConfig()
     seconds = round(PLANNED_DRIVE_S * recipe.collect.episodes) if recipe.collect is not None else 0
     states = [("semantic states", seconds * config.states.draws, "kv")] if config.policy == TIC_VLA else []
@@ -66,7 +66,7 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Train on the run's drives; leaves the network with its new action expert, or the point-goal network.
+    """Train on the run's drives and write the network with its new action expert, or the point-goal network.
 
     Raises ImitateError, SampleError, LatencyError, DriveError, TokenCacheError, KvCacheError, NetworkFileError.
     """
@@ -81,17 +81,17 @@ def run(job: StageJob) -> dict[str, Any]:
     network.to(job.device)
     if config.policy == POINT_GOAL:
         return _point_goal(job, network, dataset, tokens, seconds)
-    states = _said(job, network, dataset, tokens, STATES, dataset.ids)
+    states = _states(job, network, dataset, tokens, STATES, dataset.ids)
     mirror = None
     if seconds is not None:
-        seen = MirrorTokens(seconds)
-        mirror = Mirror(seen, _said(job, network, MirroredDrives.of(dataset), seen, MIRRORED_STATES, dataset.train))
+        mirror_tokens, mirrored = MirrorTokens(seconds), MirroredDrives.of(dataset)
+        mirror = Mirror(mirror_tokens, _states(job, network, mirrored, mirror_tokens, MIRRORED_STATES, dataset.train))
     own = None
     if config.evaluate.own_words and dataset.val:
-        own = _said(job, network, dataset, tokens, STATES, dataset.val, own=True)
-    pupil = ExpertPupil(network.action, config.loss)
+        own = _states(job, network, dataset, tokens, STATES, dataset.val, own=True)
+    policy = ActionExpertPolicy(network.action, config.loss)
     of = f"{states.key} {parts_sha256(network, (*SEEN_PARTS, 'action'))}"
-    result = fit(job, pupil, dataset, tokens, states, of=of, share=share, mirror=mirror, own=own)
+    result = fit(job, policy, dataset, tokens, states, of=of, share=share, mirror=mirror, own=own)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
     job.ranks.barrier()
@@ -105,7 +105,7 @@ def _encoded(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> TokenCach
     return tokens
 
 
-def _said(
+def _states(
     job: StageJob,
     network: TicVla,
     dataset: Dataset,
@@ -115,7 +115,7 @@ def _said(
     *,
     own: bool = False,
 ) -> KvCache:
-    """States along drives: of what is true there, or (`own`) of what the language model says itself."""
+    """Build the semantic states of drives with the true text, or (`own`) with text that the language model decodes."""
     config = _config(job).states
     job.progress.say("semantic states")
     return build_kv_cache(
@@ -125,7 +125,7 @@ def _said(
         dataset,
         tokens,
         replace(config, draws=1, own_share=1.0, own_share_policy=1.0) if own else config,
-        # Of the run, not of the stage: ablations of one seed share their states.
+        # The run's seed, not the stage's: ablations of one seed share their states.
         seed=job.recipe.seed,
         ids=ids,
         ranks=job.ranks,
@@ -139,8 +139,8 @@ def _point_goal(
     student: PointGoalNet = build_point_goal(network.config, job.generator(_START)).to(job.device)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, network.config.kv_dim)
     mirror = None if seconds is None else Mirror(MirrorTokens(seconds), states)
-    pupil = PointGoalPupil(student, _config(job).loss)
-    result = fit(job, pupil, dataset, tokens, states, of=parts_sha256(network, ("vision",)), mirror=mirror)
+    policy = PointGoalNetPolicy(student, _config(job).loss)
+    result = fit(job, policy, dataset, tokens, states, of=parts_sha256(network, ("vision",)), mirror=mirror)
     if job.ranks.first:
         path = job.run_dir.stage(STAGE) / POINT_GOAL_FILE
         save_point_goal(student, path, f"edge-train {job.recipe.name}, seed {job.recipe.seed}, after {STAGE}")
@@ -149,19 +149,19 @@ def _point_goal(
 
 
 def _start(job: StageJob, config: ImitateConfig) -> tuple[TicVla, float]:
-    """The network to begin with, and the share of `samples` that it is trained for."""
+    """Return the initial network and the share of `samples` that it is trained on."""
     network, rounds = start_network(job, STAGE), job.run_dir.retired(STAGE)
     if not rounds or not config.go_on_share or config.policy == POINT_GOAL:
         return network, 1.0
     path = stage_weights(job.run_dir.out, f"{STAGE}-{rounds - 1}")
-    # The action expert alone: the language model may have gone on since.
+    # The action expert alone: the language model may have been trained further since.
     network.action.load_state_dict(read_network(path, job.recipe.model, job.recipe.seed).action.state_dict())
     return network, config.go_on_share
 
 
 def fit(
     job: StageJob,
-    pupil: Pupil,
+    policy: TrainablePolicy,
     dataset: Dataset,
     tokens: FrameTokens,
     states: States,
@@ -171,26 +171,26 @@ def fit(
     mirror: Mirror | None = None,
     own: States | None = None,
 ) -> dict[str, Any]:
-    """Train a pupil in place and say how far its plans are from the expert's; raises ImitateError, SampleError.
+    """Train a policy in place and return its errors against the expert. Raises ImitateError, SampleError.
 
-    `of`: what frames and states were made with; `share` of the recipe's samples; `mirror`: of the drives to learn from;
-    `own`: states of the held-out drives with what the language model says itself.
+    `of`: hash of what tokens and states were computed with; `share` of the recipe's samples; `mirror`: mirrored
+    training drives; `own`: states of the held-out drives with text that the language model decoded.
     """
     config = _config(job)
-    delays = Delays.of(config.delays) if config.inject_delay and pupil.hears else Delays.none()
+    delays = Delays.of(config.delays) if config.inject_delay and policy.uses_semantics else Delays.none()
     scenes = Scenes() if config.loss.walls else None
     drives = _frames(job, dataset, dataset.train, config.sample, scenes)
     if mirror is not None:
         reflected = _frames(job, MirroredDrives.of(dataset), dataset.train, config.sample, scenes)
         drives = balanced(drives, [mirrored_frames(drive) for drive in reflected], config.mirrored)
         tokens, states = BothTokens(tokens, mirror.tokens), BothStates(states, mirror.states)
-    data = _samples(job, drives, tokens, states, delays, pupil)
+    data = _samples(job, drives, tokens, states, delays, policy)
     unseen = _frames(job, dataset, dataset.val, config.sample.undisturbed(), scenes)
-    held = _held(job, unseen, tokens, states, delays, pupil)
-    pupil.begin(data.drives)
+    held = _held_out(job, unseen, tokens, states, delays, policy)
+    policy.begin(data.drives)
     total = max(1, round(config.samples * share) // config.batch)
-    job.ranks.copy_parameters(pupil.module.parameters())
-    training = Training(STAGE, job, config, pupil, data, held, total, _key(config, dataset, pupil, of, total))
+    job.ranks.copy_parameters(policy.module.parameters())
+    training = Training(STAGE, job, config, policy, data, held, total, _key(config, dataset, policy, of, total))
     numbers = training.run()
     result: dict[str, Any] = {
         "steps": total,
@@ -199,14 +199,15 @@ def fit(
         "mean_age_s": delays.mean_s,
         **numbers,
     }
-    for name, told in (("held_out", states), ("held_out_own", own)):
-        # Of every age, whatever was trained under.
-        every = Delays.uniform(DelayConfig()) if pupil.hears else delays
-        looked = _held(job, unseen, tokens, told, every, pupil) if told is not None else None
-        if job.ranks.first and looked is not None:
+    for name, given in (("held_out", states), ("held_out_own", own)):
+        # Evaluate at all delays, whatever the delays in training.
+        every = Delays.uniform(DelayConfig()) if policy.uses_semantics else delays
+        samples = _held_out(job, unseen, tokens, given, every, policy) if given is not None else None
+        if job.ranks.first and samples is not None:
             result[name] = evaluate(
-                pupil.plan, looked, config.evaluate, seed=job.seed, device=torch.device(job.device), words=pupil.hears
-            )
+                policy.plan, samples, config.evaluate, seed=job.seed, device=torch.device(job.device),
+                semantics=policy.uses_semantics,
+            )  # fmt: skip
             draw_errors(result[name], job.run_dir.curves / f"{STAGE}_{name}.png")
     return result
 
@@ -214,7 +215,7 @@ def fit(
 def _frames(
     job: StageJob, dataset: Dataset, ids: Sequence[str], config: SampleConfig, scenes: Scenes | None
 ) -> list[DriveFrames]:
-    """`scenes`: where walls are looked at."""
+    """Load the drives' frames; with `scenes` also the walls around them."""
     steps, in_mirror = job.recipe.model.action.steps, isinstance(dataset, MirroredDrives)
     return [
         DriveFrames.of(
@@ -230,23 +231,24 @@ def _samples(
     tokens: FrameTokens,
     states: States,
     delays: Delays,
-    pupil: Pupil,
+    policy: TrainablePolicy,
     *,
     held: bool = False,
 ) -> Samples:
     config, model = _config(job).sample, job.recipe.model
-    if not pupil.hears:
-        # What the state is made of is of no interest to who does not look at it.
+    if not policy.uses_semantics:
+        # Such a policy works with any semantic interface.
         model = replace(model, action=replace(model.action, semantic_interface="kv"))
     return Samples(drives, tokens, states, delays, config.undisturbed() if held else config, model, drop=not held)
 
 
-def _held(
-    job: StageJob, drives: Sequence[DriveFrames], tokens: FrameTokens, states: States, delays: Delays, pupil: Pupil
-) -> Samples | None:
-    """Samples of held-out layouts as they are; None where there are none."""
+def _held_out(
+    job: StageJob, drives: Sequence[DriveFrames], tokens: FrameTokens, states: States, delays: Delays,
+    policy: TrainablePolicy,
+) -> Samples | None:  # fmt: skip
+    """Return undisturbed samples of held-out layouts; None if there are none."""
     try:
-        return _samples(job, drives, tokens, states, delays, pupil, held=True)
+        return _samples(job, drives, tokens, states, delays, policy, held=True)
     except SampleError:
         return None
 
@@ -257,13 +259,13 @@ def _config(job: StageJob) -> ImitateConfig:
     return job.recipe.imitate
 
 
-def _key(config: ImitateConfig, dataset: Dataset, pupil: Pupil, of: str, total: int) -> str:
-    """What a checkpoint must have been made with to be gone on from."""
+def _key(config: ImitateConfig, dataset: Dataset, policy: TrainablePolicy, of: str, total: int) -> str:
+    """Hash what a checkpoint depends on; only an equal hash can be resumed."""
     made = {
         "config": asdict(config),
         "dataset": dataset.sha256,
         "of": of,
         "total": total,
-        "pupil": {name: list(tensor.shape) for name, tensor in pupil.module.state_dict().items()},
+        "pupil": {name: list(tensor.shape) for name, tensor in policy.module.state_dict().items()},
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""Whole drives as a mirror shows them, to learn to drive in twice as many places as were recorded.
+"""Mirrored drives, which double the number of places to learn driving in.
 
-Frames' tokens are those that fine-tuning has made of the mirrored pictures, one a second: what is driven there is
-learned at whole seconds alone, which is enough, for neighbouring frames hardly differ.
+Their visual tokens are those that fine-tuning computed from mirrored images, one per second. Mirrored drives are
+therefore learned at whole seconds alone; this suffices because neighbouring frames hardly differ.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from tools.train.samples.mirror import mirrored_reasoning, mirrored_text
 from tools.train.scenes.trace_sentences import aspects_json, aspects_of_json
 
 MIRROR: Final = "mirror-of-"
-"""Before the id of a drive: the drive in the mirror."""
+"""Prefix of a mirrored drive's id."""
 STATES: Final = "kv-mirrored"
-"""Folder of the mirrored drives' semantic states, beside the drives."""
+"""Folder of the mirrored drives' semantic states, in the data set."""
 
 
 def mirrored_drive(drive: Drive) -> Drive:
-    """The drive in the mirror, without pictures."""
+    """Mirror a drive; the result has no images."""
     about = drive.about
     x_m, y_m = about.goal_xy
     return replace(
@@ -50,7 +50,7 @@ def mirrored_drive(drive: Drive) -> Drive:
 
 
 def _flipped(array: NDArray[Any], *axes: int) -> NDArray[Any]:
-    """With another sign in some places of the last axis; zeros stay without one."""
+    """Negate some entries of the last axis; zeros stay positive."""
     array = array.copy()
     for axis in axes:
         array[..., axis] = 0.0 - array[..., axis]
@@ -62,72 +62,72 @@ def _mirrored_trace(trace: Mapping[str, object]) -> dict[str, Any]:
 
 
 class MirroredDrives(Dataset):
-    """A data set whose drives are in the mirror; ids are the same."""
+    """A data set whose drives are mirrored; the ids are unchanged."""
 
     @staticmethod
     def of(dataset: Dataset) -> MirroredDrives:  # type: ignore[override]  # makes one; the parent's picks drives
-        """The mirror of a data set."""
+        """Return the mirrored data set."""
         return MirroredDrives(dataset.folder, dataset.entries)
 
     def load(self, drive_id: str, *, pictures: bool = False) -> Drive:
-        """One drive, always without pictures. Raises DriveError."""
+        """Load one drive, always without images. Raises DriveError."""
         return mirrored_drive(super().load(drive_id, pictures=False))
 
 
 def mirrored_frames(drive: DriveFrames) -> DriveFrames:
-    """What samples need of a mirrored drive: its id says so, and only whole seconds can be drawn."""
+    """Mark a drive's frames as mirrored by its id and restrict them to whole seconds."""
     weight = np.where(np.arange(len(drive)) % TRACE_EVERY == 0, drive.weight, 0.0)
     return replace(drive, id=MIRROR + drive.id, weight=weight)
 
 
 class Seconds:
-    """Tokens of whole seconds, by the number of the frame. Raises IndexError for another frame."""
+    """Tokens at whole seconds, indexed by frame. Raises IndexError for other frames."""
 
     def __init__(self, rows: FrameRows) -> None:
         self._rows = rows
 
     def __getitem__(self, k: int) -> Halves:
         if k % TRACE_EVERY:
-            raise IndexError(f"frame {k}: of the mirror there are whole seconds alone")
+            raise IndexError(f"frame {k}: mirrored drives have tokens at whole seconds alone")
         return self._rows[k // TRACE_EVERY]
 
 
 class MirrorTokens:
-    """Tokens of mirrored drives as those of others are asked for."""
+    """Tokens of mirrored drives with the interface of `FrameTokens`."""
 
     def __init__(self, seconds: FrameTokens) -> None:
         self._seconds = seconds
 
     def frames(self, drive_id: str) -> Seconds:
-        """Indexed by frame."""
+        """Return the tokens of a drive, indexed by frame."""
         return Seconds(self._seconds.frames(drive_id))
 
 
 class BothTokens:
-    """Tokens of drives, and under MIRROR those of their mirror images."""
+    """Tokens of drives and, under ids with the prefix MIRROR, of mirrored drives."""
 
     def __init__(self, plain: FrameTokens, mirror: MirrorTokens) -> None:
         self._plain, self._mirror = plain, mirror
 
     def frames(self, drive_id: str) -> FrameRows:
-        """Indexed by frame."""
+        """Return the tokens of a drive, indexed by frame."""
         of_mirror = drive_id.startswith(MIRROR)
         return self._mirror.frames(drive_id.removeprefix(MIRROR)) if of_mirror else self._plain.frames(drive_id)
 
 
 class BothStates:
-    """Semantic states of drives, and under MIRROR those of their mirror images; as many draws of each."""
+    """Semantic states of drives and, under ids with the prefix MIRROR, of mirrored drives."""
 
     def __init__(self, plain: States, mirror: States) -> None:
         self._plain, self._mirror = plain, mirror
         self.draws = plain.draws
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Frames that have a state."""
+        """Return the frames that have a state."""
         return self._of(drive_id).anchors(drive_id.removeprefix(MIRROR))
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
-        """The state of a generation whose newest frame is k."""
+        """Return state number `draw` of the generation whose newest frame is k."""
         return self._of(drive_id).at(drive_id.removeprefix(MIRROR), k, draw)
 
     def _of(self, drive_id: str) -> States:
@@ -136,14 +136,14 @@ class BothStates:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Where tokens and states of the mirrored drives come from, by the ids of the drives."""
+    """Tokens and states of mirrored drives, by the ids of the original drives."""
 
     tokens: MirrorTokens
     states: States
 
 
 def balanced(plain: list[DriveFrames], mirror: list[DriveFrames], share: float) -> list[DriveFrames]:
-    """All drives, the mirrored ones weighted so that `share` of what is drawn is theirs."""
+    """Return all drives, with the mirrored ones weighted to be drawn with probability `share`."""
     own, others = (sum(float(drive.weight.sum()) for drive in drives) for drives in (plain, mirror))
     if not share or not own or not others:
         return plain

@@ -1,7 +1,7 @@
-"""The paper's point-goal baselines as a network: pictures, state and where the goal is, no words (section 4.1).
+"""The network of the paper's point-goal baselines: image, state and goal, without language (section 4.1).
 
-Behaviour cloning and reinforcement learning share it, so that what differs between their rows is how they were trained.
-Its trunk is the value network's (appendix D: the baseline "shares the same architecture as the value network").
+Behaviour cloning and reinforcement learning share it, so that the baselines differ only in their training. Its trunk is
+the value network's (appendix D: the baseline "shares the same architecture as the value network").
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from export.model.attention import projection
 from export.model.config import TicVlaConfig
 
 FORMAT: Final = "tic-vla-edge-point-goal/1"
-_KEY: Final = "point_goal"  # the only metadata key: with two, the order of the bytes would be left to chance
+_KEY: Final = "point_goal"  # the only metadata key: the order of several keys would not be reproducible
 GOAL_SCALE_M: Final = 10.0
+"""Unit of the goal distance, m."""
 GOAL_MOST: Final = 3.0
-"""A goal further than 30 m is told as one 30 m away."""
+"""Clip of the goal distance, in units of GOAL_SCALE_M (30 m)."""
 
 
 class PointGoalFileError(ValueError):
-    """A file that is not a point-goal network of ours, or one of another size; one line."""
+    """A file that is not a point-goal network, or one of another size; one line."""
 
 
 class PointGoalNet(nn.Module):
-    """Visual tokens [n, N, D], state [n, 3], goal [n, 2] m in the robot's frame → plan [n, steps, 3] in it."""
+    """Maps visual tokens [n, N, D], state [n, 3] and goal [n, 2] m to plans [n, steps, 3], in the robot frame."""
 
     def __init__(self, config: TicVlaConfig) -> None:
         super().__init__()
@@ -47,9 +48,9 @@ class PointGoalNet(nn.Module):
         self.out = nn.Linear(width, 3 * config.action.steps)
 
     def features(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
-        """[n, channels]: what plan, policy or value are read off from."""
+        """Compute the features [n, channels] from which the plan is computed."""
         distance = goal.norm(dim=-1, keepdim=True)
-        # Direction and distance apart: near and far goals are told apart as well as left and right ones.
+        # Separate direction and distance: both are distinguished equally well at every distance.
         direction = goal / distance.clamp(min=1e-3)
         low = torch.cat([state, (distance / GOAL_SCALE_M).clamp(max=GOAL_MOST), direction], dim=-1)
         seen = self.convolutions(visual_tokens.transpose(1, 2))
@@ -62,13 +63,13 @@ class PointGoalNet(nn.Module):
 
 
 def build_point_goal(config: TicVlaConfig, generator: torch.Generator) -> PointGoalNet:
-    """An untrained network whose plan is a slow walk straight ahead; the same generator gives the same weights."""
+    """Build an untrained network whose plan is a slow straight walk; weights depend on the generator alone."""
     network = PointGoalNet(config)
     with torch.no_grad():
         for module in network.modules():
             if isinstance(module, nn.Conv1d | nn.Linear):
                 fan_in = module.weight[0].numel()
-                # He initialisation: a ReLU halves what passes it.
+                # He initialisation, for ReLU activations.
                 module.weight.normal_(0.0, (2.0 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
@@ -78,7 +79,7 @@ def build_point_goal(config: TicVlaConfig, generator: torch.Generator) -> PointG
 
 
 def save_point_goal(network: PointGoalNet, path: Path, origin: str) -> None:
-    """Write the weights in one rename; raises OSError."""
+    """Write the weights atomically. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
@@ -88,7 +89,7 @@ def save_point_goal(network: PointGoalNet, path: Path, origin: str) -> None:
 
 
 def load_point_goal(path: Path, config: TicVlaConfig) -> PointGoalNet:
-    """The network that `save_point_goal` wrote, in evaluation mode; raises PointGoalFileError."""
+    """Load a network that `save_point_goal` wrote, in evaluation mode. Raises PointGoalFileError."""
     network = PointGoalNet(config)
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -99,6 +100,6 @@ def load_point_goal(path: Path, config: TicVlaConfig) -> PointGoalNet:
         raise PointGoalFileError(f"{path}: not readable ({error})") from error
     wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != wanted:
-        raise PointGoalFileError(f"{path}: made for a network of other sizes; train it again")
+        raise PointGoalFileError(f"{path}: expected tensors of another size; train the network again")
     network.load_state_dict(tensors)
     return network.eval()

@@ -1,4 +1,4 @@
-"""The steps of imitation: batches that are a function of seed and step, losses over all ranks, exact checkpoints."""
+"""The training loop of imitation: reproducible batches, losses over all ranks, exact checkpoints."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from tools.train.config.imitate import ImitateConfig
 from tools.train.imitate.data import Samples
-from tools.train.imitate.trainable_policies import Pupil
+from tools.train.imitate.trainable_policies import TrainablePolicy
 from tools.train.run import checkpoint
 from tools.train.run.job import StageJob
 from tools.train.run.optim import Optimiser, autocast
@@ -21,31 +21,31 @@ FILE: Final = "checkpoint.safetensors"
 
 
 class ImitateError(ValueError):
-    """Data or a checkpoint that cannot be learned from; one line."""
+    """Unusable data, or a checkpoint of another run; one line."""
 
 
 class Training:
-    """The steps of one run of a stage; `key`: what a checkpoint must have been made with to be gone on from."""
+    """The training loop of one stage; a checkpoint can only be resumed with the same `key`."""
 
     def __init__(
         self,
         stage: str,
         job: StageJob,
         config: ImitateConfig,
-        pupil: Pupil,
+        policy: TrainablePolicy,
         data: Samples,
         held: Samples | None,
         total: int,
         key: str,
     ) -> None:
-        self._stage, self._job, self._config, self._pupil = stage, job, config, pupil
+        self._stage, self._job, self._config, self._policy = stage, job, config, policy
         self._data, self._held, self._total, self._key = data, held, total, key
-        self._optimiser = Optimiser(pupil.module.parameters(), config.optim, total, job.ranks)
+        self._optimiser = Optimiser(policy.module.parameters(), config.optim, total, job.ranks)
         self._path = job.run_dir.stage(stage) / FILE
         self._device = torch.device(job.device)
 
     def run(self) -> dict[str, float]:
-        """All steps that are left; the newest numbers. Raises ImitateError, and KeyboardInterrupt when told to end."""
+        """Run all remaining steps and return the last losses. Raises ImitateError, KeyboardInterrupt if interrupted."""
         job, config, optimiser = self._job, self._config, self._optimiser
         numbers = self._load()
         with Ahead(self._groups) as ahead:
@@ -56,7 +56,7 @@ class Training:
                 line = {"loss": numbers["loss"], "lr": lr}
                 if self._held is not None and (step % config.held_steps == 0 or step == self._total):
                     ahead.rest()
-                    line["held_loss"] = numbers["held_loss"] = self._look(self._held)
+                    line["held_loss"] = numbers["held_loss"] = self._held_loss(self._held)
                 if job.ranks.first:
                     job.run_dir.log(self._stage, step, **line)
                 job.progress.update(step, self._total, **numbers)
@@ -68,13 +68,13 @@ class Training:
         return numbers
 
     def _groups(self, step: int) -> list[Group]:
-        """This rank's share of a step's groups, each drawn from a generator of its own."""
+        """Draw this rank's share of a step's groups, each from its own generator."""
         count = self._config.batch // self._data.group
         own = range(count)[self._job.ranks.rank :: self._job.ranks.world]
         return [self._data.draw(np.random.default_rng((self._job.seed, _DRAWS, step, number))) for number in own]
 
     def _learn(self, groups: list[Group]) -> float:
-        """One step; the mean loss over all ranks."""
+        """Run one step and return the mean loss over all ranks."""
         value, weight = 0.0, float(len(groups))
         if groups:
             batch = collate(groups, self._device)
@@ -87,10 +87,10 @@ class Training:
     def _errors(self, batch: ActionBatch, step: int) -> torch.Tensor:
         generator = self._job.generator(_NOISE, step, self._job.ranks.rank)
         with autocast(self._job.device, self._config.optim.bf16):
-            return self._pupil.errors(batch, generator)
+            return self._policy.errors(batch, generator)
 
-    def _look(self, held: Samples) -> float:
-        """The loss over held-out samples, always the same ones, shared by the ranks."""
+    def _held_loss(self, held: Samples) -> float:
+        """Compute the loss over the fixed held-out samples, distributed over the ranks."""
         ranks, seed = self._job.ranks, self._job.seed
         count = -(-self._config.held_samples // held.group)
         each = self._config.batch // held.group
@@ -105,22 +105,22 @@ class Training:
         return ranks.sum(total) / whole if whole else float("nan")
 
     def _save(self, numbers: dict[str, float]) -> None:
-        """Written by the first rank alone: all have the same."""
+        """Write the checkpoint, in the first rank alone: all ranks have equal weights."""
         if self._job.ranks.first:
-            weights = checkpoint.with_prefix("pupil", self._pupil.module.state_dict())
+            weights = checkpoint.with_prefix("pupil", self._policy.module.state_dict())
             meta = {"key": self._key, "step": self._optimiser.step_count, "numbers": numbers}
             checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
 
     def _load(self) -> dict[str, float]:
-        """Go on if asked to and able to; gives the last numbers. Raises ImitateError for another run's checkpoint."""
+        """Resume if requested and possible; return the last losses. Raises ImitateError for another checkpoint."""
         step, numbers = -1, {}
         if self._job.resume and self._path.exists():
             tensors, meta = checkpoint.load(self._path)
             if meta["key"] != self._key:
                 raise ImitateError(
-                    f"{self._path}: of other drives, other states or another recipe; delete it to begin anew"
+                    f"{self._path}: checkpoint of other drives, states or another recipe; delete it to start again"
                 )
-            self._pupil.module.load_state_dict(checkpoint.under("pupil", tensors))
+            self._policy.module.load_state_dict(checkpoint.under("pupil", tensors))
             self._optimiser.restore(tensors)
             step, numbers = int(meta["step"]), dict(meta["numbers"])
         if self._job.ranks.first:

@@ -1,4 +1,4 @@
-"""What imitation trains: the action expert, or the point-goal network that the paper compares it with."""
+"""The policies that imitation trains: the action expert, or the paper's point-goal baseline."""
 
 from __future__ import annotations
 
@@ -18,55 +18,55 @@ from tools.train.scenes.walls import too_near
 
 
 def plan_loss(config: LossConfig, plan: Tensor, batch: ActionBatch) -> Tensor:
-    """Of every frame's plan [B, steps, 3]: equation 4, and what it comes too near to walls."""
+    """Compute the loss [B] of plans [B, steps, 3]: equation 4, plus a penalty for plans too close to walls."""
     loss = action_batch.smooth_l1(plan, batch, beta=config.beta, heading_weight=config.heading_weight)
     if not config.walls or batch.around is None:
         return loss
     return loss + config.walls * too_near(plan.float(), batch.target, batch.known, *batch.around, config.room_m)
 
 
-class Pupil(ABC):
-    """A policy that learns from batches."""
+class TrainablePolicy(ABC):
+    """A policy that is trained on batches."""
 
     module: nn.Module
-    """What learns: all of its parameters."""
-    hears: bool
-    """Whether it is given semantic states."""
+    """The trained network; all of its parameters are trained."""
+    uses_semantics: bool
+    """Whether the policy receives semantic states."""
 
     @abstractmethod
     def plan(self, batch: ActionBatch) -> Tensor:
-        """Trajectories [B, steps, 3]."""
+        """Compute trajectories [B, steps, 3]."""
 
     @abstractmethod
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """What is made small, for every frame [B]."""
+        """Compute the loss of every frame [B]."""
 
     @abstractmethod
     def begin(self, drives: Iterable[DriveFrames]) -> None:
-        """Look at all drives once before the first step."""
+        """Prepare for training on these drives, once before the first step."""
 
 
-class ExpertPupil(Pupil):
-    """The action expert, by any of its heads."""
+class ActionExpertPolicy(TrainablePolicy):
+    """The action expert with any of its heads."""
 
-    hears = True
+    uses_semantics = True
 
     def __init__(self, action: ActionExpert, loss: LossConfig) -> None:
         self.module = self._action = action.eval()
         self._loss = loss
 
     def plan(self, batch: ActionBatch) -> Tensor:
-        """By the network's layers, with what the batch drops out."""
+        """Compute the plan with the batch's dropout masks."""
         return action_batch.plan(self._action, batch)
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """Equation 4 and walls; a diffusion's or a flow's own objective (paper appendix D)."""
+        """Compute equation 4 and the wall penalty, or the objective of a diffusion or flow head (paper appendix D)."""
         if self._action.config.action.head == "query":
             return plan_loss(self._loss, self.plan(batch), batch)
         return action_batch.errors(self._action, batch, generator)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
-        """Heads that work on normalised actions take mean and deviation from the labels."""
+        """Compute mean and deviation of the labels for heads that normalise actions."""
         if self._action.scale is None:
             return
         labels = [(torch.from_numpy(drive.target), torch.from_numpy(drive.known)) for drive in drives]
@@ -76,23 +76,23 @@ class ExpertPupil(Pupil):
         self._action.fit_actions(target.to(device), known.to(device))
 
 
-class PointGoalPupil(Pupil):
-    """Behaviour cloning of the paper's point-goal baseline; the state is dropped out as the action expert's is."""
+class PointGoalNetPolicy(TrainablePolicy):
+    """The point-goal network for behaviour cloning, with the action expert's state dropout."""
 
-    hears = False
+    uses_semantics = False
 
     def __init__(self, network: PointGoalNet, loss: LossConfig) -> None:
         self.module = self._network = network
         self._loss = loss
 
     def plan(self, batch: ActionBatch) -> Tensor:
-        """From picture, state and goal alone."""
+        """Compute the plan from image, state and goal."""
         plans: Tensor = self._network(batch.visual_tokens, batch.state * batch.keep_state[:, None], batch.goal)
         return plans
 
     def errors(self, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-        """Equation 4 and walls."""
+        """Compute equation 4 and the wall penalty."""
         return plan_loss(self._loss, self.plan(batch), batch)
 
     def begin(self, drives: Iterable[DriveFrames]) -> None:
-        """There is nothing to be looked at."""
+        """Do nothing."""

@@ -1,1 +1,1 @@
-"""Recordings of real robots as drives: SCAND and GND, as folders of pictures and poses (never ROS bags)."""
+"""Import of real robots' recordings as drives: SCAND and GND, as folders of images and poses (no ROS bags)."""

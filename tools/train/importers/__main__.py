@@ -1,4 +1,4 @@
-"""`python -m tools.train.importers`: recordings of real robots into a data set that the training stages read."""
+"""`python -m tools.train.importers`: import recordings of real robots as a data set for training."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ exit codes: 0 done, 2 bad input, 130 interrupted
 
 
 def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, Any]:
-    """Every recording below `root` into the data set `out`; those that are there already stay. Returns counts.
+    """Import every recording below `root` into the data set `out`; existing drives are kept. Returns counts.
 
     Raises ImportedError, DriveError, OSError.
     """
     module = LAYOUTS[layout]
     folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and module.is_recording(folder))
     if not folders:
-        raise ImportedError(f"{root}: holds no recording of {layout}; its folders are described in {module.__name__}")
+        raise ImportedError(f"{root}: found no recording of {layout}; {module.__name__} describes its folders")
     with DatasetWriter(out) as writer:
         for folder in folders:
             for drive in drives(module.read(folder), layout, robot):
@@ -47,17 +47,17 @@ def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, A
 
 @command_line("importers")
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.train.importers",
         description=__doc__,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("layout", choices=sorted(LAYOUTS), help="how the recordings lie there")
-    parser.add_argument("root", type=Path, metavar="DIR", help="folder that holds a folder for each recording")
-    parser.add_argument("--robot", default="unknown", metavar="NAME", help="whose recordings these are")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the data set, new or to be added to")
+    parser.add_argument("layout", choices=sorted(LAYOUTS), help="format of the recordings")
+    parser.add_argument("root", type=Path, metavar="DIR", help="folder with one folder per recording")
+    parser.add_argument("--robot", default="unknown", metavar="NAME", help="robot that was recorded")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="data set to create or extend")
     parser.add_argument("--json", metavar="FILE", help="write counts as JSON to FILE, or to standard output for -")
     args = parser.parse_args(argv)
     try:

@@ -1,4 +1,4 @@
-"""From a recording to drives: 10 Hz, cut into episodes of 20 s, futures in the robot's frame (paper appendix B)."""
+"""Conversion of a recording to drives: resampled at 10 Hz and cut into episodes of 20 s (paper appendix B)."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from numpy.typing import NDArray
 
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
-from tools.train.drives.futures import driven_future
-from tools.train.drives.windows import EPISODE_S, relative
-from tools.train.importers.recording import ImportedError, Recording, Words, read_picture
+from tools.train.drives.futures import driven_future, relative
+from tools.train.importers.recording import ImportedError, Recording, Texts, read_picture
 
 Array = NDArray[np.float64]
 
+EPISODE_S: Final = 20.0
+"""Length of an imported episode, s (paper appendix B)."""
 FRAMES: Final = round(EPISODE_S * RATE_HZ)
-PICTURE_GAP_S: Final = 0.25  # an instant without a picture so new lies in a hole of the recording
-POSE_GAP_S: Final = 0.25  # and so does one between two poses further apart than this
+PICTURE_GAP_S: Final = 0.25  # largest age of an image at an instant; older ones are a gap of the recording
+POSE_GAP_S: Final = 0.25  # largest time between two poses; more is a gap of the recording
 QUALITY: Final = 90
 THRESHOLD_M: Final = 1.5
 _STEP_S: Final = 1 / RATE_HZ
-_ROUNDING: Final = 1e-4  # of an instant: stamps since 1970 in seconds are exact to a quarter of a microsecond
+_ROUNDING: Final = 1e-4  # tolerance of an instant: stamps since 1970 as float seconds are exact to 0.25 µs
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of a recording without holes, at 10 Hz: for each instant its newest picture [n], its pose [n, 3] and the
-    body velocity [n, 3] over the tenth of a second before it: nothing of what comes after it."""
+    """Part of a recording without gaps, at 10 Hz: index of the newest image [n], pose [n, 3] and body velocity over the
+    previous 0.1 s [n, 3] of each instant."""
 
     picture: NDArray[np.int64]
     pose: Array
@@ -39,7 +40,7 @@ class Piece:
 
 
 def pieces(recording: Recording) -> list[Piece]:
-    """The recording at 10 Hz, cut at its holes. No instant is given a picture that was taken after it."""
+    """Resample a recording at 10 Hz and cut it at its gaps. No instant uses a later image."""
     stamps, stamps_of_poses = recording.stamps_s, recording.poses[:, 0]
     start, end = max(stamps[0], stamps_of_poses[0] + _STEP_S), min(stamps[-1], stamps_of_poses[-1])
     times = start + np.arange(max(0, int(np.floor((end - start) * RATE_HZ + _ROUNDING)) + 1)) / RATE_HZ
@@ -58,22 +59,24 @@ def pieces(recording: Recording) -> list[Piece]:
 
 
 def _poses_at(poses: Array, times: Array) -> Array:
-    """[n, 3] between the poses [p, 4] of a recording at instants [n], s; headings the short way round."""
+    """Interpolate the poses [p, 4] of a recording at instants [n], s: [n, 3]; headings take the shorter direction."""
     heading = np.unwrap(poses[:, 3])
     found = [np.interp(times, poses[:, 0], column) for column in (poses[:, 1], poses[:, 2], heading)]
     return np.stack((found[0], found[1], (found[2] + np.pi) % (2 * np.pi) - np.pi), axis=1)
 
 
 def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
-    """Episodes of 20 s, one after the other; what is shorter, before a hole or at the end, is left out.
+    """Yield episodes of 20 s, one after the other; shorter remainders are left out.
 
-    Raises ImportedError for a picture that cannot be read and for words of an episode that there is not.
+    Raises ImportedError for an unreadable image and for texts of an episode that does not exist.
     """
     parts = [(piece, k) for piece in pieces(recording) for k in range(0, len(piece.pose) - FRAMES + 1, FRAMES)]
     if unknown := sorted(set(recording.words) - set(range(len(parts)))):
-        raise ImportedError(f"recording {recording.name}: words for episode {unknown[0]}, of {len(parts)} from 0 on")
+        raise ImportedError(
+            f"recording {recording.name}: texts for episode {unknown[0]}; expected a number below {len(parts)}"
+        )
     for number, (piece, start) in enumerate(parts):
-        words = recording.words.get(number, Words())
+        words = recording.words.get(number, Texts())
         if words.traces and len(words.traces) != FRAMES // TRACE_EVERY:
             raise ImportedError(
                 f"recording {recording.name}: episode {number}: expected {FRAMES // TRACE_EVERY} traces, one a second, "
@@ -83,7 +86,7 @@ def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
 
 
 def _drive(
-    recording: Recording, kind: str, robot: str, number: int, piece: Piece, start: int, words: Words
+    recording: Recording, kind: str, robot: str, number: int, piece: Piece, start: int, words: Texts
 ) -> Drive:  # fmt: skip
     span = slice(start, start + FRAMES)
     last = len(piece.pose) - 1
@@ -133,7 +136,7 @@ def _drive(
 
 
 def _jpeg(recording: Recording, index: int) -> NDArray[np.uint8]:
-    """The whole picture, squeezed to 128 x 128 as the robot's own camera's are."""
+    """Resize an image to 128 x 128 without cropping, as on the robot, and encode it as JPEG."""
     picture = read_picture(recording.pictures[index])
     small = cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
     done, jpeg = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

@@ -1,10 +1,10 @@
-"""GND (Liang et al. 2025) as we read it: its bags extracted to one folder a recording, poses of its lidar map.
+"""Reader of GND (Liang et al. 2025): bags extracted to one folder per recording, poses in its lidar map.
 
 RECORDING/recording.json      {"frames": [{"stamp_s", "file"}], "poses": [{"stamp_s", "position_m", "quaternion_xyzw"}]}
 RECORDING/…                   the pictures that it names, JPEG or PNG, by paths below the recording's folder
 RECORDING/texts.json          optional, see `tools.train.importers.recording`
 
-Poses are in three dimensions; what is kept is where the robot is on the ground and which way its x axis points.
+Poses are three-dimensional; only the position on the ground and the heading of the x axis are used.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from tools.train.importers.recording import ImportedError, Recording, read_json,
 
 KIND: Final = "gnd"
 TABLE: Final = "recording.json"
-_UNIT: Final = 0.01  # so far from length 1 a quaternion may be
+_UNIT: Final = 0.01  # tolerance of a quaternion's squared length
 
 
 def is_recording(folder: Path) -> bool:
-    """Whether a folder looks like one of these."""
+    """Return whether a folder has the files of a GND recording."""
     return (folder / TABLE).is_file()
 
 
 def read(folder: Path) -> Recording:
-    """One recording. Raises ImportedError."""
+    """Read one recording. Raises ImportedError."""
     path = folder / TABLE
     content = read_json(path)
     try:
@@ -60,7 +60,7 @@ def _number(value: object) -> float:
 
 
 def _below(folder: Path, name: str) -> Path:
-    """A file of the recording; nothing outside of it."""
+    """Return the path of a file inside the recording's folder. Raises ImportedError for one outside."""
     plain = PurePosixPath(name)
     if plain.is_absolute() or ".." in plain.parts:
         raise ImportedError(f"{folder / TABLE}: {name!r} is not a path below the recording")

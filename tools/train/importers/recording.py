@@ -1,4 +1,4 @@
-"""A real robot's recording, whatever files it came in: when each picture was taken, where the robot was, and words."""
+"""A real robot's recording, independent of its file format: image stamps, poses, and texts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class ImportedError(ValueError):
 
 
 @dataclass(frozen=True)
-class Words:
-    """What somebody has written about one episode of 20 s: instructions that say the same, one trace a second."""
+class Texts:
+    """Texts of one episode of 20 s: instructions with the same meaning, and one trace per second."""
 
     wordings: tuple[str, ...] = ()
     traces: tuple[Mapping[str, Any], ...] = ()
@@ -35,16 +35,16 @@ class Words:
 
 @dataclass(frozen=True)
 class Recording:
-    """`stamps_s` [p] and `pictures` [p] in order of time; `poses` [n, 4]: stamp s, x m, y m, theta rad, likewise.
+    """A recording in order of time: `stamps_s` [p] and `pictures` [p]; `poses` [n, 4] (stamp s, x m, y m, theta rad).
 
-    `words`: by number of the episode that is cut out of it.
+    `words`: texts by number of the 20 s episode.
     """
 
     name: str
     stamps_s: NDArray[np.float64]
     pictures: tuple[Path, ...]
     poses: NDArray[np.float64]
-    words: Mapping[int, Words]
+    words: Mapping[int, Texts]
 
     def __post_init__(self) -> None:
         what = f"recording {self.name}"
@@ -55,14 +55,14 @@ class Recording:
         if not (np.isfinite(self.stamps_s).all() and np.isfinite(self.poses).all()):
             raise ImportedError(f"{what}: a stamp or pose is not finite")
         if np.any(np.diff(self.stamps_s) <= 0) or np.any(np.diff(self.poses[:, 0]) <= 0):
-            raise ImportedError(f"{what}: expected stamps that grow, of pictures and of poses")
+            raise ImportedError(f"{what}: expected increasing stamps of pictures and of poses")
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
-    """uint8 RGB [height, width, 3] of a JPEG or PNG. Raises ImportedError."""
+    """Read a JPEG or PNG as uint8 RGB [height, width, 3]. Raises ImportedError."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise ImportedError(f"{path}: more than {MAX_BYTES} bytes, which is no picture of a robot")
+            raise ImportedError(f"{path}: expected at most {MAX_BYTES} bytes")
         data = path.read_bytes()
     except OSError as error:
         raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
@@ -70,12 +70,12 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         raise ImportedError(f"{path}: {why}")
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise ImportedError(f"{path}: expected a picture, found something else")
+        raise ImportedError(f"{path}: expected a JPEG or PNG image")
     return np.asarray(picture[..., ::-1], np.uint8)
 
 
 def read_json(path: Path) -> Any:
-    """A JSON file's content. Raises ImportedError."""
+    """Read a JSON file. Raises ImportedError."""
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
             raise ImportedError(f"{path}: more than {MAX_TABLE_BYTES} bytes")
@@ -88,7 +88,7 @@ def read_json(path: Path) -> Any:
         raise ImportedError(f"{path}: not JSON ({error})") from error
 
 
-def read_words(folder: Path) -> dict[int, Words]:
+def read_words(folder: Path) -> dict[int, Texts]:
     """`texts.json` of a recording, if it has one: `{"0": {"wordings": [texts], "traces": [20 tables]}, …}` by episode.
 
     `traces` may be left out; a trace is {situation, objects, motion, progress {step, steps, passed}, plan}, each in the
@@ -109,7 +109,7 @@ def _number(path: Path, key: str) -> int:
     return int(key)
 
 
-def _words(where: str, value: object) -> Words:
+def _words(where: str, value: object) -> Texts:
     if not isinstance(value, Mapping) or not {"wordings"} <= set(value) <= {"wordings", "traces"}:
         raise ImportedError(f"{where}: expected wordings and traces")
     wordings, traces = value["wordings"], value.get("traces", [])
@@ -122,4 +122,4 @@ def _words(where: str, value: object) -> Words:
             aspects_of_json(trace)
         except (ValueError, KeyError, TypeError) as error:
             raise ImportedError(f"{where}: {error}") from error
-    return Words(tuple(wordings), tuple(dict(trace) for trace in traces))
+    return Texts(tuple(wordings), tuple(dict(trace) for trace in traces))

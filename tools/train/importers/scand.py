@@ -1,4 +1,4 @@
-"""SCAND (Karnan et al. 2022) as we read it: its bags extracted to one folder a recording.
+"""Reader of SCAND (Karnan et al. 2022): bags extracted to one folder per recording.
 
 RECORDING/image/STAMP.jpg     front camera, STAMP in whole nanoseconds; .jpeg and .png are read as well
 RECORDING/odometry.csv        columns stamp_ns, x_m, y_m, theta_rad (in any order, others are left alone)
@@ -22,17 +22,17 @@ _SUFFIXES: Final = (".jpg", ".jpeg", ".png")
 
 
 def is_recording(folder: Path) -> bool:
-    """Whether a folder looks like one of these."""
+    """Return whether a folder has the files of a SCAND recording."""
     return (folder / PICTURES).is_dir() and (folder / POSES).is_file()
 
 
 def read(folder: Path) -> Recording:
-    """One recording. Raises ImportedError."""
+    """Read one recording. Raises ImportedError."""
     pictures = sorted((_stamp(path), path) for path in (folder / PICTURES).iterdir() if path.suffix in _SUFFIXES)
     rows = _rows(folder / POSES)
     if not pictures or not rows:
         raise ImportedError(f"{folder}: expected pictures in {PICTURES}/ and rows in {POSES}")
-    # Whole nanoseconds are subtracted before they become floats, which could not hold them.
+    # Subtract whole nanoseconds first: floats cannot represent them exactly.
     first_ns = min(pictures[0][0], rows[0][0])
     return Recording(
         name=folder.name,

@@ -1,4 +1,4 @@
-"""What a run will take before it is begun: samples of every stage, and time by throughputs that were measured."""
+"""Estimate of a run's work before it starts: samples of each stage, and duration from measured throughputs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ else:
     import tomli as tomllib
 
 Work = list[tuple[str, int, str]]
-"""What is to be done, how many samples of it, and the key of its throughput."""
+"""(description, number of samples, key in the throughput table) of each kind of work."""
 
 BUDGETS: Final[Mapping[str, Callable[[Recipe], Work]]] = {
     "collect": collect.budget,
@@ -34,13 +34,13 @@ BUDGETS: Final[Mapping[str, Callable[[Recipe], Work]]] = {
     "imitate": imitate.budget,
     "rl": rl.budget,
 }
-"""Name of a stage and the function that tells its work; `evaluate` and `dagger` are told here."""
+"""Function of each stage that returns its work; `evaluate` and `dagger` are computed here."""
 FILE: Final = Path(__file__).with_name("throughput.toml")
 
 
 @dataclass(frozen=True)
 class Line:
-    """One kind of work of a step; `rate` in samples a second, None where nobody has measured it."""
+    """One kind of work of a step; `rate` in samples per second, None if it was not measured."""
 
     step: str
     what: str
@@ -49,12 +49,12 @@ class Line:
 
     @property
     def seconds(self) -> float | None:
-        """How long it takes, s."""
+        """Estimated duration, s; None without a measured rate."""
         return None if self.rate is None else self.samples / self.rate
 
 
 def throughputs(model: str, device: str) -> Mapping[str, float]:
-    """Measured samples a second by key, for a network and a kind of device; empty where there are none."""
+    """Return measured samples per second by key for a network and a device; empty if none were measured."""
     tables = tomllib.loads(FILE.read_text(encoding="utf-8"))
     kind = device.partition(":")[0]
     if kind == "cpu" and not computes_bf16(kind):
@@ -64,7 +64,7 @@ def throughputs(model: str, device: str) -> Mapping[str, float]:
 
 
 def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
-    """The work of every step, as far as its stage tells it."""
+    """Return the work of every step."""
     rates = throughputs(recipe.model.name, device)
     lines: list[Line] = []
     for step in steps:
@@ -74,28 +74,28 @@ def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
 
 def _work(recipe: Recipe, step: Step) -> Work:
     if step.stage == "dagger":
-        shown = (
+        expert = (
             [("drives of the expert", recipe.dagger.expert_episodes, "drive")] if recipe.dagger.expert_episodes else []
         )
-        return [*shown, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
+        return [*expert, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
     if step.stage == "evaluate":
         count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
         return [("episodes", count, "policy-drive")]
     work = BUDGETS[step.stage](recipe)
-    return _again(recipe, step.stage, work) if step.round else work
+    return _after_round(recipe, step.stage, work) if step.round else work
 
 
-def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> Work:
-    """What goes on after a round of DAgger: what is cached of the new drives, and the share that is learned again."""
+def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> Work:
+    """Return the work of a stage that continues after a DAgger round: caching new drives and training for a share."""
     dagger = recipe.dagger
     drives = dagger.episodes + dagger.expert_episodes
     more = drives / recipe.collect.episodes if recipe.collect is not None else 1.0
     config = recipe.imitate if stage == "imitate" else recipe.sft
     share = (config.go_on_share or 1.0) if config is not None else 1.0
-    # An epoch is as long as its drives are many; imitation's samples are a number of their own.
+    # The length of an SFT epoch grows with the number of drives; imitation has a fixed number of samples.
     shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
-    again = recipe.sft.tours_again if recipe.sft is not None else 1.0
-    tours = {"tour": 0.0, "encode": 0.0, "sft": share * again}  # there are no more of them, and some are learned again
+    tours_share = recipe.sft.tours_again if recipe.sft is not None else 1.0
+    tours = {"tour": 0.0, "encode": 0.0, "sft": share * tours_share}  # no new tours; a share is trained on again
     counts = (
         (what, round(count * (tours if what.startswith(OF_TOURS) else shares).get(key, share)), key)
         for what, count, key in work
@@ -104,23 +104,23 @@ def _again(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> 
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:
-    """The plan for people."""
-    shown = [f"{recipe.name}: network {recipe.model.name}, seed {recipe.seed}, {device}"]
+    """Format the estimate as lines of text."""
+    lines = [f"{recipe.name}: network {recipe.model.name}, seed {recipe.seed}, {device}"]
     for step in steps:
         own = [line for line in budget if line.step == step.name]
         for line in own:
             took = "not measured" if line.seconds is None else duration(line.seconds)
-            shown.append(f"  {step.name:<11}{line.samples:>9,} {line.what:<28} {took}")
+            lines.append(f"  {step.name:<11}{line.samples:>9,} {line.what:<28} {took}")
         if not own:
-            shown.append(f"  {step.name:<11}{'':>9} its module does not tell")
+            lines.append(f"  {step.name:<11}{'':>9} no estimate")
     known = sum(line.seconds for line in budget if line.seconds is not None)
     open_ends = sum(line.seconds is None for line in budget)
-    shown.append(f"  in all {duration(known)}{f' and {open_ends} parts that nobody has measured' if open_ends else ''}")
-    return shown
+    lines.append(f"  total {duration(known)}{f' plus {open_ends} parts without a measured rate' if open_ends else ''}")
+    return lines
 
 
 def as_json(budget: Sequence[Line]) -> list[dict[str, Any]]:
-    """The same for `--json`."""
+    """Return the estimate as the value that `--json` writes."""
     return [
         {
             "step": line.step,

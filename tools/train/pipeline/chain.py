@@ -1,4 +1,4 @@
-"""The steps of a run in their order, each done once: a stage, a round of DAgger, or a stage again after one."""
+"""The steps of a run in order, each run once: a stage, a DAgger round, or a stage that continues after a round."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tools.train.sft import sft
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
-"""Stages whose work torchrun shares out; the others the first of its processes does alone."""
+"""Stages that torchrun distributes; the other stages run in its first process alone."""
 
 GO_ON: Final = ("sft", "imitate")
-"""Stages that go on, over more drives, after a round of DAgger."""
+"""Stages that continue after a DAgger round, with its new drives."""
 
 ADOPTED: Final = "adopted"
-"""In a stage's result: it was not run here, the run began with weights that it had left."""
+"""Key in the result of a stage that did not run here because the run started with that stage's weights."""
 
 StageRun = Callable[[StageJob], dict[str, Any]]
 RUNS: Final[Mapping[str, StageRun]] = {
@@ -40,28 +40,28 @@ RUNS: Final[Mapping[str, StageRun]] = {
     "rl": rl.run,
     "evaluate": evaluate.run,
 }
-"""Name of a stage and the function that does it."""
+"""Function that runs each stage."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage, or round number `round` of DAgger; what goes on after that round has its number too."""
+    """One step: a stage, DAgger round `round`, or a stage that continues after that round."""
 
     stage: str
     round: int = 0
 
     @property
     def name(self) -> str:
-        """For people, and for a round's folder."""
+        """Display name, which is also the folder of a DAgger round."""
         return f"{self.stage}-{self.round}" if self.round else self.stage
 
 
 def steps_of(command: str, recipe: Recipe) -> list[Step]:
-    """What a command does, in order."""
+    """Return the steps of a command, in order."""
     rounds: list[Step] = []
     for number in range(1, recipe.dagger.rounds + 1):
-        spoken = [Step("sft", number)] if number <= recipe.dagger.sft_rounds else []
-        rounds += [Step("dagger", number), *spoken, Step("imitate", number)]
+        sft_step = [Step("sft", number)] if number <= recipe.dagger.sft_rounds else []
+        rounds += [Step("dagger", number), *sft_step, Step("imitate", number)]
     if command == "dagger":
         return rounds
     if command != "all":
@@ -73,7 +73,7 @@ def steps_of(command: str, recipe: Recipe) -> list[Step]:
 
 
 def is_done(run_dir: RunDir, step: Step) -> bool:
-    """Whether a step has finished."""
+    """Return whether a step has finished."""
     if step.stage == "dagger":
         return run_dir.result(step.name) is not None
     if step.stage in GO_ON and step.round != (now := run_dir.retired(step.stage)):
@@ -82,19 +82,21 @@ def is_done(run_dir: RunDir, step: Step) -> bool:
 
 
 def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
-    """Raise RunDirError where a step would write over what is there."""
+    """Raise RunDirError if a step would overwrite existing files."""
     where = step.name if step.stage == "dagger" else step.stage
     if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
-        raise RunDirError(f"{run_dir.out}: its drives are another run's (--from); set dagger.rounds=0")
+        raise RunDirError(f"{run_dir.out}: its drives belong to another run (--from); set dagger.rounds=0")
     again = step.stage in GO_ON and step.round > run_dir.retired(step.stage)
     if run_dir.begun(where) and not resume and not again:
-        raise RunDirError(f"{run_dir.out / where}: was begun; go on with --resume, or delete it to begin anew")
+        raise RunDirError(
+            f"{run_dir.out / where}: already started; continue with --resume, or delete it to start again"
+        )
 
 
 def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]:
-    """The steps up to that one; raises RunDirError for one that the recipe does not have, or that leaves no policy.
+    """Return the steps up to `name`; `wanted` are the steps to run after them.
 
-    `wanted`: what is to be done after them.
+    Raises RunDirError if the recipe has no such step, the step leaves no policy, or a later step needs earlier drives.
     """
     steps = steps_of("all", recipe)
     policies = [step.name for step in steps if step.stage in ("imitate", "rl")]
@@ -102,12 +104,12 @@ def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]
         raise RunDirError(f"--after {name}: expected one of {', '.join(policies)}")
     before = steps[: [step.name for step in steps].index(name) + 1]
     if not recipe.dagger.newest_only and any(step.stage == "dagger" and step not in before for step in wanted):
-        raise RunDirError(f"--after {name}: the drives before it are not here; set dagger.newest_only=true")
+        raise RunDirError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
     return before
 
 
 def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
-    """Take the weights that the run began with for what these steps have left: what follows them is next."""
+    """Record the run's start weights as the result of these steps, so that the next step is the one after them."""
     start = stage_weights(run_dir.out, START)
     result = {ADOPTED: file_sha256(start), "after": steps[-1].name}
     for step in steps:
@@ -122,15 +124,15 @@ def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
 
 
 def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | None = None) -> dict[str, Any]:
-    """Do one step and record its result; raises what its stage raises."""
+    """Run one step and record its result. Raises the stage's errors."""
     if step.stage == "dagger":
         result = _round(job, step)
         if job.ranks.first:
             job.run_dir.finish(step.name, result)
         return result
     if step.stage in GO_ON and step.round > job.run_dir.retired(step.stage):
-        # The drives have become more: the stage goes on over all of them, and what it was is kept.
-        job.ranks.barrier()  # all ranks have looked
+        # The round has added drives: the stage continues on all of them, and its earlier result is kept.
+        job.ranks.barrier()  # all ranks have read the old state
         if job.ranks.first:
             job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
         job.ranks.barrier()
@@ -142,7 +144,7 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
 
 
 def module_run(stage: str) -> StageRun:
-    """The function of a stage's module."""
+    """Return the function that runs a stage."""
     return RUNS[stage]
 
 

@@ -1,4 +1,4 @@
-"""Console script of `edge-train`, which an install without torch or pybullet has too."""
+"""Console script of `edge-train`; it also exists in installations without torch or pybullet."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from edge.core.cli import EXIT_INTERRUPTED, run_with_extra
 
 
 def main() -> int:
-    """Entry point; returns the exit code."""
+    """Run `edge-train` and return its exit code."""
     try:
         return run_with_extra("edge-train", "tools.train.cli", "export,sim")
-    except KeyboardInterrupt:  # while modules load; afterwards tools.train.cli answers itself
+    except KeyboardInterrupt:  # while modules load; later, tools.train.cli handles it
         sys.stderr.write("edge-train: interrupted\n")
         return EXIT_INTERRUPTED

@@ -1,4 +1,4 @@
-"""The last stage: the exported model drives episodes in training's kind of scenes that it has never seen."""
+"""The last stage: the exported model drives episodes in training-like scenes that no stage has used."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ SUITE: Final = "training.toml"
 
 
 class EvaluateError(ValueError):
-    """Nothing to evaluate; one line."""
+    """No policy to evaluate, or a suite of another configuration; one line."""
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Export the run's newest weights, drive, and return the benchmark's summary; resumes by itself.
+    """Export the run's newest weights, drive the episodes and return the benchmark's summary. Resumes automatically.
 
     Raises EvaluateError, ExportError, RunsError, ScenarioError, StoreError.
     """
@@ -65,21 +65,23 @@ def run(job: StageJob) -> dict[str, Any]:
         stopped=job.should_stop,
         watcher=RunWatcher(finished=finished),
     )
-    # By kind of scene: the layouts themselves are of no interest.
+    # Summarise by kind of scene, not by layout.
     by_kind = [replace(result, scene=Path(result.scene).stem.split("-")[0]) for result in results]
     return {"weights": weights.parent.name, "latency_s": config.latency_s, "summary": summarise(by_kind)}
 
 
 def write_suite(folder: Path, config: EvaluateConfig) -> Path:
-    """The episodes as a suite's file, with their scenes beside it; one of the same numbers is taken as it is.
+    """Write the episodes as a suite file with its scenes beside it, or reuse a file of the same configuration.
 
-    Raises EvaluateError where there is one of other numbers: its results would be taken for these.
+    Returns its path. Raises EvaluateError for a file of another configuration, whose results would be mixed in.
     """
     path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
     numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
     if path.exists() and mark.exists():
         if (found := json.loads(mark.read_text(encoding="utf-8"))) != numbers:
-            raise EvaluateError(f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to begin anew")
+            raise EvaluateError(
+                f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to start again"
+            )
         return path
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""The model card: what the weights are, what they were made of, how well they do, and what they are not for.
+"""The model card: weights, scores, training data, training and limits.
 
-A run that went on from weights with a card has that card's data and training at its end: nothing of a chain is lost.
+If the run started from weights with a card, that card's data and training are appended: the history stays complete.
 """
 
 from __future__ import annotations
@@ -23,39 +23,42 @@ from tools.train.run.network_file import CARD, START, START_CARD, read_network, 
 from tools.train.run.own_drives import IMPORTED
 from tools.train.run.run_dir import VERSIONS, RunDir
 
-_HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # there are six levels
+_HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # Markdown has six levels
 _THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
 _BEFORE: Final = "## What it went on from"
 _OUR_DRIVES: Final = (
     "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
-    "layouts, the demo's corridor, crowds and instruction patterns, all apart from every episode of the benchmark,",
-    "which a test holds. No recording of a person or a place is in it.",
+    "layouts, the demo's corridor, crowds and instruction patterns. A test checks that none of them occurs in the",
+    "benchmark's episodes. They contain no recording of a person or a place.",
 )
 _OTHERS_DRIVES: Final = (
-    "Drives that were recorded elsewhere and imported (`--drives`); whose they are, this run cannot know.",
+    "Drives that were recorded elsewhere and imported (`--drives`); this run does not know their origin.",
 )
 _LIMITS_HERE: Final = """\
-* It was trained and measured in simulated scenes with simulated people, seen by a renderer. Nothing here says how it
-  does with a real camera: train it further on recorded drives first (`tools/train/importers` reads them).
+* It was trained and measured in simulated scenes with simulated people and rendered images. Its performance with a real
+  camera is unknown: train it further on recorded drives first (`tools/train/importers` reads them).
 """
 _LIMITS_ELSEWHERE: Final = """\
-* It was measured in simulated scenes with simulated people, if at all. Nothing here says how it does where its drives
-  were recorded.
+* It was measured in simulated scenes with simulated people, if at all. Its performance where its drives were recorded
+  is unknown.
 """
 LIMITS: Final = """\
-* It knows the words of its instruction grammar and of its landmarks, in English. Others it may ignore.
-* It is no safety function. Fences, the emergency stop and a person who watches are; so are the supervisor's limits and
-  the bridge's deadman, which hold whatever it does.
+* It understands the vocabulary of its instruction grammar and its landmarks, in English. It may ignore other words.
+* It is not a safety function. Fences, the emergency stop, a supervising person, the supervisor's limits and the
+  bridge's deadman are; they do not depend on the model.
 * Speeds, camera height and field of view are those of the simulated Go2 and Carter.
 """
 
 
 class CardError(ValueError):
-    """Nothing to write a card about; one line."""
+    """No weights to describe, or an unreadable score file; one line."""
 
 
 def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> Path:
-    """Write the card beside the run's weights. `scores` are results of edge-bench. Raises CardError, OSError."""
+    """Write the card beside the run's weights and return its path. `scores`: result files of edge-bench.
+
+    Raises CardError, OSError.
+    """
     if not run_dir.model_path.is_file():
         raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     path = run_dir.out / CARD
@@ -64,17 +67,17 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
 
 
 def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
-    """Write the run's weights as they are given away, with card and recipe: float16, without what only training needs.
+    """Write the run's weights for publication, with card and recipe: float16, without the value network.
 
     Returns the weights' path. Raises CardError, NetworkFileError, OSError.
     """
     if not run_dir.model_path.is_file():
         raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     with safe_open(str(run_dir.model_path), framework="pt") as file:
-        said = file.metadata()
+        about = file.metadata()
     model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
     path = folder / f"{recipe.model.name}.safetensors"
-    info = WeightsInfo(trained=said["trained"] == "true", origin=f"{said['origin']}, float16")
+    info = WeightsInfo(trained=about["trained"] == "true", origin=f"{about['origin']}, float16")
     save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
     write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
     write_whole(path.with_suffix(".recipe.toml"), run_dir.recipe_path.read_text(encoding="utf-8"))
@@ -82,7 +85,7 @@ def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] =
 
 
 def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mapping[str, object]] = ()) -> str:
-    """The card's text; the same run gives the same text."""
+    """Return the card's text; it depends on the run's files alone."""
     found = {name: result for name in STAGES if (result := run_dir.result(name)) is not None}
     results = {name: result for name, result in found.items() if ADOPTED not in result}
     after = next((str(result.get("after")) for result in found.values() if ADOPTED in result), None)
@@ -100,13 +103,13 @@ def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mappin
 
 
 def _card_before(run_dir: RunDir) -> str | None:
-    """The card of the weights that the run began with; None where they had none."""
+    """Return the card of the run's start weights; None if they had none."""
     path = stage_weights(run_dir.out, START).with_name(START_CARD)
     return path.read_text(encoding="utf-8") if path.is_file() else None
 
 
 def _history(text: str) -> str:
-    """Data and training of a card, and of what it went on from itself, one level of headings further down."""
+    """Return a card's data and training, and its own history, with headings one level deeper."""
     sections = [f"## {section.rstrip()}\n" for section in text.split("\n## ")[1:]]
     kept = [each for each in sections if each.startswith(("## Data\n", "## Training\n", f"{_BEFORE}\n"))]
     lines = (line for each in kept for line in each.split("\n"))
@@ -120,7 +123,7 @@ def _licence(begun_with_weights: bool, before: str | None) -> str:
 
 
 def score(path: Path) -> dict[str, Any]:
-    """Conditions and summary of a benchmark's result file; raises CardError."""
+    """Read conditions and summary of a benchmark's result file. Raises CardError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
@@ -129,7 +132,7 @@ def score(path: Path) -> dict[str, Any]:
 
 
 def parameters(weights: Path) -> dict[str, int]:
-    """Number of weights of each part of the network."""
+    """Count the weights of each part of the network."""
     counts = dict.fromkeys(PARTS, 0)
     with safe_open(str(weights), framework="pt") as file:
         for name in file.keys():  # noqa: SIM118 — not a mapping
@@ -151,7 +154,7 @@ def _network(weights: Path, recipe: Recipe, licence: str) -> str:
     }
     rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
     return (
-        f"Network `{recipe.model.name}`: camera pictures, odometry and an instruction in plain words become motion.\n"
+        f"Network `{recipe.model.name}`: maps camera images, odometry and an English instruction to motion.\n"
         f"{licence}\n\n"
         f"`{weights.name}`: {size / 1e6:.1f} MB, SHA-256 `{file_sha256(weights)}`\n\n"
         f"| part | weights |\n|---|---:|\n{rows}\n| all | {sum(counts.values()):,} |\n"
@@ -161,17 +164,17 @@ def _network(weights: Path, recipe: Recipe, licence: str) -> str:
 def _scores(evaluation: Mapping[str, Any] | None, scores: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for each in scores:
-        told = each["conditions"]
+        conditions = each["conditions"]
         latency = each["latency"].get("profile") or "none"
-        where = f"{Path(each['suite']).stem}, {told['clock']}, {told['mode']}, latency {latency}, drift {told['drift']}"
-        rows.append(_row(where, each["summary"]))
+        settings = f"{conditions['clock']}, {conditions['mode']}, latency {latency}, drift {conditions['drift']}"
+        rows.append(_row(f"{Path(each['suite']).stem}, {settings}", each["summary"]))
     if evaluation is not None:
         where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
         rows.append(_row(where, evaluation["summary"]))
     if not rows:
         return "Not measured yet.\n"
     head = "| episodes of | n | SR % | SPL % | CR % | NE m |\n|---|---:|---:|---:|---:|---:|\n"
-    note = "\nMeasured; in brackets bootstrap intervals of 95 % over tasks and their episodes.\n"
+    note = "\nMeasured; in brackets 95 % bootstrap intervals over tasks and their episodes.\n"
     return head + "\n".join(rows) + "\n" + note
 
 
@@ -196,7 +199,7 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
         if result is not None and ADOPTED not in result:
             lines += [
                 "",
-                f"Round {number} of DAgger, driven by the policy, relabelled by the expert:",
+                f"DAgger round {number}, driven by the policy, relabelled by the expert:",
                 "",
                 *_facts(result),
             ]
@@ -217,7 +220,7 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
         f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
     ]
     if later := versions.get("later"):
-        lines.append(f"It went on with other code, versions or machines {len(later)} times: `{VERSIONS}`.")
+        lines.append(f"It was continued with other code, versions or machines {len(later)} times: `{VERSIONS}`.")
     if timings := run_dir.timings():
         each = ", ".join(f"{step} {duration(seconds)}" for step, seconds in timings.items())
         lines.append(
@@ -232,7 +235,7 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
 
 
 def _facts(result: Mapping[str, object], under: str = "") -> list[str]:
-    """One line a number; long lists are left out."""
+    """Format a result as one line per value; lists are omitted."""
     lines = []
     for key, value in sorted(result.items()):
         if isinstance(value, Mapping):

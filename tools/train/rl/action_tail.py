@@ -1,6 +1,6 @@
-"""The action expert cut before its last cross-attention layer: what reinforcement learning trains, and what it keeps.
+"""The action expert split before its last cross-attention layer: the frozen prefix and the tail that PPO trains.
 
-Paper, appendix D: "we finetune only the final cross-attention Transformer layer and the MLP decoder". All before it is
+Paper, appendix D: "we finetune only the final cross-attention Transformer layer and the MLP decoder". The prefix is
 frozen, so its output is computed once in a rollout and reused in every epoch of the optimisation.
 """
 
@@ -16,36 +16,38 @@ from export.model.heads import integrated
 
 
 class ActionTailError(ValueError):
-    """An action expert that cannot be cut so; one line."""
+    """An action expert that cannot be split, or weights that are not a tail's; one line."""
 
 
 def check_tail(expert: ActionExpert) -> None:
-    """Raise ActionTailError unless the expert's last layer and head alone make a trajectory (head `query`)."""
+    """Raise ActionTailError unless the expert's last layer and head alone compute the trajectory (head `query`)."""
     head = getattr(expert.config.action, "head", "query")
     if head != "query":
-        raise ActionTailError(f"action.head {head!r}: reinforcement learning trains the query head; imitate is its end")
+        raise ActionTailError(
+            f"action.head {head!r}: reinforcement learning trains the query head alone; end with imitate"
+        )
     if expert.config.action.semantic_interface == "waypoints":
         raise ActionTailError(
-            "semantic_interface 'waypoints': reinforcement learning needs kv or values-only, fixed by a generation"
+            "semantic_interface 'waypoints': reinforcement learning needs kv or values-only, which a generation fixes"
         )
 
 
 def tail_parameters(expert: ActionExpert) -> dict[str, torch.nn.Parameter]:
-    """Name → parameter of the last cross-attention layer, its keys and values, and the head, in the expert's names."""
+    """Return the tail's parameters by the expert's names: last cross-attention layer, its keys and values, and head."""
     last = len(expert.layers) - 1
     trained = (f"layers.{last}.", f"key_values.{last}.", "norm.", "head.", "out.")
     return {name: each for name, each in expert.named_parameters() if name.startswith(trained)}
 
 
 def freeze_all_but_tail(expert: ActionExpert) -> None:
-    """Only the tail's parameters keep gradients."""
+    """Disable gradients of all parameters but the tail's."""
     trained = tail_parameters(expert)
     for name, each in expert.named_parameters():
         each.requires_grad_(name in trained)
 
 
 def load_tail(expert: ActionExpert, tensors: Mapping[str, Tensor]) -> None:
-    """Give the tail other weights; raises ActionTailError unless they are exactly the tail's."""
+    """Replace the tail's weights. Raises ActionTailError unless the names are exactly the tail's."""
     wanted = tail_parameters(expert)
     if set(tensors) != set(wanted):
         odd = sorted(set(tensors) ^ set(wanted))[0]
@@ -56,19 +58,22 @@ def load_tail(expert: ActionExpert, tensors: Mapping[str, Tensor]) -> None:
 
 
 def semantic_of(expert: ActionExpert, last_layer_kv: Tensor) -> Tensor:
-    """Semantic tokens [1, T, hidden] of a generation's K‖V [1, T, kv_dim]; frozen, once a generation."""
+    """Compute semantic tokens [1, T, hidden] from a generation's K‖V [1, T, kv_dim], without gradients."""
     with torch.no_grad():
         return expert.semantic_tokens(last_layer_kv)
 
 
 def now_of(expert: ActionExpert, visual_tokens: Tensor, state: Tensor, latency: Tensor) -> Tensor:
-    """Tokens of the present [B, N + 2, hidden]; frozen."""
+    """Compute the tokens of the current frame, state and latency [B, N + 2, hidden], without gradients."""
     with torch.no_grad():
         return expert.now_tokens(visual_tokens, state, latency)
 
 
 def prefix(expert: ActionExpert, now: Tensor, semantic: Tensor) -> Tensor:
-    """The queries [B, steps, hidden] before the last layer; frozen. All of the batch have T semantic tokens."""
+    """Compute the queries [B, steps, hidden] before the last layer, without gradients.
+
+    `now` [B, N + 2, hidden]; `semantic` [B, T, hidden], of equal length T in the whole batch.
+    """
     with torch.no_grad():
         x = expert.queries.detach().expand(now.shape[0], -1, -1)
         pairs = list(zip(expert.key_values, expert.layers, strict=True))
@@ -79,7 +84,10 @@ def prefix(expert: ActionExpert, now: Tensor, semantic: Tensor) -> Tensor:
 
 
 def tail(expert: ActionExpert, x: Tensor, now: Tensor, semantic: Tensor, real: Tensor | None = None) -> Tensor:
-    """Trajectory [B, steps, 3] from the queries before the last layer; `real` [B, T] is False at padded tokens."""
+    """Compute the trajectory [B, steps, 3] from the queries before the last layer.
+
+    `real` [B, T] is False at padded semantic tokens; None if none is padded.
+    """
     c = expert.config.action
     tokens = torch.cat([now, semantic], dim=1)
     keys, values = expert.key_values[-1](tokens)
@@ -91,7 +99,7 @@ def tail(expert: ActionExpert, x: Tensor, now: Tensor, semantic: Tensor, real: T
 
 
 def padded(sequences: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Sequences [T_i, h] as one batch [B, T, h] padded with zeros, and which tokens are real [B, T]."""
+    """Stack sequences [T_i, h] as a batch [B, T, h] padded with zeros; return it and which tokens are real [B, T]."""
     lengths = torch.tensor([len(each) for each in sequences])
     batch = torch.nn.utils.rnn.pad_sequence(list(sequences), batch_first=True)
     return batch, torch.arange(batch.shape[1])[None] < lengths[:, None]

@@ -1,6 +1,6 @@
-"""From a trajectory to a Gaussian over (v, ω), as appendix D has it: its mean is the arc to the point 1 s ahead.
+"""A Gaussian over commands (v, ω) whose mean is the arc to the trajectory's point 1 s ahead (paper, appendix D).
 
-The torch twin of `edge.motion.controller`: the same arc and the same limits, so that what is learned is what is driven.
+Computes the same arc and limits as `edge.motion.controller`, in torch, so that training and driving agree.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class CommandLimits:
 
 
 def command_mean(trajectory: Tensor, step_s: float, limits: CommandLimits) -> Tensor:
-    """(v m/s, ω rad/s) [B, 2] of trajectories [B, steps, 3]: `arc_to` of the target 1 s ahead, within the limits."""
+    """Compute (v m/s, ω rad/s) [B, 2] of trajectories [B, steps, 3]: the arc to the target 1 s ahead, within limits."""
     return within_limits(arc_command(trajectory, step_s), limits)
 
 
 def arc_command(trajectory: Tensor, step_s: float) -> Tensor:
-    """(v m/s, ω rad/s) [B, 2] of the same arc, however fast it would have to be driven."""
+    """Compute (v m/s, ω rad/s) [B, 2] of the arc to the target 1 s ahead, without limits (`controller.arc_to`)."""
     index = min(trajectory.shape[1], max(1, round(TARGET_TIME_S / step_s))) - 1
     x, y, theta = trajectory[:, index].unbind(-1)
     distance = torch.sqrt(x * x + y * y + 1e-12)
     bearing = torch.atan2(y, x)
     small = bearing.abs() < 1e-3
-    # Both branches of a `where` get gradients: the one that is not taken must be finite.
+    # Both branches of a `where` receive gradients, so the branch that is not taken must be finite.
     sine = torch.where(small, torch.ones_like(bearing), torch.sin(bearing))
     divisor = torch.where(sine.abs() < 1e-6, torch.ones_like(sine), sine)
     stretch = torch.where(small, 1 + bearing * bearing / 6, bearing / divisor)
@@ -52,9 +52,9 @@ def arc_command(trajectory: Tensor, step_s: float) -> Tensor:
 
 
 def within_limits(arc: Tensor, limits: CommandLimits) -> Tensor:
-    """Commands [B, 2] slowed down on their arcs until they are within the limits.
+    """Scale commands [B, 2] down along their arcs until they are within the limits.
 
-    The share is a constant to gradients: otherwise a plan at the limit of speed could not be taught to go slower.
+    The scale is detached: with its gradient, a plan above the speed limit could not learn to go slower.
     """
     speed, turn = arc.unbind(-1)
     over = torch.maximum(speed / limits.vx_max_mps, turn.abs() / limits.wz_max_radps).clamp(min=1.0).detach()
@@ -62,11 +62,11 @@ def within_limits(arc: Tensor, limits: CommandLimits) -> Tensor:
 
 
 def log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """Log density [B] of actions [B, 2] under independent Gaussians."""
+    """Compute the log density [B] of actions [B, 2] under independent Gaussians; `log_std` [2]."""
     z = (action - mean) * torch.exp(-log_std)
     return (-0.5 * z * z - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
 
 
 def entropy(log_std: Tensor) -> Tensor:
-    """Differential entropy of the Gaussian, nats."""
+    """Compute the differential entropy [] of the Gaussian, nats."""
     return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()

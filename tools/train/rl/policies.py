@@ -1,8 +1,13 @@
-"""Who is trained: the action expert beside an asynchronous mind, and the paper's point-goal network."""
+"""The policies that reinforcement learning trains, while they drive one episode.
+
+`TailPolicy` is the action expert with asynchronous reasoning; `PointGoalRolloutPolicy` is the paper's baseline without
+language.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +20,42 @@ from sim_hil.benchmark.conditions.latency import Timing
 from tools.train.imitate.point_goal_net import PointGoalNet
 from tools.train.rl.action_tail import now_of, prefix, semantic_of, tail
 from tools.train.rl.command_policy import CommandLimits, command_mean
-from tools.train.rl.rollout import Chosen
-from tools.train.rl.virtual_time_reasoner import AsyncMind, Models
+from tools.train.rl.rollout import PolicyOutput
+from tools.train.rl.virtual_time_reasoner import Models, RolloutReasoner
 
 Floats = npt.NDArray[np.float32]
 
 
-class TailPilot:
-    """Acts by the last released generation (Algorithm 2, lines 4 to 9); one episode."""
+class RolloutPolicy(Protocol):
+    """A trained policy during one episode; every control period calls `observe`, `choose`, then `start_generation`."""
+
+    @property
+    def semantic(self) -> Sequence[Floats]:
+        """Semantic tokens [T, hidden] of each generation that an action was based on."""
+        ...
+
+    @property
+    def failure(self) -> str | None:
+        """Why the policy cannot continue; None while it can."""
+        ...
+
+    def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
+        """Take in the newest image [h, w, 3] and return its visual tokens [1, N, D]."""
+        ...
+
+    def choose(
+        self, visual: Floats, state: tuple[float, ...], goal_m: tuple[float, float], time_s: float, T_odom_base: SE2
+    ) -> PolicyOutput | None:
+        """Compute the mean command; None before the first semantic state. `goal_m` (x, y) is in the robot frame."""
+        ...
+
+    def start_generation(self, time_s: float) -> None:
+        """Start the next generation unless one is running or the policy has none."""
+        ...
+
+
+class TailPolicy:
+    """The action expert acting on the last released generation (Algorithm 2, lines 4 to 9), for one episode."""
 
     def __init__(
         self,
@@ -32,7 +65,7 @@ class TailPilot:
         instruction: str,
         draw: Callable[[], Timing],
     ) -> None:
-        self._mind = AsyncMind(models, instruction, draw)
+        self._reasoner = RolloutReasoner(models, instruction, draw)
         self._expert, self._limits, self._step_s = expert, limits, models.artifacts.runtime.step_s
         self._number: int | None = None
         self._tokens = torch.empty(0)
@@ -40,49 +73,49 @@ class TailPilot:
 
     @property
     def semantic(self) -> Sequence[Floats]:
-        """Of each generation that was acted by."""
+        """See `RolloutPolicy`."""
         return self._semantic
 
     @property
     def failure(self) -> str | None:
-        """Why reasoning has ended for good."""
-        return self._mind.failure
+        """Why reasoning has ended for good; None while it continues."""
+        return self._reasoner.failure
 
-    def see(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
-        """Release what is due, encode the frame."""
-        return self._mind.see(time_s, image, T_odom_base)
+    def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
+        """See `RolloutReasoner.observe`."""
+        return self._reasoner.observe(time_s, image, T_odom_base)
 
     def choose(
         self, visual: Floats, state: tuple[float, ...], goal_m: tuple[float, float], time_s: float, T_odom_base: SE2
-    ) -> Chosen | None:
-        """None before the first semantic state; the goal is not looked at."""
-        semantic = self._mind.semantic
+    ) -> PolicyOutput | None:
+        """See `RolloutPolicy`; the goal is not used."""
+        semantic = self._reasoner.semantic
         if semantic is None:
             return None
         if semantic.generation != self._number:
             self._number = semantic.generation
             self._tokens = semantic_of(self._expert, torch.from_numpy(semantic.last_layer_kv))
             self._semantic.append(self._tokens[0].numpy().copy())
-        latency = self._mind.metadata(time_s, T_odom_base)
+        latency = self._reasoner.metadata(time_s, T_odom_base)
         now = now_of(self._expert, torch.from_numpy(visual), torch.tensor([state]), torch.tensor([latency]))
         x = prefix(self._expert, now, self._tokens)
         with torch.no_grad():
             mean = command_mean(tail(self._expert, x, now, self._tokens), self._step_s, self._limits)[0]
-        return Chosen(
+        return PolicyOutput(
             (float(mean[0]), float(mean[1])),
             x[0].numpy().copy(),
             latency,
             len(self._semantic) - 1,
-            self._mind.speed_scale(time_s),
+            self._reasoner.speed_scale(time_s),
         )
 
-    def think(self, time_s: float) -> None:
-        """Start the next generation if none is under way."""
-        self._mind.think(time_s)
+    def start_generation(self, time_s: float) -> None:
+        """Start the next generation unless one is running."""
+        self._reasoner.start_generation(time_s)
 
 
-class PointGoalPilot:
-    """The paper's RL baseline: frame, state and where the goal is; nothing to wait for."""
+class PointGoalRolloutPolicy:
+    """The paper's RL baseline, for one episode: it reads the frame, the robot state and the goal, and never waits."""
 
     semantic: Sequence[Floats] = ()
     failure: str | None = None
@@ -90,7 +123,7 @@ class PointGoalPilot:
     def __init__(self, vision: VisionEncoder, net: PointGoalNet, limits: CommandLimits, step_s: float) -> None:
         self._vision, self._net, self._limits, self._step_s = vision, net, limits, step_s
 
-    def see(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
+    def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
         """Encode the frame."""
         with torch.no_grad():
             tokens: Floats = self._vision(torch.from_numpy(image)[None]).numpy()
@@ -98,12 +131,12 @@ class PointGoalPilot:
 
     def choose(
         self, visual: Floats, state: tuple[float, ...], goal_m: tuple[float, float], time_s: float, T_odom_base: SE2
-    ) -> Chosen | None:
-        """Always something."""
+    ) -> PolicyOutput | None:
+        """See `RolloutPolicy`; never None."""
         with torch.no_grad():
             plan = self._net(torch.from_numpy(visual), torch.tensor([state]), torch.tensor([goal_m]))
             mean = command_mean(plan, self._step_s, self._limits)[0]
-        return Chosen((float(mean[0]), float(mean[1])))
+        return PolicyOutput((float(mean[0]), float(mean[1])))
 
-    def think(self, time_s: float) -> None:
-        """It does not."""
+    def start_generation(self, time_s: float) -> None:
+        """Do nothing: this policy has no language model."""

@@ -1,43 +1,261 @@
-"""Proximal policy optimisation with a clipped surrogate (Schulman et al. 2017), numbers from the paper's Table 9."""
+"""Proximal policy optimisation: advantages (GAE), the learners that are optimised, and the clipped update.
+
+Schulman et al. 2016 (generalised advantage estimation) and 2017 (clipped surrogate); constants from the paper's
+Table 9. A learner is one policy (the tail of the action expert, or the point-goal network) with the network's value
+function; the value network is the same for both and is always trained (paper Fig. 3b and appendix D).
+"""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from tools.train.config.rl import PpoConfig
+from export.model.action import ActionExpert
+from export.model.network import TicVla
+from tools.train.config.rl import LOG_STD_RANGE, PpoConfig
+from tools.train.imitate.point_goal_net import PointGoalNet
+from tools.train.rl.action_tail import freeze_all_but_tail, load_tail, now_of, padded, tail, tail_parameters
+from tools.train.rl.command_policy import CommandLimits, arc_command, entropy, log_prob, within_limits
+from tools.train.rl.rollout import GOAL_SCALE_M, Rollout
+
+Array = npt.NDArray[np.float64]
 
 
-class Learner(Protocol):
-    """What is optimised: a policy and a value function over the steps of a rollout, by their numbers."""
+# Advantages
+
+
+def advantages(
+    rewards: Array, values: Array, after: float, *, terminal: bool, gamma: float, lam: float
+) -> tuple[Array, Array]:
+    """Compute advantages and returns [S] of one episode by generalised advantage estimation.
+
+    `values` [S] belong to the states in which the S actions were taken, `after` to the state after the last action. An
+    episode that was cut off (`terminal` False) is continued by `after`; a terminal one has no future reward.
+    Raises ValueError if the shapes differ.
+    """
+    if rewards.shape != values.shape or rewards.ndim != 1:
+        raise ValueError(f"expected as many values as rewards, found {values.shape} and {rewards.shape}")
+    found = np.zeros(len(rewards), dtype=np.float64)
+    running, next_value = 0.0, 0.0 if terminal else after
+    for step in range(len(rewards) - 1, -1, -1):
+        error = rewards[step] + gamma * next_value - values[step]
+        running = error + gamma * lam * running
+        found[step] = running
+        next_value = values[step]
+    return found, found + values
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Advantage and return of every step of a rollout, [S] each."""
+
+    advantages: Tensor
+    returns: Tensor
+
+
+# Learners
+
+
+class ActorCritic(Protocol):
+    """A policy and a value function over the steps of a rollout; `rows` are step indices [B]."""
 
     @property
     def actor_parameters(self) -> Sequence[torch.nn.Parameter]:
-        """What `action_lr` moves."""
+        """Parameters that are updated with `action_lr`."""
         ...
 
     @property
     def critic_parameters(self) -> Sequence[torch.nn.Parameter]:
-        """What `value_lr` moves."""
+        """Parameters that are updated with `value_lr`."""
         ...
 
     def act(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-probabilities [B] of the actions taken, mean entropy [], and a penalty [] to add to the loss."""
+        """Return log-probabilities [B] of the recorded actions, the mean entropy [] and a penalty [] for the loss."""
         ...
 
     def value(self, rows: Tensor) -> Tensor:
-        """Values [B] of the states."""
+        """Return the values [B] of the states."""
         ...
+
+
+class Learner(ABC):
+    """A policy with the network's value function, trained on the rollout that `take` received last."""
+
+    def __init__(self, network: TicVla, limits: CommandLimits, log_std: Sequence[float]) -> None:
+        self.network = network.eval()
+        for part in (network.vision, network.language):
+            part.requires_grad_(False)
+        device = next(network.parameters()).device
+        self.log_std = torch.nn.Parameter(torch.tensor(log_std, dtype=torch.float32, device=device))
+        self._limits = limits
+        self._step_s = network.config.action.step_s
+        self._rollout: Rollout | None = None
+        self._tensors: dict[str, Tensor] = {}
+
+    @property
+    @abstractmethod
+    def policy_parameters(self) -> Mapping[str, torch.nn.Parameter]:
+        """Trained parameters of the policy by name, without `log_std`."""
+
+    @abstractmethod
+    def load_policy(self, tensors: Mapping[str, Tensor]) -> None:
+        """Replace the policy's weights."""
+
+    @abstractmethod
+    def arcs(self, rows: Tensor) -> Tensor:
+        """Compute the commands (v m/s, ω rad/s) [B, 2] of the steps' plans, before the robot's limits."""
+
+    def means(self, rows: Tensor) -> Tensor:
+        """Compute the mean commands (v m/s, ω rad/s) [B, 2] of steps, within the robot's limits."""
+        return within_limits(self.arcs(rows), self._limits)
+
+    def penalty(self, rows: Tensor, arc: Tensor) -> Tensor:
+        """Compute a penalty [] to add to the policy loss from the steps' `arcs`; zero unless overridden."""
+        return arc.new_zeros(())
+
+    @property
+    def actor_parameters(self) -> list[torch.nn.Parameter]:
+        """Parameters of the policy and of its exploration."""
+        return [*self.policy_parameters.values(), self.log_std]
+
+    @property
+    def critic_parameters(self) -> list[torch.nn.Parameter]:
+        """Parameters of the value network."""
+        return list(self.network.value.parameters())
+
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Copy the policy's weights to the CPU, by name."""
+        return {name: each.detach().cpu().clone() for name, each in self.policy_parameters.items()}
+
+    def take(self, rollout: Rollout) -> None:
+        """Set the rollout whose steps `rows` refer to."""
+        self._rollout = rollout
+        device = self.log_std.device
+        self._tensors = {name: torch.from_numpy(array).to(device) for name, array in rollout.arrays.items()}
+
+    def act(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `ActorCritic`. The penalty is computed only where gradients are."""
+        arc = self.arcs(rows)
+        mean = within_limits(arc, self._limits)
+        log_std = self.log_std.clamp(*LOG_STD_RANGE)
+        penalty = self.penalty(rows, arc) if torch.is_grad_enabled() else arc.new_zeros(())
+        return log_prob(self._tensors["action"][rows], mean, log_std), entropy(log_std), penalty
+
+    def value(self, rows: Tensor) -> Tensor:
+        """See `ActorCritic`."""
+        t = self._tensors
+        values: Tensor = self.network.value(t["visual"][rows], t["state"][rows], t["goal"][rows])
+        return values
+
+    def estimates(self, *, gamma: float, lam: float, reward_scale: float, batch: int = 256) -> Estimates:
+        """Estimate advantages and returns of the rollout with the current value network; rewards are scaled first."""
+        if self._rollout is None:
+            raise RuntimeError("estimates: expected a rollout to be taken first")
+        t, device = self._tensors, self.log_std.device
+        with torch.no_grad():
+            rows = torch.arange(self._rollout.steps, device=device)
+            values = torch.cat([self.value(part) for part in rows.split(batch)]).double().cpu().numpy()
+            after = self.network.value(t["after_visual"], t["after_state"], t["after_goal"]).double().cpu().numpy()
+        rewards = self._rollout.arrays["reward"].astype(np.float64) * reward_scale
+        found, returns = np.zeros(len(rewards)), np.zeros(len(rewards))
+        for steps, number, end in self._rollout.episodes():
+            found[steps], returns[steps] = advantages(
+                rewards[steps], values[steps], float(after[number]), terminal=end.terminal, gamma=gamma, lam=lam
+            )
+        return Estimates(torch.from_numpy(found).float().to(device), torch.from_numpy(returns).float().to(device))
+
+
+class TailLearner(Learner):
+    """Learner whose policy is the action expert's last cross-attention layer and head; earlier layers are frozen."""
+
+    def __init__(
+        self, network: TicVla, limits: CommandLimits, log_std: Sequence[float], *, imitation: float = 0.0
+    ) -> None:
+        """`imitation`: weight of a penalty on the distance from the arcs of the policy before this stage."""
+        super().__init__(network, limits, log_std)
+        freeze_all_but_tail(network.action)
+        self._imitation = imitation
+        self._reference = copy.deepcopy(network.action).requires_grad_(False) if imitation > 0 else None
+        self._semantic: list[Tensor] = []
+
+    @property
+    def policy_parameters(self) -> Mapping[str, torch.nn.Parameter]:
+        """Tail parameters under the action expert's names."""
+        return tail_parameters(self.network.action)
+
+    def load_policy(self, tensors: Mapping[str, Tensor]) -> None:
+        """Replace the tail's weights. Raises ActionTailError for those of another network."""
+        load_tail(self.network.action, tensors)
+
+    def take(self, rollout: Rollout) -> None:
+        """See `Learner.take`."""
+        super().take(rollout)
+        self._semantic = [torch.from_numpy(each).to(self.log_std.device) for each in rollout.semantic]
+
+    def arcs(self, rows: Tensor) -> Tensor:
+        """Compute arcs from the rollout's outputs of the frozen layers."""
+        return self._arcs(rows, self.network.action)
+
+    def penalty(self, rows: Tensor, arc: Tensor) -> Tensor:
+        """Compute the mean squared distance, in standard deviations, from the imitated policy's arcs.
+
+        Arcs, and not commands, are compared: beyond the robot's limits a command no longer changes, an arc does.
+        """
+        if self._reference is None:
+            return arc.new_zeros(())
+        with torch.no_grad():
+            wanted = self._arcs(rows, self._reference)
+            std = torch.exp(self.log_std.clamp(*LOG_STD_RANGE))
+        return self._imitation * (((arc - wanted) / std) ** 2).sum(-1).mean()
+
+    def _arcs(self, rows: Tensor, expert: ActionExpert) -> Tensor:
+        t = self._tensors
+        now = now_of(expert, t["visual"][rows], t["state"][rows], t["latency"][rows])
+        semantic, real = padded([self._semantic[number] for number in t["generation"][rows].tolist()])
+        trajectory = tail(expert, t["queries"][rows], now, semantic, real.to(semantic.device))
+        return arc_command(trajectory, self._step_s)
+
+
+class PointGoalLearner(Learner):
+    """Learner whose policy is the whole point-goal network over a frozen encoder (paper appendix D, RL baseline)."""
+
+    def __init__(self, network: TicVla, net: PointGoalNet, limits: CommandLimits, log_std: Sequence[float]) -> None:
+        super().__init__(network, limits, log_std)
+        network.action.requires_grad_(False)
+        self.net = net
+
+    @property
+    def policy_parameters(self) -> Mapping[str, torch.nn.Parameter]:
+        """All parameters of the point-goal network."""
+        return dict(self.net.named_parameters())
+
+    def load_policy(self, tensors: Mapping[str, Tensor]) -> None:
+        """Replace the weights. Raises RuntimeError for those of another network."""
+        self.net.load_state_dict(dict(tensors))
+
+    def arcs(self, rows: Tensor) -> Tensor:
+        """Compute arcs to the plan's point 1 s ahead."""
+        t = self._tensors
+        # The rollout stores goals in tens of metres, as the value network reads them.
+        plan = self.net(t["visual"][rows], t["state"][rows], GOAL_SCALE_M * t["goal"][rows])
+        return arc_command(plan, self._step_s)
+
+
+# Update
 
 
 @dataclass(frozen=True)
 class PpoStats:
-    """Of one update: means over its minibatches."""
+    """Means of one update over its minibatches."""
 
     policy_loss: float
     value_loss: float
@@ -46,29 +264,34 @@ class PpoStats:
     clipped: float
     """Share of steps whose ratio lay outside the clip."""
     skipped: int
-    """Minibatches whose gradient was not finite; nothing was learned from them."""
+    """Minibatches skipped because their gradient was not finite."""
     moved: int
-    """Minibatches that the policy was moved by."""
+    """Minibatches that updated the policy."""
 
 
 class PpoOptimiser:
-    """Two AdamW without decay, the policy's and the value function's."""
+    """Two Adam optimisers: one for the policy, one for the value function."""
 
-    def __init__(self, learner: Learner, config: PpoConfig) -> None:
+    def __init__(self, learner: ActorCritic, config: PpoConfig) -> None:
         self.config = config
         self.actor = torch.optim.Adam(learner.actor_parameters, lr=config.action_lr)
         self.critic = torch.optim.Adam(learner.critic_parameters, lr=config.value_lr)
 
     def update(
         self,
-        learner: Learner,
+        learner: ActorCritic,
         advantages: Tensor,
         returns: Tensor,
         generator: torch.Generator,
         *,
         policy: bool = True,
     ) -> PpoStats:
-        """Optimise over all steps of a rollout; `policy` False trains the value function alone (its warm-up)."""
+        """Optimise over all S steps of a rollout for `config.epochs` epochs.
+
+        `advantages` and `returns` [S]; `generator` shuffles the minibatches. With `policy` False only the value
+        function is trained (its warm-up). The policy is no longer updated once the KL divergence exceeds 1.5
+        `config.target_kl`.
+        """
         config, count = self.config, len(advantages)
         with torch.no_grad():
             old = torch.cat([learner.act(rows)[0] for rows in torch.arange(count).split(config.batch)])
@@ -107,7 +330,7 @@ class PpoOptimiser:
 def _step(
     optimiser: torch.optim.Optimizer, loss: Tensor, parameters: Sequence[torch.nn.Parameter], clip: float
 ) -> bool:
-    """One clipped update; False, and no update, where the gradient is not finite."""
+    """Apply one update with a clipped gradient; return False, without an update, if the gradient is not finite."""
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     norm = float(torch.nn.utils.clip_grad_norm_(list(parameters), clip))

@@ -1,52 +1,60 @@
 """Stage 3: reinforcement learning with asynchronous guidance (paper Algorithm 2, equation 5, Table 9, appendix D).
 
-Where this differs from the paper it says so: rollouts are whole episodes, each in a fresh simulator, instead of 1,024
-steps across them, so that a run resumes exactly and has the same result on any number of processes; rewards are scaled
-for the value network; a policy that does worse on fixed training scenes is taken back to its best; and the best, which
-was chosen there by numbers that are partly luck, replaces the policy it began with only if it is ahead on fresh ones.
+Differences from the paper:
+- Rollouts are whole episodes, each in a new simulator, instead of 1,024 steps across episodes. A run therefore resumes
+  exactly and has the same result with any number of processes.
+- Rewards are scaled for the value network.
+- A policy that becomes worse on fixed evaluation scenarios is reset to the best one.
+- The best policy was selected on noisy scores, so it replaces the first policy only if it is ahead on other scenarios.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 
 from edge.core.cli import write_whole
 from export.model.network import initialise
+from export.model.weights import weights_sha256
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
 from tools.train.config.recipe import Recipe
-from tools.train.config.rl import RlConfig
+from tools.train.config.rl import LOG_STD_RANGE, RlConfig
 from tools.train.config.scenes import TASKS_PER_SCENE
 from tools.train.imitate.point_goal_net import build_point_goal, save_point_goal
 from tools.train.rl.action_tail import check_tail
 from tools.train.rl.command_policy import CommandLimits
-from tools.train.rl.learners import Learner, PointGoalLearner, TailLearner
+from tools.train.rl.ppo import Learner, PointGoalLearner, PpoOptimiser, TailLearner
 from tools.train.rl.rollout import Rollout
-from tools.train.rl.state import ROLLOUTS, STAGE, RlError, Score, State
 from tools.train.rl.vector_env import drive
 from tools.train.rl.worker import RolloutOrder
+from tools.train.run import checkpoint
 from tools.train.run.exported import export_artifacts
 from tools.train.run.job import StageFailedError, StageJob
 from tools.train.run.network_file import START, finish_network, is_trained, read_network, weights_before
 from tools.train.scenes.scenarios import KEPT_SEEDS
 
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
-# Seeds of scenarios that no other stage draws: to learn from, to choose the best by, to say whether it is better.
+# Seeds of scenarios that no other stage uses, for evaluation (selects the best), training and the final comparison.
 _EVALUATION_SCENES, _SCENES, _FINAL_SCENES = KEPT_SEEDS[1:]
-_EVALUATION_TASKS: Final = 2  # of one layout: more layouts tell more than more tasks in one
+_EVALUATION_TASKS: Final = 2  # per layout: more layouts are more informative than more tasks in one
+STAGE: Final = "rl"
+ROLLOUTS: Final = "rollouts"
+_ROUNDING: Final = 1e-9
 STEPS_PER_EPISODE: Final = 300
-"""As a rule: 30 s. For the plan of a run alone."""
+"""Typical number (30 s at 10 Hz); used only to estimate a run's duration."""
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """(what, number of samples, key of the throughput) of a run of this stage."""
+    """Return (description, number of samples, key of the throughput table) of this stage's work."""
     config = recipe.rl
     if config is None:
         return []
@@ -58,11 +66,123 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 Drive = Callable[..., Rollout]
 
 
+class RlError(ValueError):
+    """No policy to improve, or a checkpoint of another run; one line."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Shares of an evaluation that drives the mean action: success, episodes with a collision, SPL."""
+
+    success: float
+    collided: float
+    spl: float
+
+    def ahead_of(self, other: Score, by: float = 0.0) -> bool:
+        """Return whether success is higher by more than `by`, or equal or higher with collisions lower by more."""
+        if self.success - other.success > by + _ROUNDING:
+            return True
+        return self.success >= other.success and other.collided - self.collided > by + _ROUNDING
+
+
+class State:
+    """State between iterations and its checkpoint: policy, value network, optimisers, first and best policy."""
+
+    def __init__(self, job: StageJob, learner: Learner, config: RlConfig) -> None:
+        self._job, self._learner, self._config = job, learner, config
+        self.optimiser = PpoOptimiser(learner, config.ppo)
+        folder = job.run_dir.stage(STAGE)
+        self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
+        numbers = asdict(config)
+        numbers.pop("jobs")
+        content = {
+            "rl": numbers,
+            "seed": job.seed,
+            "before": weights_sha256(learner.network),
+        }
+        self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        self.iteration = 0
+        self.steps = 0
+        self.first: Score | None = None
+        self.best: Score | None = None
+        self.improved = False
+        """Whether the best policy differs from the first one."""
+        self._kept: dict[str, dict[str, torch.Tensor]] = {}
+
+    def write_policy(self) -> Path:
+        """Write the current policy for the workers and return its path."""
+        log_std = [float(v) for v in self._learner.log_std.detach().clamp(*LOG_STD_RANGE)]
+        checkpoint.save(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
+        return self._policy
+
+    def begin(self) -> None:
+        """Keep the current policy as the start and as the best so far."""
+        self._kept = {name: self._learner.policy_tensors() for name in ("start", "best")}
+
+    def take(self, name: str) -> None:
+        """Load the policy `start` (the first one) or `best`."""
+        self._learner.load_policy(self._kept[name])
+
+    def judge(self, score: Score) -> bool:
+        """Keep a better policy as the best, or reset a much worse one to the best; return whether it was reset."""
+        assert self.best is not None
+        if score.success - self.best.success > self._config.keep_margin + _ROUNDING:
+            self.best, self.improved = score, True
+            self._kept["best"] = self._learner.policy_tensors()
+            return False
+        if not self.best.ahead_of(score, self._config.fall_back):
+            return False
+        self.take("best")
+        # The optimiser's moments point towards the policy that became worse.
+        self.optimiser = PpoOptimiser(self._learner, self._config.ppo)
+        return True
+
+    def save(self) -> None:
+        """Write the checkpoint of the finished iteration."""
+        learner, optimiser = self._learner, self.optimiser
+        tensors = {
+            **checkpoint.with_prefix("policy", learner.policy_tensors()),
+            **checkpoint.with_prefix("start", self._kept["start"]),
+            **checkpoint.with_prefix("best", self._kept["best"]),
+            **checkpoint.with_prefix("value", learner.network.value.state_dict()),
+            **checkpoint.with_prefix("actor", checkpoint.optimiser_tensors(optimiser.actor)),
+            **checkpoint.with_prefix("critic", checkpoint.optimiser_tensors(optimiser.critic)),
+            "log_std": learner.log_std.detach(),
+        }
+        scores = {name: asdict(score) for name in ("first", "best") if (score := getattr(self, name)) is not None}
+        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved, **scores}
+        checkpoint.save(self._path, tensors, meta)
+
+    def load(self) -> None:
+        """Resume from the checkpoint if requested and present. Raises RlError for another run's checkpoint."""
+        if not (self._job.resume and self._path.exists()):
+            self._job.run_dir.rewind(STAGE, -1)
+            shutil.rmtree(self._path.parent / ROLLOUTS, ignore_errors=True)
+            return
+        tensors, meta = checkpoint.load(self._path)
+        if meta["key"] != self._key:
+            raise RlError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
+        learner, optimiser = self._learner, self.optimiser
+        learner.load_policy(checkpoint.under("policy", tensors))
+        self._kept = {name: checkpoint.under(name, tensors) for name in ("start", "best")}
+        learner.network.value.load_state_dict(checkpoint.under("value", tensors))
+        checkpoint.restore_optimiser(optimiser.actor, checkpoint.under("actor", tensors))
+        checkpoint.restore_optimiser(optimiser.critic, checkpoint.under("critic", tensors))
+        learner.log_std.data.copy_(tensors["log_std"])
+        self.iteration, self.steps, self.improved = int(meta["iteration"]), int(meta["steps"]), bool(meta["improved"])
+        self.first, self.best = _score(meta.get("first")), _score(meta.get("best"))
+        self._job.run_dir.rewind(STAGE, self.iteration)
+
+
+def _score(content: Mapping[str, float] | None) -> Score | None:
+    return None if content is None else Score(**content)
+
+
 def run(job: StageJob) -> dict[str, Any]:
     """Improve the newest weights of the run. Raises RlError, ActionTailError, RolloutFailedError, KeyboardInterrupt."""
     if job.ranks.world > 1:
         raise RlError(
-            "torchrun: reinforcement learning shares its work among processes itself (rl.jobs); start it alone"
+            "torchrun: reinforcement learning starts its own processes (rl.jobs); run edge-train rl without torchrun"
         )
     config = job.recipe.rl or RlConfig()
     before = weights_before(job.run_dir.out, STAGE)
@@ -70,7 +190,7 @@ def run(job: StageJob) -> dict[str, Any]:
         raise RlError(f"{job.run_dir.out}: no policy to improve; run imitate first")
     imitated = before.parent.name == "imitate" or (before.parent.name == START and is_trained(before))
     if config.policy == "action" and not imitated:
-        raise RlError(f"{before}: its action expert has learned nothing yet; run imitate first")
+        raise RlError(f"{before}: the action expert is untrained; run imitate first")
     network = read_network(before, job.recipe.model, job.recipe.seed)
     initialise(network, job.seed, ("value",))
     network.to(job.device)
@@ -82,8 +202,8 @@ def run(job: StageJob) -> dict[str, Any]:
         result = improve(job, PointGoalLearner(network, net, limits, config.log_std), before, None)
         if result["kept"] == "start":
             raise StageFailedError(
-                f"rl: {config.iterations} iterations made nothing that drives better than chance; give it more "
-                "(rl.iterations), other steps (rl.ppo.action_lr) or more to explore (rl.log_std), in a new --out"
+                f"rl: no policy is better than the untrained one after {config.iterations} iterations; try more "
+                "(rl.iterations), another rate (rl.ppo.action_lr) or exploration (rl.log_std), in a new --out"
             )
         save_point_goal(net, folder / POINT_GOAL_FILE, f"edge-train {job.recipe.name}, seed {job.recipe.seed}, rl")
         return result
@@ -98,7 +218,10 @@ def run(job: StageJob) -> dict[str, Any]:
 def improve(
     job: StageJob, learner: Learner, before: Path, artifacts: Path | None, drive: Drive = drive
 ) -> dict[str, Any]:
-    """Train the learner's policy and value network in place; gives its scores. Ends with the best, or as it began."""
+    """Train the learner's policy and value network in place and return the stage's result.
+
+    The policy ends as the best one, or as the first one if the best is not ahead on the final scenarios.
+    """
     config = job.recipe.rl or RlConfig()
     state = State(job, learner, config)
     orders = _Orders(job, config, before, artifacts)
@@ -135,7 +258,7 @@ def improve(
 
 
 def _choose(job: StageJob, config: RlConfig, orders: _Orders, state: State, drive: Drive) -> dict[str, Any]:
-    """End with the best if it is ahead of the policy it began with on scenarios that have chosen nothing."""
+    """Load the best policy if it is ahead of the first one on scenarios that selected nothing, else the first."""
     if not state.improved:
         state.take("start")
         return {"kept": "start", "final": {}}
@@ -146,7 +269,7 @@ def _choose(job: StageJob, config: RlConfig, orders: _Orders, state: State, driv
     kept = "best" if scores["best"].ahead_of(scores["start"]) else "start"
     state.take(kept)
     before, after = scores["start"].success, scores["best"].success
-    job.progress.say(f"on fresh scenarios: success {before:g} before, {after:g} after; the {kept} is kept")
+    job.progress.say(f"final scenarios: success {before:g} before, {after:g} after; kept policy: {kept}")
     return {"kept": kept, "final": {name: asdict(score) for name, score in scores.items()}}
 
 
@@ -159,7 +282,7 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
         "steps": float(rollout.steps),
     }
     if rollout.steps < config.ppo.batch:
-        return numbers  # hardly a semantic state came: nothing to learn from
+        return numbers  # almost no semantic state arrived: too few steps for a minibatch
     state.steps += rollout.steps
     learner.take(rollout)
     ppo = config.ppo
@@ -171,14 +294,14 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
 
 
 def _driven(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Rollout:
-    """An order's episodes, each told as it ends: an iteration takes minutes."""
+    """Drive the episodes of an order and show progress after each: an iteration takes minutes."""
     ended: list[bool] = []
 
-    def told(success: bool) -> None:
+    def finished(success: bool) -> None:
         ended.append(success)
         job.progress.update(len(ended), len(order.numbers), success=sum(ended) / len(ended))
 
-    return drive(order, jobs=config.jobs, per_job=config.episodes_per_job, told=told, stopped=job.should_stop)
+    return drive(order, jobs=config.jobs, per_job=config.episodes_per_job, finished=finished, stopped=job.should_stop)
 
 
 def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Score:
@@ -194,9 +317,9 @@ def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive
 
 
 def _gained(job: StageJob, config: RlConfig) -> dict[str, Any]:
-    """The last policy's evaluation less the first's, episode by episode, with 95 % intervals over their layouts.
+    """Compare the last policy's evaluation with the first's per episode: differences and 95 % intervals over layouts.
 
-    Neither was chosen by it. Empty where a run that was begun by an older version has not told its first one.
+    Neither policy was selected by these scores. Empty if an older version started the run without the first file.
     """
     folder = job.run_dir.stage(STAGE) / ROLLOUTS
     files = [folder / f"{_evaluation_name(iteration)}.json" for iteration in (0, config.iterations)]
@@ -219,7 +342,7 @@ def _evaluation_name(iteration: int) -> str:
 
 @dataclass(frozen=True)
 class _Orders:
-    """What workers are told."""
+    """Makes the workers' orders of one run."""
 
     job: StageJob
     config: RlConfig
@@ -227,19 +350,19 @@ class _Orders:
     artifacts: Path | None
 
     def training(self, iteration: int, policy: Path) -> RolloutOrder:
-        """Exploring, on the iteration's scenarios."""
+        """Make the order of an iteration's exploring episodes."""
         seed = int(self.job.rng("rollout", iteration).integers(2**31))
         out = self.job.run_dir.stage(STAGE) / ROLLOUTS / f"{iteration:05d}"
         numbers, kinds = self.config.numbers(iteration), self.config.kinds(iteration)
         return self._order(policy, out, _SCENES, numbers, kinds, seed, TASKS_PER_SCENE, explore=True)
 
     def evaluation(self, iteration: int, policy: Path) -> RolloutOrder:
-        """The mean action, always on the same scenarios, all kinds of the rotation."""
+        """Make the order of an evaluation: the mean action, always on the same scenarios, all kinds of the rotation."""
         out = self.job.run_dir.stage(STAGE) / ROLLOUTS / _evaluation_name(iteration)
         return self._mean(policy, out, _EVALUATION_SCENES, self.config.evaluate_episodes)
 
     def final(self, name: str, policy: Path) -> RolloutOrder:
-        """The same on scenarios that no evaluation has."""
+        """Make the order of a final comparison: the mean action on scenarios that no evaluation uses."""
         out = self.job.run_dir.stage(STAGE) / ROLLOUTS / f"final-{name}"
         return self._mean(policy, out, _FINAL_SCENES, self.config.final_episodes)
 

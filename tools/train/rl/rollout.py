@@ -1,6 +1,6 @@
-"""What a rollout keeps of the steps it has driven: everything the optimisation needs, the frozen parts computed once.
+"""Recorded steps of rollouts: everything that PPO needs, with the outputs of frozen layers computed once.
 
-One safetensors file a job, over S steps of E episodes and G generations: no pickle between processes.
+Each worker job writes one safetensors file with S steps of E episodes and G generations.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from safetensors.numpy import save_file
 
 FORMAT: Final = "tic-vla-edge-rollout/1"
 GOAL_SCALE_M: Final = 10.0
+"""Unit of goal coordinates for the value network, m."""
 GOAL_FARTHEST_M: Final = 40.0
+"""Goals farther away are clipped to this distance for the value network, m."""
 
 Floats = npt.NDArray[np.float32]
 
 
 class RolloutError(ValueError):
-    """A rollout that is not whole; one line."""
+    """A rollout file that is incomplete or inconsistent; one line."""
 
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """How one driven episode came out. `terminal`: reached or fallen; otherwise it was cut off."""
+    """Outcome of one driven episode. `terminal`: the goal was reached or the robot fell; otherwise it was cut off."""
 
     id: str
     kind: str
@@ -45,25 +47,25 @@ class EpisodeEnd:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """What a pilot would do: the mean command (v m/s, ω rad/s), and what optimisation needs beside what was seen."""
+class PolicyOutput:
+    """A policy's mean command (v m/s, ω rad/s) in one control period, and what PPO needs beside the observation."""
 
     mean: tuple[float, float]
     queries: Floats | None = None
     latency: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     generation: int = 0
     speed_scale: float = 1.0
-    """Share of the limits that the runner would leave: less where the last answer is too old."""
+    """Share of the speed limits, 0 to 1, that the robot's monitor leaves; below 1 if the semantic state is too old."""
 
 
 @dataclass
 class EpisodeSteps:
-    """One episode while it is driven; a step is one control period that had a semantic state to act by."""
+    """Steps of one episode while it is driven; a step is one control period with a semantic state to act on."""
 
     visual: list[Floats] = field(default_factory=list)
-    """[N, D] a step."""
+    """Visual tokens [N, D] of each step."""
     queries: list[Floats] = field(default_factory=list)
-    """[steps, hidden] a step, before the last layer; none of a policy without one."""
+    """Queries [steps, hidden] of each step before the last layer; empty for a policy without such a layer."""
     state: list[tuple[float, ...]] = field(default_factory=list)
     latency: list[tuple[float, ...]] = field(default_factory=list)
     goal: list[tuple[float, float]] = field(default_factory=list)
@@ -72,7 +74,7 @@ class EpisodeSteps:
     generation: list[int] = field(default_factory=list)
     """Index into `semantic`."""
     semantic: list[Floats] = field(default_factory=list)
-    """[T, hidden] a generation."""
+    """Semantic tokens [T, hidden] of each generation."""
     after_visual: Floats | None = None
     after_state: tuple[float, ...] = (0.0, 0.0, 0.0)
     after_goal: tuple[float, float] = (0.0, 0.0)
@@ -87,9 +89,9 @@ class EpisodeSteps:
         goal: tuple[float, float],
         action: tuple[float, float],
         reward: float,
-        chosen: Chosen,
+        chosen: PolicyOutput,
     ) -> None:
-        """Keep a step that was acted in."""
+        """Append a step in which the policy acted."""
         self.visual.append(visual)
         self.state.append(state)
         self.goal.append(goal)
@@ -102,14 +104,14 @@ class EpisodeSteps:
 
 
 def goal_features(x_m: float, y_m: float) -> tuple[float, float]:
-    """A goal in the robot frame as the value network is told it: clipped to 40 m, in tens of metres."""
+    """Convert a goal in the robot frame to the value network's input: clipped to 40 m, in tens of metres."""
     distance = float(np.hypot(x_m, y_m))
     share = min(1.0, GOAL_FARTHEST_M / max(distance, 1e-9)) / GOAL_SCALE_M
     return (x_m * share, y_m * share)
 
 
 def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> None:
-    """Write a job's episodes in one rename; episodes without a step are kept by their end alone."""
+    """Write a job's episodes atomically; of an episode without steps only its end is written."""
     driven = [steps for steps, _ in episodes if len(steps)]
     arrays: dict[str, npt.NDArray[Any]] = {}
     if driven:
@@ -139,7 +141,7 @@ def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> Non
 
 @dataclass(frozen=True)
 class Rollout:
-    """All steps of one iteration, episodes one after the other. Shapes as in `EpisodeSteps`, stacked over S steps."""
+    """All steps of one iteration, episode after episode. Shapes as in `EpisodeSteps`, stacked over S steps."""
 
     arrays: dict[str, npt.NDArray[Any]]
     semantic: tuple[Floats, ...]
@@ -151,7 +153,7 @@ class Rollout:
         return len(self.arrays["reward"]) if self.arrays else 0
 
     def episodes(self) -> Iterator[tuple[slice, int, EpisodeEnd]]:
-        """Steps of each driven episode, its number in `after_*`, and how it ended."""
+        """Yield each episode that has steps: its slice of steps, its row in `after_*`, and its end."""
         start = number = 0
         for end in self.ends:
             if end.steps:
@@ -160,7 +162,7 @@ class Rollout:
 
 
 def read(paths: Sequence[Path]) -> Rollout:
-    """The jobs' files as one rollout, in the order given. Raises RolloutError, OSError."""
+    """Read the jobs' files as one rollout, in the order given. Raises RolloutError, OSError."""
     parts: list[dict[str, npt.NDArray[Any]]] = []
     semantic: list[Floats] = []
     ends: list[EpisodeEnd] = []
@@ -176,7 +178,7 @@ def read(paths: Sequence[Path]) -> Rollout:
         parts.append(arrays)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
     if joined and sum(end.steps for end in ends) != len(joined["reward"]):
-        raise RolloutError(f"rollout {paths[0].parent}: its episodes and its steps do not agree")
+        raise RolloutError(f"rollout {paths[0].parent}: the number of steps differs from the sum over its episodes")
     return Rollout(joined, tuple(semantic), tuple(ends))
 
 
@@ -191,7 +193,7 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], list[EpisodeEnd]]:
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, RolloutError):
             raise
-        raise RolloutError(f"rollout {path}: not whole ({error})") from error
+        raise RolloutError(f"rollout {path}: not readable ({error})") from error
 
 
 def _rows(driven: Sequence[EpisodeSteps], name: str) -> Floats:

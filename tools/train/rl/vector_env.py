@@ -1,4 +1,4 @@
-"""Many episodes at a time: orders for worker processes, whose rollout files are read in the order of the orders."""
+"""Driving many episodes at a time in worker processes, whose rollout files are read in a fixed order."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _POLL_S: Final = 0.5
 
 
 class RolloutFailedError(StageFailedError):
-    """A worker that ended without a rollout; one line."""
+    """A worker process that ended without a rollout; one line."""
 
 
 def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
-    """One order as several of at most `per_job` episodes, each with its own file below `order.out`.
+    """Split an order into orders of at most `per_job` episodes, each with its own file below `order.out`.
 
-    Each knows where its episodes are in the whole order, so that no two of it are driven by the same chance.
+    Each part keeps the position of its episodes in the whole order, so that every episode has its own random seed.
     """
     return [
         replace(
@@ -43,13 +43,14 @@ def drive(
     *,
     jobs: int,
     per_job: int,
-    told: Callable[[bool], None] = lambda success: None,
+    finished: Callable[[bool], None] = lambda success: None,
     stopped: Callable[[], bool] = lambda: False,
     command: Sequence[str] = COMMAND,
 ) -> Rollout:
-    """Drive an order's episodes; files of jobs that have finished before are kept.
+    """Drive an order's episodes; files of jobs that have finished before are reused.
 
-    Raises RolloutFailedError, KeyboardInterrupt when `stopped`. How many jobs there are changes nothing.
+    `finished` takes for each episode whether it succeeded. The number of jobs does not change the result. Raises
+    RolloutFailedError, KeyboardInterrupt when `stopped`.
     """
     folder = Path(order.out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -66,7 +67,7 @@ def drive(
                 workers.start(stem, part.to_json(), folder / f"{stem}.log")
             for line in workers.wait(_POLL_S):
                 if line.message is not None:
-                    told(bool(line.message["success"]))
+                    finished(bool(line.message["success"]))
                 elif line.why:
                     raise RolloutFailedError(f"rollout {line.key}: {line.why}")
     finally:

@@ -1,1 +1,1 @@
-"""The folder and the processes of a training run: stage jobs, ranks, checkpoints, optimiser, weights between stages."""
+"""Folder and processes of a training run: stage jobs, ranks, checkpoints, optimiser, weights between stages."""

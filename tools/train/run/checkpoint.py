@@ -1,4 +1,4 @@
-"""Where a stage has got to, in one safetensors file: tensors, and JSON in its header. Never pickle."""
+"""Checkpoints of a stage as one safetensors file: tensors, and JSON in its header. Pickle is never used."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -18,14 +17,14 @@ _KEYS: Final = ("format", "meta")
 
 
 class CheckpointFileError(ValueError):
-    """A checkpoint that is not whole or not ours; one line."""
+    """A file that is damaged or not a checkpoint; one line."""
 
 
 def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, object]) -> None:
-    """Write tensors (any device, kept dtype) and JSON in one rename; raises OSError and leaves the old file."""
+    """Write tensors (any device, dtype kept) and JSON atomically. On OSError the old file remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    # Clones: safetensors refuses tensors that share memory, such as tied weights.
+    # Clone, because safetensors refuses tensors that share memory, such as tied weights.
     whole = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
     try:
         save_file(whole, str(partial), metadata={"format": FORMAT, "meta": json.dumps(meta, sort_keys=True)})
@@ -37,9 +36,9 @@ def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, obj
 
 
 def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors on the CPU and the JSON that `save` was given; raises CheckpointFileError, OSError if there is none."""
+    """Read the tensors, on the CPU, and the JSON of a checkpoint. Raises CheckpointFileError, FileNotFoundError."""
     if not path.is_file():
-        raise FileNotFoundError(f"checkpoint {path}: not there")
+        raise FileNotFoundError(f"checkpoint {path}: not found")
     try:
         with safe_open(str(path), framework="pt") as file:
             header = file.metadata() or {}
@@ -50,21 +49,21 @@ def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     except (SafetensorError, KeyError, ValueError) as error:
         if isinstance(error, CheckpointFileError):
             raise
-        raise CheckpointFileError(f"checkpoint {path}: damaged ({error}); delete it to begin anew") from error
+        raise CheckpointFileError(f"checkpoint {path}: damaged ({error}); delete it to start again") from error
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Tensors renamed to `prefix.name`."""
+    """Rename tensors to `prefix.name`."""
     return {f"{prefix}.{name}": tensor for name, tensor in tensors.items()}
 
 
 def under(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors named `prefix.name`, as `name`."""
+    """Return the tensors named `prefix.name` as `name`."""
     return {name[len(prefix) + 1 :]: tensor for name, tensor in tensors.items() if name.startswith(prefix + ".")}
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
-    """The moments and step counts of an optimiser as `INDEX.name`; its options come from the recipe, not from here."""
+    """Return an optimiser's moments and step counts as `INDEX.name`; its options come from the recipe."""
     state = optimiser.state_dict()["state"]
     return {
         f"{index}.{name}": value if isinstance(value, torch.Tensor) else torch.tensor(value)
@@ -74,30 +73,10 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, torch.Tenso
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor]) -> None:
-    """The inverse of `optimiser_tensors`, for an optimiser over the same parameters in the same order."""
+    """Load what `optimiser_tensors` returned into an optimiser over the same parameters in the same order."""
     state: dict[int, dict[str, torch.Tensor]] = {}
     for key, tensor in tensors.items():
         index, _, name = key.partition(".")
         state.setdefault(int(index), {})[name] = tensor.clone()
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": state, "param_groups": groups})
-
-
-def generator_tensor(generator: torch.Generator) -> torch.Tensor:
-    """State of a torch generator, uint8."""
-    return generator.get_state()
-
-
-def restore_generator(generator: torch.Generator, state: torch.Tensor) -> None:
-    """Set a torch generator to a saved state."""
-    generator.set_state(state)
-
-
-def rng_meta(rng: np.random.Generator) -> dict[str, object]:
-    """State of a numpy generator as JSON."""
-    return dict(rng.bit_generator.state)
-
-
-def restore_rng(rng: np.random.Generator, meta: Mapping[str, object]) -> None:
-    """Set a numpy generator to a saved state."""
-    rng.bit_generator.state = dict(meta)

@@ -1,4 +1,4 @@
-"""Pictures of a run's numbers: one a stage, losses above, rates and everything else below."""
+"""Plots of a run's log, one per stage: losses on top, then rates and the other values."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from matplotlib.figure import Figure
 from tools.train.run.run_dir import RunDir
 
 Series = dict[str, list[tuple[int, float]]]
-"""(step, value) by the name of a number."""
+"""(step, value) pairs by the name of the value."""
 LOG_RATIO: Final = 20.0
-"""Losses that fall by more than this are drawn on a logarithmic axis."""
+"""Ratio of largest to smallest loss above which the axis is logarithmic."""
 COLOURS: Final = ("#1f6f8b", "#d1603d", "#8a5fbf", "#2c8c4a", "#b8860b", "#5b6774")
 SMOOTH: Final = 40
-"""Points that a jagged line is averaged over where it has many times more."""
+"""Points of the moving average that is drawn over long noisy lines."""
 
 
 def draw_curves(run_dir: RunDir) -> list[Path]:
-    """Write `curves/STAGE.png` for every stage in the log; returns their paths."""
+    """Write `curves/STAGE.png` for every stage in the log and return the paths."""
     written = []
     for stage, series in stages_of(run_dir).items():
         if not any(len(points) > 1 for points in series.values()):
@@ -34,7 +34,7 @@ def draw_curves(run_dir: RunDir) -> list[Path]:
 
 
 def stages_of(run_dir: RunDir) -> dict[str, Series]:
-    """Every number of the log by stage and name, in the order of its steps; what is not finite is left out."""
+    """Return the log's finite values by stage and name, in the order of the steps."""
     stages: dict[str, Series] = {}
     for line in run_dir.lines():
         series = stages.setdefault(str(line["stage"]), {})
@@ -46,7 +46,7 @@ def stages_of(run_dir: RunDir) -> dict[str, Series]:
 
 
 def panels_of(names: Sequence[str]) -> list[list[str]]:
-    """Names that share an axis: losses, shares between 0 and 1 or percent, and each other number by itself."""
+    """Group names by axis: losses, shares, and every other value on its own axis."""
     losses = [name for name in names if "loss" in name]
     rates = [name for name in names if name not in losses and any(part in name for part in _RATES)]
     return [group for group in (losses, rates, *([name] for name in names if name not in (*losses, *rates))) if group]
@@ -56,7 +56,7 @@ _RATES: Final = ("success", "accuracy", "share", "collided", "recall", "precisio
 
 
 def draw(title: str, series: Mapping[str, Sequence[tuple[int, float]]], path: Path) -> None:
-    """One picture; the same numbers give the same picture."""
+    """Draw one plot as a PNG file that depends on the values alone."""
     panels = panels_of(list(series))
     figure = Figure(figsize=(8.0, 1.0 + 2.2 * len(panels)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -80,7 +80,7 @@ def draw(title: str, series: Mapping[str, Sequence[tuple[int, float]]], path: Pa
 
 
 def smoothed(values: Sequence[float]) -> list[float]:
-    """Each value's mean with those before it, up to SMOOTH of them."""
+    """Return the moving average over up to SMOOTH values."""
     sums = [0.0]
     for value in values:
         sums.append(sums[-1] + value)

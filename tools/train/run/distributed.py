@@ -1,7 +1,7 @@
-"""One process of several under torchrun: its share of a global batch, and gradients weighted by what was in it.
+"""Distributed training under torchrun: each rank's share of a global batch, and gradients weighted by its size.
 
-A stage that draws its batches from `BatchOrder` and averages through `Ranks` gives the same losses on any number of
-processes: the order of samples is one global permutation, and a mean is taken over the whole batch, not of means.
+A stage that draws batches from `BatchOrder` and averages through `Ranks` has the same losses with any number of
+processes: samples are ordered by one global permutation, and means are taken over the whole batch.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ import torch.distributed as dist
 from numpy.typing import NDArray
 
 _PATIENCE: Final = timedelta(days=7)
-"""How long ranks wait for one another: one may record drives for hours. torchrun ends them all when one dies."""
+"""Timeout of collective operations: the first rank may record drives for hours. torchrun ends all ranks if one dies."""
 
 
 class EndedEarlyError(RuntimeError):
-    """The first rank has not finished what the others waited for; its own line says why."""
+    """The first rank failed while the others waited; its own message says why."""
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process (`rank`) among `world`; with one process nothing is sent anywhere."""
+    """This process's `rank` among `world` processes; a single process communicates with no other."""
 
     rank: int = 0
     world: int = 1
 
     @property
     def first(self) -> bool:
-        """Whether this process writes files, logs and pictures."""
+        """Whether this process writes files, logs and plots."""
         return self.rank == 0
 
     def share(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
-        """This rank's part of a global batch of indices, every `world`-th from `rank` on."""
+        """Return this rank's part of a global batch of indices: every `world`-th from `rank` on."""
         return batch[self.rank :: self.world]
 
     def average_gradients(self, parameters: Iterable[torch.nn.Parameter], weight: float = 1.0) -> float:
-        """Replace gradients of this rank's *mean* loss over `weight` samples by those of the whole batch's mean.
+        """Replace the gradients of this rank's mean loss over `weight` samples by those of the whole batch's mean.
 
-        Returns the weight of all ranks together. A rank whose share is empty takes part with weight 0.
+        Returns the sum of the weights of all ranks. A rank with an empty share takes part with weight 0.
         """
         parameters = list(parameters)
         if self.world == 1:
@@ -61,7 +61,7 @@ class Ranks:
         return total
 
     def sum(self, value: float) -> float:
-        """A number added over ranks."""
+        """Return the sum of a value over the ranks."""
         if self.world == 1:
             return value
         whole = torch.tensor([value], dtype=torch.float64, device=_device())
@@ -69,13 +69,13 @@ class Ranks:
         return float(whole.item())
 
     def mean(self, value: float, weight: float = 1.0) -> float:
-        """A number averaged over ranks by weight."""
+        """Return the weighted mean of a value over the ranks."""
         if self.world == 1:
             return value
         return self.sum(value * weight) / max(self.sum(weight), 1e-12)
 
     def any(self, flag: bool) -> bool:
-        """Whether it is so on any rank."""
+        """Return whether the flag is set on any rank."""
         return flag if self.world == 1 else self.sum(float(flag)) > 0
 
     def barrier(self) -> None:
@@ -85,9 +85,9 @@ class Ranks:
 
     @contextmanager
     def by_first(self) -> Iterator[bool]:
-        """True where the work is to be done, on the first rank; the others wait at the end of the block.
+        """Yield True on the first rank, which does the work; the others wait at the end of the block.
 
-        Raises EndedEarlyError on those where the first one's work has raised.
+        Raises EndedEarlyError on the other ranks if the first rank's work raised an error.
         """
         if not self.first:
             yield False
@@ -97,13 +97,13 @@ class Ranks:
         try:
             yield True
         except BaseException:
-            with suppress(RuntimeError):  # the others may be gone; what has happened here is what counts
+            with suppress(RuntimeError):  # the others may have ended; the error raised here matters more
                 self.any(True)
             raise
         self.any(False)
 
     def copy_parameters(self, parameters: Iterable[torch.Tensor]) -> None:
-        """Give every rank the first one's values."""
+        """Copy the first rank's values to every rank."""
         if self.world > 1:
             for each in parameters:
                 dist.broadcast(each.detach(), src=0)
@@ -114,7 +114,7 @@ SINGLE = Ranks()
 
 @contextmanager
 def ranks_of_environment(device: str = "cpu") -> Iterator[Ranks]:
-    """Join the processes that torchrun has started (gloo; NCCL for cuda); alone without torchrun."""
+    """Join the processes that torchrun started (gloo, or NCCL for cuda); yields SINGLE without torchrun."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         yield SINGLE
@@ -127,15 +127,15 @@ def ranks_of_environment(device: str = "cpu") -> Iterator[Ranks]:
         options["backend"] = "gloo"
     dist.init_process_group(**options)
     yield Ranks(dist.get_rank(), world)
-    # Not after an error: NCCL would wait here for those who wait for this process, which is about to end.
+    # Not after an error: NCCL would wait here for ranks that wait for this process.
     dist.destroy_process_group()
 
 
 def leave(code: int) -> NoReturn:
-    """End this process, whose work is done, without Python's own ending.
+    """End this process without Python's own shutdown.
 
-    There, a thread of gloo's that still lets go of a tensor aborts the process now and then ("terminate called without
-    an active exception"), and torchrun takes a finished run for a failed one.
+    During shutdown, a gloo thread that still releases a tensor sometimes aborts the process ("terminate called without
+    an active exception"); torchrun would then report a finished run as failed.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -157,16 +157,16 @@ class BatchOrder:
 
     @property
     def steps_per_epoch(self) -> int:
-        """Batches of one pass over the samples."""
+        """Number of batches of one epoch."""
         return -(-self.count // self.batch)
 
     @property
     def steps(self) -> int:
-        """Batches in all."""
+        """Total number of batches."""
         return self.steps_per_epoch * self.epochs
 
     def indices(self, step: int) -> NDArray[np.int64]:
-        """int64 sample indices of the global batch of `step`, from 0; any step without the ones before it."""
+        """Return the sample indices, int64, of the global batch of `step`, which counts from 0."""
         epoch, within = divmod(step, self.steps_per_epoch)
         order = np.random.default_rng((self.seed, 0xBA7C, epoch)).permutation(self.count)
         return order[within * self.batch : (within + 1) * self.batch].astype(np.int64)

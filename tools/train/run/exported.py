@@ -1,4 +1,4 @@
-"""Artifacts of a run's weights, made by `edge-export` in a process of its own: it is what a robot would be given."""
+"""Artifacts of a run's weights, made by `edge-export` in a separate process, as for a robot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def export_artifacts(
     say: Callable[[str], None] = lambda line: None,
     command: Sequence[str] = COMMAND,
 ) -> Path:
-    """Export into `out` unless it holds these weights already; raises ExportError, KeyboardInterrupt."""
+    """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
     digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
     if (out / MANIFEST_NAME).is_file() and mark.is_file():
         if json.loads(mark.read_text(encoding="utf-8")).get("weights_sha256") == digest:
@@ -38,7 +38,7 @@ def export_artifacts(
         mark.unlink()
     out.parent.mkdir(parents=True, exist_ok=True)
     arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
-    say(f"exporting {weights.parent.name} to drive with it")
+    say(f"exporting the weights of stage {weights.parent.name}")
     log = out.with_name(out.name + ".log")
     with log.open("wb") as output:
         code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
@@ -52,7 +52,7 @@ def export_artifacts(
 
 
 def model_argument(config: TicVlaConfig, out: Path) -> str:
-    """What `--model` names the network by: a preset, or a file written beside `out`."""
+    """Return the value of `--model`: a preset's name, or the path of a file that is written beside `out`."""
     for name, preset in PRESETS.items():
         if preset == config:
             return name

@@ -1,4 +1,4 @@
-"""The network between stages: each begins with the weights of the one before it and leaves its own."""
+"""Weights between stages: each stage starts with those of the previous one and writes its own."""
 
 from __future__ import annotations
 
@@ -20,37 +20,38 @@ from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
 
 START: Final = "start"
-"""Folder of weights that were there before the first stage."""
+"""Folder of weights that the run started with."""
 START_CARD: Final = "card.md"
-"""Beside them: the model card that they had."""
+"""Their model card, in the same folder."""
 CARD: Final = "MODEL_CARD.md"
-"""Of a run, beside its weights."""
+"""Model card of a run, beside its weights."""
 ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
-"""Where weights come from, in the order in which they do."""
+"""Folders with weights, in the order of the stages."""
 FILE: Final = "model.safetensors"
 SHARED: Final = ("vision", "language")
-"""What ablations of the action expert have in common."""
+"""Parts that ablations of the action expert share."""
 
 
 class NetworkFileError(ValueError):
-    """Weights that a stage cannot begin with; one line: what, expected, found."""
+    """Weights that a stage cannot start with; one line: what, expected, found."""
 
 
 def stage_weights(out: Path, stage: str) -> Path:
-    """Where a stage of the run in `out` leaves the whole network."""
+    """Return the path of a stage's weights in the run `out`."""
     return out / stage / FILE
 
 
 def weights_before(out: Path, stage: str) -> Path | None:
-    """The newest weights of what comes before `stage`; None where there are none."""
+    """Return the newest weights from before `stage`; None if there are none."""
     earlier = ORDER[: ORDER.index(stage)] if stage in ORDER else ORDER
     return next((path for name in reversed(earlier) if (path := stage_weights(out, name)).is_file()), None)
 
 
 def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], seed: int) -> Path:
-    """Begin a run with somebody's weights; an action expert that they lack is of the seed. Raises CheckpointError.
+    """Convert given weights to the run's start weights; a missing action expert is initialised from the seed.
 
-    An ablation of what the action expert hears goes on from weights of ours that heard it, and the other way round.
+    Weights of edge-train with other inputs of the action expert (`latency_aware`, `motion_offset`) are accepted.
+    Returns the path. Raises CheckpointError.
     """
     path = stage_weights(out, START)
     loaded = load_checkpoint(checkpoints, _as_written(checkpoints, config), fill_seed=seed)
@@ -61,25 +62,25 @@ def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], s
 
 
 def _as_written(checkpoints: Sequence[Path], config: TicVlaConfig) -> TicVlaConfig:
-    """The configuration; where a file of ours differs only in what its action expert hears, that one's."""
+    """Return a file's configuration if it differs only in the action expert's inputs, else `config`."""
     for path in checkpoints:
         try:
             with safe_open(str(path), framework="pt") as file:
                 found = config_from_dict(json.loads((file.metadata() or {})["config"])).action
         except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError):
-            continue  # not of ours; the one who loads it says what is wrong with it
-        if _hearing(found) == _hearing(config.action):
+            continue  # another format; loading it reports what is wrong
+        if _with_all_inputs(found) == _with_all_inputs(config.action):
             return replace(config, action=found)
     return config
 
 
-def _hearing(action: ActionConfig) -> ActionConfig:
-    """An action expert that is told all: what it is not told reaches the same tensors as zeros."""
+def _with_all_inputs(action: ActionConfig) -> ActionConfig:
+    """Enable all inputs of an action expert: a disabled input is a zero for the same tensors."""
     return replace(action, latency_aware=True, motion_offset=True)
 
 
 def card_of(weights: Path) -> str | None:
-    """The model card beside weights of ours: the one that states this very file's hash; None where there is none."""
+    """Return the model card beside weights that states their hash; None if there is none."""
     if not weights.is_file():
         return None
     digest = file_sha256(weights)
@@ -94,16 +95,16 @@ def card_of(weights: Path) -> str | None:
 
 
 def is_trained(weights: Path) -> bool:
-    """Whether all of the network in a file of ours has been trained. Raises NetworkFileError."""
+    """Return whether the whole network in a file was trained. Raises NetworkFileError."""
     try:
         with safe_open(str(weights), framework="pt") as file:
             return (file.metadata() or {}).get("trained") == "true"
     except (OSError, SafetensorError) as error:
-        raise NetworkFileError(f"{weights}: not weights of ours ({error})") from error
+        raise NetworkFileError(f"{weights}: not weights of edge-train ({error})") from error
 
 
 def start_network(job: StageJob, stage: str) -> TicVla:
-    """The network that a stage begins with: of the stages before it, else of the recipe's seed; on the CPU.
+    """Load the network of the previous stage, or initialise one from the recipe's seed; on the CPU.
 
     Raises NetworkFileError for weights of another network.
     """
@@ -114,25 +115,25 @@ def start_network(job: StageJob, stage: str) -> TicVla:
 
 
 def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
-    """A network from a file of ours. An action expert or value network of other numbers begins from the seed.
+    """Load a network; an action expert or value network of another configuration is initialised from the seed.
 
-    What an action expert hears is no such number: ablations of it begin with the same weights as the whole.
+    The action expert's inputs do not count as configuration: ablations of them start with the same weights.
 
-    Raises NetworkFileError where encoder or language model are others.
+    Raises NetworkFileError if encoder or language model differ.
     """
     model = build(config, seed)
     try:
         with safe_open(str(path), framework="pt") as file:
             found = config_from_dict(json.loads((file.metadata() or {})["config"]))
-            theirs, ours = (replace(of, action=_hearing(of.action)) for of in (found, config))
+            theirs, ours = (replace(of, action=_with_all_inputs(of.action)) for of in (found, config))
             same = [part for part in PARTS if getattr(theirs, part) == getattr(ours, part)]
             if other := sorted(set(SHARED) - set(same)):
-                raise NetworkFileError(f"{path}: its {other[0]} is not the recipe's; train from the beginning")
+                raise NetworkFileError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
     except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError) as error:
         if isinstance(error, NetworkFileError):
             raise
-        raise NetworkFileError(f"{path}: not weights of ours ({error})") from error
+        raise NetworkFileError(f"{path}: not weights of edge-train ({error})") from error
     wanted = {name for name in model.state_dict() if name.split(".")[0] in same}
     if set(tensors) != wanted:
         odd = sorted(set(tensors) ^ wanted)
@@ -142,7 +143,7 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
 
 
 def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
-    """Leave the network as this stage's, and as the run's `model.safetensors`; call it on the first rank only."""
+    """Write the network as this stage's weights and as the run's `model.safetensors`; for the first rank alone."""
     path = stage_weights(job.run_dir.out, stage)
     origin = f"edge-train {job.recipe.name}, seed {job.recipe.seed}, after {stage}"
     save_weights(model, path, WeightsInfo(trained=True, origin=origin))

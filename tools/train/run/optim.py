@@ -1,4 +1,4 @@
-"""AdamW with warm-up, cosine decay and clipped gradients (paper Table 8), and bf16 where it is asked for."""
+"""AdamW with warm-up, cosine decay and clipped gradients (paper Table 8), and bfloat16 on request."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tools.train.run.distributed import SINGLE, Ranks
 
 
 class Optimiser:
-    """AdamW over parameters for a known number of steps; what it needs to go on exactly is `tensors` and `step`."""
+    """AdamW over parameters for a known number of steps; `tensors` and `restore` resume it exactly."""
 
     def __init__(
         self, parameters: Iterable[torch.nn.Parameter], config: OptimConfig, total_steps: int, ranks: Ranks = SINGLE
@@ -25,7 +25,7 @@ class Optimiser:
         self.step_count = 0
         self._ranks = ranks
         self.parameters = [each for each in parameters if each.requires_grad]
-        # Gains and biases are not weights: decay would pull them off their meaning.
+        # No weight decay for gains and biases.
         decayed = [each for each in self.parameters if each.ndim >= 2]
         others = [each for each in self.parameters if each.ndim < 2]
         groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
@@ -39,13 +39,13 @@ class Optimiser:
         return learning_rate(self.config, self.step_count, self.total_steps)
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Reset the gradients."""
         self._adam.zero_grad(set_to_none=True)
 
     def step(self, weight: float = 1.0) -> float:
-        """One update from the gradients of this rank's mean loss over `weight` samples; returns their norm.
+        """Update once from the gradients of this rank's mean loss over `weight` samples; return the gradient norm.
 
-        Gradients are averaged over ranks and clipped first; a norm that is not finite skips the update.
+        Gradients are averaged over ranks and clipped first; if the norm is not finite, the update is skipped.
         """
         self._ranks.average_gradients(self.parameters, weight)
         norm = float(torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip))
@@ -58,18 +58,18 @@ class Optimiser:
         return norm
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Moments and the step, for a checkpoint."""
+        """Return the moments and the step for a checkpoint."""
         count = torch.tensor(self.step_count, dtype=torch.int64)
         return {**checkpoint.with_prefix("adam", checkpoint.optimiser_tensors(self._adam)), "step_count": count}
 
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Go on from what `tensors` gave."""
+        """Resume from what `tensors` returned."""
         self.step_count = int(tensors["step_count"])
         checkpoint.restore_optimiser(self._adam, checkpoint.under("adam", tensors))
 
 
 def learning_rate(config: OptimConfig, step: int, total_steps: int) -> float:
-    """Linear warm-up over at most a tenth of the run, then half a cosine down to `final_lr_share`."""
+    """Return the rate at a step: linear warm-up for at most a tenth of the run, then a cosine to `final_lr_share`."""
     warmup = min(config.warmup_steps, total_steps // 10)
     if step < warmup:
         return config.lr * (step + 1) / warmup
@@ -79,14 +79,14 @@ def learning_rate(config: OptimConfig, step: int, total_steps: int) -> float:
 
 
 def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
-    """bfloat16 where `bf16` says so and the device computes in it; float32 otherwise."""
+    """Return a context for bfloat16 if `bf16` is set and the device supports it, else for float32."""
     kind = torch.device(device).type
     return torch.autocast(kind, dtype=torch.bfloat16) if bf16 and computes_bf16(kind) else nullcontext()
 
 
 @cache
 def computes_bf16(device: str) -> bool:
-    """Whether the device has instructions for bfloat16: emulated it takes twelve times as long as float32."""
+    """Return whether the device has bfloat16 instructions: emulation takes twelve times as long as float32."""
     if torch.device(device).type != "cpu":
         return True
     found = torch.cpu.get_capabilities()

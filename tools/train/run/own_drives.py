@@ -1,4 +1,4 @@
-"""Which drives a run learns from: all of its own or those of the newest round, or another data set's instead."""
+"""Selection of a run's drives: all of its own, those of the newest DAgger round, or an imported data set."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tools.train.run.run_dir import RunDir, RunDirError
 
 _PARTIAL: Final = "collect.partial"
 IMPORTED: Final = "imported"
-"""In the result of `collect`: the drives are not this repository's expert's."""
+"""Key in the result of `collect`: the drives were imported."""
 
 
 def prefixes_of(round_number: int) -> tuple[str, str]:
-    """How the ids of a round's drives begin, the policy's and the expert's; rounds count from 1."""
+    """Return the id prefixes of a round's drives, the policy's and the expert's; rounds count from 1."""
     return f"d{round_number}-", f"n{round_number}-"
 
 
 def drives_after(job: StageJob, stage: str) -> Dataset:
-    """The drives that a stage learns from: all, or those of the newest round (`dagger.newest_only`). Raises DriveError.
+    """Return the drives that a stage trains on: all, or those of the newest round (`dagger.newest_only`).
 
-    Before the first round those are the same.
+    Raises DriveError.
     """
     dataset, rounds = Dataset.open(job.run_dir.stage("collect")), job.run_dir.retired(stage)
     if rounds and job.recipe.dagger.newest_only:
@@ -34,17 +34,17 @@ def drives_after(job: StageJob, stage: str) -> Dataset:
 
 
 def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
-    """Make the data set in `folder` the run's own, and its stage `collect` done; files are linked where they can be.
+    """Import the data set in `folder` as the result of the run's stage `collect`; files are hard-linked if possible.
 
-    All or nothing: an interrupted call leaves no drives. Raises DriveError for a data set that is not whole,
-    RunDirError where the run has other drives.
+    An interrupted call leaves no drives. Returns the stage's result. Raises DriveError for a damaged data set,
+    RunDirError if the run has other drives.
     """
     dataset = Dataset.open(folder)
     done = run_dir.result("collect")
     if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
         return done
     if run_dir.begun("collect"):
-        raise RunDirError(f"--drives {folder}: {run_dir.out} has drives that are others; name another --out")
+        raise RunDirError(f"--drives {folder}: {run_dir.out} has other drives; name another --out")
     Dataset.open(folder, verify=True)
     partial = run_dir.out / _PARTIAL
     shutil.rmtree(partial, ignore_errors=True)
@@ -61,5 +61,5 @@ def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
 def _link_or_copy(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # another disk, or one without links
+    except OSError:  # another file system, or one without hard links
         shutil.copyfile(source, target)

@@ -1,4 +1,4 @@
-"""Batches made in another thread while the network computes."""
+"""Preparation of batches in another thread while the network computes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Generic, TypeVar
 Made = TypeVar("Made")
 
 DEPTH = 2
-"""Steps that are made ahead: more would only take memory, a step computes longer than it is made."""
+"""Batches prepared in advance; more would only take memory, because a step computes longer than its batch takes."""
 
 
 class Ahead(Generic[Made]):
-    """What `make(step)` gives for one step after the other; errors come out where the step is asked for."""
+    """Runs `make(step)` in advance for consecutive steps; its errors are raised by `at`."""
 
     def __init__(self, make: Callable[[int], Made]) -> None:
         self._make = make
@@ -22,14 +22,14 @@ class Ahead(Generic[Made]):
         self._coming: dict[int, Future[Made]] = {}
 
     def at(self, step: int, total: int) -> Made:
-        """Step `step` of `total`, with the next ones begun."""
+        """Return the result of step `step` of `total` and start the next ones."""
         for number in range(step, min(step + 1 + DEPTH, total)):
             if number not in self._coming:
                 self._coming[number] = self._pool.submit(self._make, number)
         return self._coming.pop(step).result()
 
     def rest(self) -> None:
-        """Wait until nothing is being made: what `make` reads is not for two threads at a time."""
+        """Wait until no call of `make` is running, because its inputs are not thread-safe."""
         wait(self._coming.values())
 
     def __enter__(self) -> Ahead[Made]:

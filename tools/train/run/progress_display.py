@@ -1,4 +1,4 @@
-"""How far a stage is, on standard error: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a stage on standard error: a bar on a terminal, otherwise a line from time to time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tools.train.run.job import PlainProgress, QuietProgress, StageProgress
 
 
 class StageBar(AbstractContextManager["StageBar"]):
-    """A bar with the newest numbers behind it; a `StageProgress`."""
+    """A progress bar with the newest values; a `StageProgress`."""
 
     def __init__(self, stage: str, console: Console) -> None:
         self._stage, self._console = stage, console
@@ -43,19 +43,19 @@ class StageBar(AbstractContextManager["StageBar"]):
         """Move the bar."""
         if self._task is None:
             self._task, self._total = self._bar.add_task("", total=total, completed=done), total
-        if total != self._total:  # a stage may do one thing after another
+        if total != self._total:  # a stage may have several parts
             self._bar.reset(self._task, total=total)
             self._total = total
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
-        self._bar.update(self._task, completed=done, total=total, description=shown)
+        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=done, total=total, description=values)
 
     def say(self, line: str) -> None:
-        """A line above the bar."""
+        """Write a line above the bar."""
         self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
 
 
 class _Lines(AbstractContextManager[StageProgress]):
-    """Something that needs no end, where one is expected."""
+    """Context manager around a progress that needs no cleanup."""
 
     def __init__(self, progress: StageProgress) -> None:
         self._progress = progress
@@ -70,7 +70,7 @@ class _Lines(AbstractContextManager[StageProgress]):
 def progress_for(
     stage: str, *, quiet: bool = False, stream: TextIO | None = None
 ) -> AbstractContextManager[StageProgress]:
-    """The progress of a stage as this standard error can show it; quiet on all ranks but the first."""
+    """Return the progress display for a stage: a bar, lines, or with `quiet` nothing."""
     if quiet:
         return _Lines(QuietProgress())
     console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The folder of a training run: recipe, versions, a folder a stage, the log of numbers and the weights."""
+"""The folder of a training run: recipe, versions, one folder per stage, the log and the weights."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from tools.train.run.optim import computes_bf16
 VERSIONS: Final = "versions.json"
 TIMINGS: Final = "timings.json"
 SHARED_PARTS: Final = ("vision", "language")
-"""Of the network: what another run's encoder and language model are used in."""
+"""Parts of the network that --from takes from another run."""
 PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "tokenizers", "panda3d", "pybullet")
-"""Whose versions decide what a run gives."""
+"""Packages whose versions affect a run's result."""
 
 
 class RunDirError(ValueError):
-    """A folder that is not the run that was asked for; one line: what, expected, found."""
+    """A folder that is not the requested run; one line: what, expected, found."""
 
 
 class RunDir:
@@ -37,25 +37,25 @@ class RunDir:
 
     @staticmethod
     def open(out: Path, recipe: Recipe) -> RunDir:
-        """Make the folder, or go on with the run in it; raises RunDirError if it holds another run.
+        """Create the folder or reopen the run in it. Raises RunDirError if it contains another run.
 
-        Stages may be started one by one, and numbers of a stage that has not begun may still be changed.
+        The configuration of a stage that has not started may still be changed.
         """
         run_dir = RunDir(out)
         if run_dir.recipe_path.exists():
             if changed := run_dir._changed(recipe):
                 raise RunDirError(
-                    f"{out}: was begun with other numbers ({changed}); name another --out, or leave them as they were"
+                    f"{out}: was started with another recipe ({changed}); name another --out, or restore the values"
                 )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise RunDirError(f"{out}: expected a new or empty directory, or one that edge-train has made")
+            raise RunDirError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
         out.mkdir(parents=True, exist_ok=True)
         run_dir._note_versions()
         write_whole(run_dir.recipe_path, recipe.to_toml())
         return run_dir
 
     def _note_versions(self) -> None:
-        """What the run began with, and below `later` whatever else it went on with."""
+        """Write the versions that the run started with, and under `later` those that it was continued with."""
         path, now = self.out / VERSIONS, versions()
         first = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
         later = [] if first is None else first.get("later", [])
@@ -68,7 +68,7 @@ class RunDir:
         write_whole(path, json.dumps(first, indent=1) + "\n")
 
     def _changed(self, recipe: Recipe) -> str:
-        """The first number of what has begun that differs from the recipe's; empty: none."""
+        """Return the first value of a started stage that differs from the recipe's; empty if none does."""
         found, asked = load_recipe(str(self.recipe_path)).to_tables(), recipe.to_tables()
         begun = [name for name in STAGES if self.begun(name)]
         fixed = [*begun, *(("seed", "name", "model") if begun else ())]
@@ -80,41 +80,41 @@ class RunDir:
         return ""
 
     def begun(self, stage: str) -> bool:
-        """Whether a stage has left anything."""
+        """Return whether a stage has written files."""
         folder = self.out / stage
         return folder.is_dir() and any(folder.iterdir())
 
     def borrow(self, other: RunDir, stages: Sequence[str], recipe: Recipe) -> None:
-        """Use finished stages of another run as they are, by links; raises RunDirError if they would be others here."""
+        """Link finished stages of another run. Raises RunDirError if this recipe would give other results."""
         if not other.recipe_path.exists():
-            raise RunDirError(f"--from {other.out}: holds no run of edge-train")
+            raise RunDirError(f"--from {other.out}: not a run folder of edge-train")
         found, asked = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
         for stage in stages:
             if other.result(stage) is None:
-                raise RunDirError(f"--from {other.out}: its stage {stage} has not finished")
+                raise RunDirError(f"--from {other.out}: stage {stage} has not finished")
             if difference := _difference(stage, found[stage], asked[stage]):
-                raise RunDirError(f"--from {other.out}: was trained with other numbers ({difference})")
+                raise RunDirError(f"--from {other.out}: was trained with another recipe ({difference})")
         for part in SHARED_PARTS:
             if difference := _difference(f"model.{part}", found["model"][part], asked["model"][part]):
-                raise RunDirError(f"--from {other.out}: its {part} is another one ({difference})")
+                raise RunDirError(f"--from {other.out}: its {part} differs ({difference})")
         for stage in stages:
             link = self.out / stage
             if not link.exists():
                 link.symlink_to(os.path.relpath((other.out / stage).resolve(), self.out.resolve()))
 
     def borrowed(self, stage: str) -> bool:
-        """Whether a stage is another run's."""
+        """Return whether a stage belongs to another run."""
         return (self.out / stage).is_symlink()
 
     def retire(self, stage: str, name: str) -> None:
-        """Keep what a stage has left, and its lines of the log, under another name: the stage is to be done again."""
+        """Keep a stage's files and log lines under another name, so that the stage can run again."""
         (self.out / stage).rename(self.out / name)
         lines = [{**line, "stage": name} if line["stage"] == stage else line for line in self.lines()]
         if lines:
             write_whole(self.log_path, "".join(json.dumps(line) + "\n" for line in lines))
 
     def retired(self, stage: str) -> int:
-        """How often a stage was kept aside, to go on after a round of DAgger."""
+        """Return how often a stage was retired to continue after a DAgger round."""
         number = 0
         while self.begun(f"{stage}-{number}"):
             number += 1
@@ -122,45 +122,45 @@ class RunDir:
 
     @property
     def recipe_path(self) -> Path:
-        """Every number of the run."""
+        """Path of the run's recipe with all values."""
         return self.out / "recipe.toml"
 
     @property
     def model_path(self) -> Path:
-        """The whole network's weights, as of the last stage that finished."""
+        """Path of the network's weights after the last finished stage."""
         return self.out / "model.safetensors"
 
     @property
     def log_path(self) -> Path:
-        """One JSON object a line: `{"stage", "step", numbers…}`."""
+        """Path of the log, one JSON object per line: `{"stage", "step", values…}`."""
         return self.out / "log.jsonl"
 
     @property
     def curves(self) -> Path:
-        """Folder of the pictures."""
+        """Folder of the plots."""
         return self.out / "curves"
 
     def stage(self, name: str) -> Path:
-        """Folder of a stage, made if it is not there."""
+        """Return the folder of a stage; create it if needed."""
         folder = self.out / name
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     def log(self, stage: str, step: int, **numbers: float) -> None:
-        """Append one line of numbers of a stage's step (called by rank 0 only)."""
+        """Append one line with the values of a stage's step; for the first rank alone."""
         line = json.dumps({"stage": stage, "step": step, **numbers})
         with self.log_path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
 
     def rewind(self, stage: str, step: int) -> None:
-        """Forget a stage's lines after `step`: a resumed stage writes them again."""
+        """Remove a stage's lines after `step`: a resumed stage writes them again."""
         lines = list(self.lines())
         kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
         if len(kept) != len(lines):
             write_whole(self.log_path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def lines(self) -> Iterator[dict[str, Any]]:
-        """The log's lines in order; half a line at the end, of a process that was killed, is left out."""
+        """Yield the log's lines in order; an incomplete last line is left out."""
         if not self.log_path.exists():
             return
         for line in self.log_path.read_text(encoding="utf-8").splitlines():
@@ -170,37 +170,37 @@ class RunDir:
                 continue
 
     def timings(self) -> dict[str, float]:
-        """Seconds that each step has taken so far, all its resumptions together."""
+        """Return the seconds that each step has taken, including resumed parts."""
         path = self.out / TIMINGS
         return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
 
     def add_time(self, step: str, seconds: float) -> None:
-        """Count time to a step."""
+        """Add to the time of a step."""
         timings = self.timings()
         timings[step] = round(timings.get(step, 0.0) + seconds, 1)
         write_whole(self.out / TIMINGS, json.dumps(timings, indent=1) + "\n")
 
     def result(self, stage: str) -> dict[str, Any] | None:
-        """What a finished stage gave; None if it has not finished."""
+        """Return the result of a finished stage; None if it has not finished."""
         path = self.out / stage / "result.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def finish(self, stage: str, result: Mapping[str, object]) -> None:
-        """Say that a stage is done, and what it gave."""
+        """Write the result of a stage, which marks it as finished."""
         write_whole(self.stage(stage) / "result.json", json.dumps(result, indent=1, sort_keys=True) + "\n")
 
 
 def _difference(where: str, found: object, asked: object) -> str:
-    """`where.key: A there, B asked for` of the first difference of two tables; empty: there is none."""
+    """Describe the first difference of two tables as `where.key: found A, recipe B`; empty if they are equal."""
     if isinstance(found, Mapping) and isinstance(asked, Mapping):
-        keys = sorted({*found, *asked} - {"jobs"})  # how many processes worked on it changes nothing
+        keys = sorted({*found, *asked} - {"jobs"})  # the number of processes does not change the result
         return next((d for key in keys if (d := _difference(f"{where}.{key}", found.get(key), asked.get(key)))), "")
     same = json.dumps(found) == json.dumps(asked)
-    return "" if same else f"{where}: {json.dumps(found)} there, {json.dumps(asked)} asked for"
+    return "" if same else f"{where}: found {json.dumps(found)}, recipe {json.dumps(asked)}"
 
 
 def versions() -> dict[str, Any]:
-    """Of everything that decides what a run gives, and the machine it ran on."""
+    """Return the versions of everything that affects a run's result, and properties of the machine."""
     found: dict[str, str | None] = {}
     for package in PACKAGES:
         try:
@@ -218,7 +218,7 @@ def versions() -> dict[str, Any]:
 
 
 def _training_sha256() -> str:
-    """Of the sources and recipes that training consists of, beside what it simulates with."""
+    """Hash the sources and recipes of the training code."""
     digest = hashlib.sha256()
     for root in (Path(__file__).parents[1], Path(model.__path__[0])):
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".json")):

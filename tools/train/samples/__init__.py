@@ -1,1 +1,1 @@
-"""From recorded drives to training samples: anchors, batches, cached tokens and semantic states."""
+"""Training samples from recorded drives: anchors, batches, cached visual tokens and semantic states."""

@@ -1,9 +1,8 @@
-"""The action expert over many frames at once, some of which share a semantic state: `ActionExpert.forward`'s numbers.
+"""The action expert on batches of frames that share semantic states, with the results of `ActionExpert.forward`.
 
-A semantic state costs more than the rest of a sample, so frames that act on one state share its keys and values. States
-differ in length: they are padded on the left and the padding is masked, which leaves every row what it is alone. What
-is dropped out comes with the batch instead of from a generator of the network's own, so that a sample is the same in
-whatever batch, process or resumed run it comes.
+A semantic state costs more than the rest of a sample, so frames with the same state share its keys and values. States
+of different length are padded on the left and the padding is masked, which does not change a row's result. Dropout
+masks are part of the batch, so that a sample is the same in every batch, process and resumed run.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Around:
-    """What is solid about g frames' robots, as `tools.train.scenes.walls` measures it: which no policy is given.
+    """Walls around the robot in g frames (`tools.train.scenes.walls`), ground truth that no policy receives.
 
-    `patches` f16 [g, rows, columns] m, `body` f32 [g, 2] reach and radius, m.
+    `patches` f16 [g, rows, columns], clearance in m; `body` f32 [g, 2], reach and radius in m.
     """
 
     patches: NDArray[np.float16]
@@ -37,13 +36,13 @@ class Around:
 
 @dataclass(frozen=True)
 class Group:
-    """g frames of one drive that act on one semantic state.
+    """g frames of one drive that share one semantic state.
 
-    `visual_tokens` f16 [g, N, D] of each frame; `state` [g, 3] vx m/s, vy m/s, wz rad/s; `latency` [g, 4] dt s, dx m,
-    dy m, dtheta rad; `guidance` [1, T, kv_dim] K‖V that all share, or waypoints [g, 3, 2] m, each in its frame;
-    `goal` [g, 2] m in the robot's frame, which only a point-goal policy may see; `keep_guidance` [1 or g, T] and
-    `keep_state` [g] are False where training drops a token. The label: `target` [g, steps, 3] x m, y m, theta rad
-    (not wrapped) in the robot's frame, of which `known` [g, steps].
+    - `visual_tokens` f16 [g, N, D]; `state` [g, 3] vx m/s, vy m/s, wz rad/s; `latency` [g, 4] Δt s, Δx m, Δy m, Δθ rad.
+    - `guidance`: shared K‖V [1, T, kv_dim], or waypoints [g, 3, 2] m, each in its robot frame.
+    - `goal` [g, 2] m in the robot frame, for point-goal policies alone.
+    - `keep_guidance` [1 or g, T] and `keep_state` [g]: False where dropout removes a token.
+    - Label: `target` [g, steps, 3] x m, y m, theta rad (not wrapped) in the robot frame; `known` [g, steps].
     """
 
     visual_tokens: NDArray[np.float16]
@@ -56,34 +55,34 @@ class Group:
     target: Array
     known: NDArray[np.bool_]
     around: Around | None = None
-    """Where plans are to keep off walls."""
+    """Walls, if the loss uses them."""
 
 
 @dataclass(frozen=True)
 class ActionBatch:
-    """Groups of equally many frames on a device, B frames in all; as `Group`, with [B] for [g] and padded guidance."""
+    """Groups of equal size on a device, B frames in total; fields as in `Group`, [B] for [g], with padded guidance."""
 
     visual_tokens: Tensor
     state: Tensor
     latency: Tensor
     guidance: Tensor
-    """[S, T, width] float, zeros behind each state's end; B is a multiple of S."""
+    """[S, T, width] float, zeros at padded tokens on the left; B is a multiple of S."""
     real: Tensor
-    """[S, T] bool: what of `guidance` is not padding."""
+    """[S, T] bool: tokens of `guidance` that are not padding."""
     goal: Tensor
     keep_guidance: Tensor
     keep_state: Tensor
     target: Tensor
     known: Tensor
     around: tuple[Tensor, Tensor] | None = None
-    """Patches and bodies, if the groups have any."""
+    """Patches and bodies, if the groups have walls."""
 
     def __len__(self) -> int:
         return len(self.state)
 
 
 def collate(groups: Sequence[Group], device: torch.device) -> ActionBatch:
-    """Groups of one size as a batch; a frame's place is its group's times the size, plus its own in it."""
+    """Combine groups of equal size g; frame i of group j is row j g + i. Raises ValueError for mixed walls."""
     longest = max(group.guidance.shape[1] for group in groups)
 
     def joined(name: str) -> Tensor:
@@ -125,24 +124,24 @@ def _around(near: Sequence[Around], device: torch.device) -> tuple[Tensor, Tenso
 
 @dataclass(frozen=True)
 class SharedTrunk:
-    """`export.model.action.Trunk` over S semantic states, each of which B/S frames in a row share."""
+    """`export.model.action.Trunk` with S semantic states, each shared by B/S consecutive frames."""
 
     layers: tuple[CrossAttentionLayer, ...]
     key_values: tuple[KeyValue, ...]
     now: tuple[tuple[Tensor, Tensor], ...]
-    """Keys and values of the present, of each layer, [B, heads, N + 2, d]."""
+    """Keys and values of each layer for frame, state and latency, [B, heads, N + 2, d]."""
     semantic: tuple[tuple[Tensor, Tensor], ...]
-    """Of the semantic states, [S, heads, T, d]."""
+    """Keys and values of each layer for the semantic states, [S, heads, T, d]."""
     real: Tensor
     """[S, T] bool, False at padding."""
 
     @property
     def batch(self) -> int:
-        """B."""
+        """Number of frames B."""
         return len(self.now[0][0])
 
     def __call__(self, x: Tensor, *, among: bool = False) -> Tensor:
-        """Tokens [B, steps, hidden] through all layers; `among`: they also attend to one another."""
+        """Run tokens [B, steps, hidden] through all layers; with `among` they also attend to one another."""
         for layer, key_value, now, semantic in zip(self.layers, self.key_values, self.now, self.semantic, strict=True):
             if among:
                 own = key_value(layer.norm1(x))
@@ -152,9 +151,9 @@ class SharedTrunk:
 
 
 def trunk(action: ActionExpert, batch: ActionBatch) -> SharedTrunk:
-    """The network's layers over a batch. The network is in evaluation mode: what is dropped out is the batch's."""
+    """Prepare the network's layers for a batch. Raises ValueError unless the network is in evaluation mode."""
     if action.training:
-        raise ValueError("the action expert must be in evaluation mode: it would drop out tokens by itself")
+        raise ValueError("expected the action expert in evaluation mode: dropout masks come with the batch")
     semantic = action.semantic_tokens(batch.guidance) * batch.keep_guidance[..., None]
     now = action.now_tokens(batch.visual_tokens, batch.state, batch.latency)
     # The last two are the robot's state and the latency.
@@ -170,17 +169,17 @@ def trunk(action: ActionExpert, batch: ActionBatch) -> SharedTrunk:
 
 
 def plan(action: ActionExpert, batch: ActionBatch) -> Tensor:
-    """Planned trajectories [B, steps, 3] (x m, y m, theta rad), each in its frame's robot frame."""
+    """Compute trajectories [B, steps, 3] (x m, y m, theta rad), each in its robot frame."""
     layers = trunk(action, batch)
     if action.config.action.head != "query":
         return action.plan(layers)
     found = action.head(action.norm(layers(action.queries.expand(len(batch), -1, -1))))
-    # Summed in float32 whatever the network computes in: thirty steps of bfloat16 would add up to centimetres.
+    # Sum in float32: thirty steps in bfloat16 would accumulate centimetres of error.
     return integrated(action.out(found).float(), action.config.action.parameterisation)
 
 
 def errors(action: ActionExpert, batch: ActionBatch, generator: torch.Generator) -> Tensor:
-    """What another head than `query` learns by, for every frame [B]."""
+    """Compute the objective of a head other than `query` for every frame [B]."""
     terms = action.errors(trunk(action, batch), batch.target, generator)
     return (terms.sum(-1) * batch.known).mean(1)
 
@@ -188,7 +187,7 @@ def errors(action: ActionExpert, batch: ActionBatch, generator: torch.Generator)
 def _layer(
     layer: CrossAttentionLayer, x: Tensor, now: tuple[Tensor, Tensor], semantic: tuple[Tensor, Tensor], real: Tensor
 ) -> Tensor:
-    """`CrossAttentionLayer.forward` with keys and values of S states that B/S frames each share."""
+    """Compute `CrossAttentionLayer.forward` with keys and values of S states, each shared by B/S frames."""
     batch, steps, _ = x.shape
     states, heads, tokens, width = semantic[0].shape
     share = batch // states
@@ -206,19 +205,19 @@ def _layer(
 
 
 def _shared(x: Tensor, share: int) -> Tensor:
-    """[S·share, heads, steps, d] → [S, heads, share·steps, d]: frames of one state as rows of one product."""
+    """Reshape [S·share, heads, steps, d] to [S, heads, share·steps, d]: frames of a state as rows of one product."""
     rows: Tensor = x.unflatten(0, (-1, share))
     return rows.transpose(1, 2).flatten(2, 3)
 
 
 def _own(x: Tensor, share: int) -> Tensor:
-    """The inverse of `_shared`."""
+    """Invert `_shared`."""
     rows: Tensor = x.unflatten(2, (share, -1))
     return rows.transpose(1, 2).flatten(0, 1)
 
 
 def smooth_l1(planned: Tensor, batch: ActionBatch, *, beta: float, heading_weight: float) -> Tensor:
-    """Equation 4 for every frame [B]: steps that are not known count as met; the heading's error counts by weight."""
+    """Compute equation 4 for every frame [B]; unknown steps have no error, heading errors are weighted."""
     terms = F.smooth_l1_loss(planned.float(), batch.target, reduction="none", beta=beta)
     terms = terms * terms.new_tensor([1.0, 1.0, heading_weight])
     return (terms.sum(-1) * batch.known).mean(1)

@@ -1,7 +1,6 @@
-"""Pictures as other cameras would have taken them: light, colour, blur, noise and JPEG; never mirrored.
+"""Image augmentation: light, colour, blur, noise and JPEG, as from other cameras.
 
-Left and right mean something to a navigator, and a shifted picture would lie about where things are: what is changed
-here is only how a view looks.
+Images are neither mirrored nor shifted, because left, right and position matter for navigation.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ Picture = NDArray[np.uint8]
 
 
 def augmented(picture: Picture, config: AugmentConfig, rng: np.random.Generator) -> Picture:
-    """A picture [height, width, 3] changed as `rng` draws; the one that is given stays as it is."""
+    """Return a randomly changed copy of an image [height, width, 3]."""
     turned = rng.uniform(-1.0, 1.0, 5)
     chance = rng.uniform(size=3)
     amount = rng.uniform(size=3)
@@ -37,21 +36,21 @@ def augmented(picture: Picture, config: AugmentConfig, rng: np.random.Generator)
 
 
 def encoded(picture: Picture, quality: int) -> NDArray[np.uint8]:
-    """The bytes of a picture [height, width, 3] RGB as JPEG."""
+    """Encode an RGB image [height, width, 3] as JPEG bytes. Raises ValueError."""
     done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"a picture of shape {picture.shape} cannot be written as JPEG")
+        raise ValueError(f"an image of shape {picture.shape} cannot be encoded as JPEG")
     return np.asarray(data, np.uint8).ravel()
 
 
 def decoded(data: NDArray[np.uint8]) -> Picture:
-    """The picture [height, width, 3] RGB of a JPEG's bytes; raises ValueError when they are none."""
+    """Decode JPEG bytes to an RGB image [height, width, 3]. Raises ValueError."""
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if picture is None:
-        raise ValueError(f"{len(data)} bytes that are no JPEG")
+        raise ValueError(f"expected a JPEG, found {len(data)} other bytes")
     return np.ascontiguousarray(picture[..., ::-1])
 
 
 def through_jpeg(picture: Picture, quality: int) -> Picture:
-    """What is left of a picture after JPEG."""
+    """Encode and decode an image with JPEG."""
     return decoded(encoded(picture, quality))

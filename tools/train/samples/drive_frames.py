@@ -1,4 +1,4 @@
-"""A drive as imitation needs it beside tokens and semantic states: poses, labels, and how often a frame is drawn."""
+"""A drive's data for imitation besides visual tokens and semantic states: poses, labels and weights of frames."""
 
 from __future__ import annotations
 
@@ -18,55 +18,55 @@ from tools.train.scenes.walls import Walls
 
 Array = NDArray[np.float64]
 
-LEAST_KNOWN: Final = RATE_HZ  # steps: a label that ends before the controller's target, 1 s ahead, says too little
-TURN_RAD: Final = 0.5
-_LABEL_STEPS: Final = 30
-_STANDS: Final = 0.1  # m/s and rad/s
-_BACKS_OFF_M: Final = 0.05
-_LEADS_M: Final = 0.3
+LEAST_KNOWN: Final = RATE_HZ  # fewest known steps of a usable label: up to the controller's target 1 s ahead
+TURN_RAD: Final = 0.5  # heading change within 3 s above which a label counts as a turn
+_LABEL_STEPS: Final = 30  # steps of a label that its weight depends on
+_STANDS: Final = 0.1  # speed, m/s, and yaw rate, rad/s, below which the robot stands
+_BACKS_OFF_M: Final = 0.05  # distance behind the robot above which a label moves backwards
+_LEADS_M: Final = 0.3  # distance in 3 s above which a label leaves a standing position
 
 
 class DriveFramesError(ValueError):
-    """A network whose plans have no label; one line."""
+    """A network with more plan steps than a label has; one line."""
 
 
 @dataclass(frozen=True)
 class DriveFrames:
-    """What samples need of a drive, but for tokens and states; N frames."""
+    """A drive's N frames for imitation."""
 
     id: str
     pose_odom: Array
     """[N, 3] x m, y m, theta rad."""
     way_m: Array
-    """[N]: driven since the first frame, by odometry."""
+    """[N]: distance driven since the first frame, from odometry."""
     state: NDArray[np.float32]
-    """[N, 3]."""
+    """[N, 3] vx m/s, vy m/s, wz rad/s."""
     goal: NDArray[np.float32]
-    """[N, 2]: where the goal is, m in the robot's frame; for point-goal policies alone."""
+    """[N, 2]: goal, m in the robot frame; for point-goal policies alone."""
     target: NDArray[np.float32]
-    """[N, steps, 3]: the label; headings are not wrapped."""
+    """[N, steps, 3]: labels x m, y m, theta rad; headings are not wrapped."""
     known: NDArray[np.int16]
-    """[N]: steps of the label that are real."""
+    """[N]: number of known steps of the label."""
     weight: Array
-    """[N]: chance to be drawn, not normalised; 0 where too little of the label is known."""
+    """[N]: relative probability of drawing the frame; 0 if too few steps of the label are known."""
     walls: Walls | None = None
-    """Around it; None where nobody asks for them or they are not known."""
+    """Walls along the drive; None if they are not used or not known."""
 
     def __len__(self) -> int:
         return len(self.state)
 
     @property
     def stood(self) -> bool:
-        """Whether the robot stands in its first frame, so that it may have stood there before."""
+        """Whether the robot stands in the first frame, so that it may have stood there before."""
         return bool(hypot(*self.state[0, :2]) < _STANDS and abs(self.state[0, 2]) < _STANDS)
 
     @staticmethod
     def of(drive: Drive, steps: int, weights: WeightConfig, walls: Walls | None = None) -> DriveFrames:
-        """Of a drive whose pictures need not be loaded. Raises DriveFramesError for more steps than a label has."""
+        """Build the frames of a drive; its images are not needed. Raises DriveFramesError for too many steps."""
         if not LEAST_KNOWN <= steps <= FUTURE_STEPS:
             raise DriveFramesError(f"action.steps: expected {LEAST_KNOWN} to {FUTURE_STEPS}, found {steps}")
         future = drive.future.astype(np.float64)
-        # A pose's heading is within half a turn; a plan's is the sum of its steps and may go beyond.
+        # A pose's heading is wrapped; a plan's heading is the sum of its steps and is not.
         start = np.zeros((len(drive), 1))
         future[..., 2] = np.unwrap(np.concatenate([start, future[..., 2]], axis=1), axis=1)[:, 1:]
         _never_backwards(future)
@@ -87,15 +87,15 @@ class DriveFrames:
         )
 
     def offset(self, anchor: int, k: int) -> SE2:
-        """The motion from frame `anchor` to frame k as odometry tells it, in the robot's frame at `anchor`."""
+        """Return the odometry's motion from frame `anchor` to frame k, in the robot frame at `anchor`."""
         T_odom_anchor, T_odom_base = (SE2(*map(float, self.pose_odom[i])) for i in (anchor, k))
         return T_odom_anchor.inverse() @ T_odom_base
 
 
 def _never_backwards(future: Array) -> None:
-    """Let labels stand, and turn as the expert turns, where it backs off: the controller cannot, in place.
+    """Replace labels that move backwards by turning on the spot, in place: the controller cannot drive backwards.
 
-    Told of a target behind it, it would turn towards that, which is as a rule away from where the expert turns.
+    With a target behind it, the controller would turn to it, which is usually away from where the expert turns.
     """
     x, y = future[:, LEAST_KNOWN - 1, :2].T
     future[(x < 0) & (np.hypot(x, y) >= _BACKS_OFF_M), :, :2] = 0.0
@@ -111,7 +111,7 @@ def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> 
         people[k] = trace is not None and trace["motion"] != NO_PEOPLE
     others = np.append(np.cumsum(drive.by != EXPERT), 0)
     until = np.minimum(np.arange(len(drive)) + FUTURE_STEPS, len(drive)) - 1
-    # Of the frames k .. k + 49; the 0 that was appended is what stands before frame 0.
+    # Counts over frames k to k + 49; the appended 0 is the count before frame 0.
     led_back = others[until] > others[np.arange(len(drive)) - 1]
     weight = np.ones(len(drive))
     for holds, factor in (
@@ -128,7 +128,7 @@ def _weights(drive: Drive, future: Array, goal: Array, config: WeightConfig) -> 
 
 
 def _stuck(state: NDArray[np.float32], future: Array) -> NDArray[np.bool_]:
-    """[N]: frames before which the robot has stood for a second, and from which the label leads away within 3 s."""
+    """Return the frames [N] after 1 s of standing from which the label leads away within 3 s."""
     moves = np.append(0, np.cumsum((np.hypot(*state[:, :2].T) >= _STANDS) | (np.abs(state[:, 2]) >= _STANDS)))
     ks = np.arange(len(state))
     stood = (ks >= RATE_HZ) & (moves[ks + 1] == moves[np.maximum(ks - RATE_HZ, 0)])

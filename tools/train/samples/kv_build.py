@@ -1,4 +1,4 @@
-"""Making semantic states: every 1 Hz anchor through the frozen language model, with the true text or its own."""
+"""Computation of semantic states: the frozen language model runs on every anchor, with the true or its own text."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TAG: Final = 0x5EE
 
 
 def parts_sha256(network: TicVla, parts: Iterable[str] = SEEN_PARTS) -> str:
-    """Hash of the weights of some parts of a network."""
+    """Hash the weights of some parts of a network."""
     digest = hashlib.sha256()
     wanted = tuple(parts)
     for name, tensor in sorted(network.state_dict().items()):
@@ -42,15 +42,15 @@ def parts_sha256(network: TicVla, parts: Iterable[str] = SEEN_PARTS) -> str:
 
 
 def cache_key(network: TicVla, tokenizer: bytes, config: KvConfig, seed: int) -> str:
-    """What states depend on, except their drive."""
-    told = {key: value for key, value in asdict(config).items() if key != "batch"}
+    """Hash everything that states depend on, except their drive."""
+    settings = {key: value for key, value in asdict(config).items() if key != "batch"}
     sizes = network.config.to_dict()
     made = {
         "format": FORMAT,
         "weights": parts_sha256(network),
         "sizes": {part: sizes[part] for part in SEEN_PARTS},
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
-        "config": told,
+        "config": settings,
         "seed": seed,
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
@@ -69,10 +69,10 @@ def build_kv_cache(
     ranks: Ranks = SINGLE,
     progress: StageProgress | None = None,
 ) -> KvCache:
-    """States of all drives (or `ids`), those that are missing made now, in a folder of its own under `folder`.
+    """Compute the missing states of all drives (or `ids`) and open the cache, a folder under `folder`.
 
-    The network runs where its weights are; ranks share the drives. Raises KvCacheError for numbers that f16 cannot
-    hold, OSError.
+    The network runs on the device of its weights; ranks share the drives. Raises KvCacheError for values beyond
+    float16, OSError.
     """
     key = cache_key(network, tokenizer, config, seed)
     place = folder / key[:16]
@@ -82,7 +82,7 @@ def build_kv_cache(
     cache = KvCache(place)
     wanted = set(dataset.ids if ids is None else ids)
     entries = [entry for entry in dataset.entries if entry.id in wanted]
-    # By place in the whole list: what is missing changes while the others work.
+    # Divide the whole list: the list of missing drives changes while other ranks work.
     own = [entry for entry in entries[ranks.rank :: ranks.world] if not cache.has(entry.id, entry.sha256)]
     prompts = Prompts(Tokenizer.from_buffer(tokenizer), network.config)
     for done, entry in enumerate(own, 1):
@@ -105,11 +105,11 @@ class _Wanted:
     own: bool
     prompt: tuple[int, ...]
     answer: tuple[int, ...]
-    """The true one; empty where the model is to say its own."""
+    """The true answer; empty if the model decodes its own."""
 
     @property
     def tokens(self) -> int:
-        """That go in at once."""
+        """Number of tokens that are fed at once."""
         return len(self.prompt) + len(self.answer)
 
 
@@ -117,7 +117,7 @@ def _states(
     network: TicVla, prompts: Prompts, tokens: FrameTokens, anchors: Sequence[Anchor], config: KvConfig,
     own_share: float, seed: int,
 ) -> list[Made]:  # fmt: skip
-    """All states of one drive by frame and draw; made in batches of about one length."""
+    """Compute all states of one drive, sorted by frame and draw, in batches of similar length."""
     wanted = [
         _wanted(prompts, anchor, n, config.words, own_share, seed) for anchor in anchors for n in range(config.draws)
     ]
@@ -130,7 +130,7 @@ def _states(
 
 
 def _wanted(prompts: Prompts, anchor: Anchor, number: int, words: DrawConfig, own_share: float, seed: int) -> _Wanted:
-    """Drawn from a generator of its own: what a state is made with does not depend on which others are made."""
+    """Draw a state's text with its own generator: it does not depend on which other states are computed."""
     rng = np.random.default_rng((seed, _TAG, crc32(anchor.drive_id.encode()), anchor.k, number))
     own = bool(rng.uniform() < own_share)
     drawn = draw(anchor, words, rng)
@@ -142,7 +142,7 @@ def _wanted(prompts: Prompts, anchor: Anchor, number: int, words: DrawConfig, ow
 def _batch(
     network: TicVla, prompts: Prompts, tokens: FrameTokens, wanted: Sequence[_Wanted], max_new_tokens: int
 ) -> list[Made]:
-    """States that are all of true texts, or all of the model's own."""
+    """Compute states that all have true texts, or all have the model's own."""
     language = network.language
     rows = [
         Row(each.prompt, each.answer, frames_of(tokens, each.anchor.drive_id, each.anchor.frames)) for each in wanted
@@ -150,10 +150,10 @@ def _batch(
     image_id, device = language.config.img_context_id, language.embed.weight.device
     batch = collate(rows, img_context_id=image_id, device=device)
     if wanted[0].own:
-        said = decode(language, batch, max_new_tokens)
-        states, texts = [each.last_layer_kv for each in said], [each.ids for each in said]
+        decoded = decode(language, batch, max_new_tokens)
+        states, texts = [each.last_layer_kv for each in decoded], [each.ids for each in decoded]
     else:
-        # The token that ends an answer is not fed: a generation stops before it.
+        # The end token of an answer is not fed: a generation stops before it.
         kv = run(language, batch.input_ids, batch.visual_tokens, None).last_layer_kv
         states = [kv[i, :length] for i, length in enumerate(batch.lengths.tolist())]
         texts = [each.answer[:-1] for each in wanted]
@@ -162,7 +162,7 @@ def _batch(
         half = state.to(torch.float16).cpu().numpy()
         if not np.isfinite(half).all():
             where = f"drive {each.anchor.drive_id}, frame {each.anchor.k}"
-            raise KvCacheError(f"{where}: keys or values beyond what float16 holds; train the language model again")
+            raise KvCacheError(f"{where}: keys or values exceed float16; train the language model again")
         text = (WAYPOINTS_START if each.drawn.waypoints_only else "") + prompts.text(ids)
         made.append(Made(each.anchor.k, each.number, half, len(each.prompt), each.own, text))
     return made

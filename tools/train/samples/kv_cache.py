@@ -1,8 +1,8 @@
-"""Semantic states on disk: the frozen language model's last-layer K‖V at every anchor (paper, Algorithm 1, line 5).
+"""Cache of semantic states: the frozen language model's last-layer K‖V at every anchor (paper, Algorithm 1, line 5).
 
-A folder has `kv.json` (what it was made with) and, for each drive, `ID.npy` f16 [tokens, kv_dim] with all its states
-one after another and `ID.json` with where each begins. Both are written by rename, so a run that was ended goes on with
-the next drive, and drives that are added later (DAgger) cost only themselves.
+A folder contains `kv.json` (its key) and, for each drive, `ID.npy` f16 [tokens, kv_dim] with all states in sequence and
+`ID.json` with their positions. Both are written atomically, so that an interrupted run continues with the next drive;
+for drives that are added later (DAgger), only their states are computed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tools.train.samples.language_batch import Halves
 
 FORMAT: Final = 1
 INDEX: Final = "kv.json"
-_MAX_OPEN: Final = 256  # a mapped file takes one of a process's descriptors, of which there may be 1024
+_MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descriptors
 
 
 class KvCacheError(ValueError):
@@ -32,7 +32,7 @@ class KvCacheError(ValueError):
 
 @dataclass(frozen=True)
 class Made:
-    """A state before it is written; `kv` f16 [T, kv_dim]."""
+    """A computed state before it is written; `kv` f16 [T, kv_dim]."""
 
     k: int
     draw: int
@@ -44,18 +44,18 @@ class Made:
 
 @dataclass(frozen=True)
 class CachedState:
-    """What one generation leaves: K‖V of prompt and text, read-only and mapped from the file."""
+    """State of one generation: K‖V of prompt and text, read-only and mapped from the file."""
 
     kv: Halves
-    """[T, kv_dim]; the first `prompt_tokens` rows are what a model that says nothing would leave."""
+    """[T, kv_dim]; the first `prompt_tokens` rows belong to the prompt."""
     prompt_tokens: int
     text: str
     own: bool
-    """Whether the model said the text itself; else it is the label's."""
+    """Whether the model decoded the text; else it is the true text."""
 
     @property
     def waypoints(self) -> Waypoints | None:
-        """(x m, y m) at 3, 6, 9 s in the anchor's robot frame; None where the model's own text has none."""
+        """(x m, y m) at 3, 6, 9 s in the robot frame at the anchor; None if the text has no valid waypoints."""
         return parse_waypoints(self.text)
 
 
@@ -71,10 +71,10 @@ class _Place:
 
 
 class KvCache:
-    """Read access; what is read is mapped from the file, not copied."""
+    """Read access to a cache; arrays are mapped from the files, not copied."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder that `build_kv_cache` has made. Raises KvCacheError."""
+        """Open a folder that `build_kv_cache` wrote. Raises KvCacheError."""
         self.folder = folder
         try:
             content = json.loads((folder / INDEX).read_text(encoding="utf-8"))
@@ -83,7 +83,7 @@ class KvCache:
             self.key: str = content["key"]
             self.kv_dim: int = content["kv_dim"]
             self.draws: int = content["draws"]
-            """States of each anchor, with other words and another `before`."""
+            """Number of states of each anchor, with different wordings and previous progress."""
         except (OSError, ValueError, KeyError, TypeError) as error:
             if isinstance(error, KvCacheError):
                 raise
@@ -92,18 +92,18 @@ class KvCache:
         self._maps: OrderedDict[str, Halves] = OrderedDict()
 
     def has(self, drive_id: str, sha256: str) -> bool:
-        """Whether this drive, with this hash of its file, is in the cache."""
+        """Return whether the cache contains a drive with this hash of its file."""
         try:
             return bool(_read(self.folder, drive_id)["drive_sha256"] == sha256) and _npy(self.folder, drive_id).exists()
         except KvCacheError:
             return False
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Frames of a drive that there is a state for, ascending. Raises KvCacheError for a drive that is not there."""
+        """Return the frames of a drive that have a state, ascending. Raises KvCacheError for a missing drive."""
         return tuple(sorted({k for k, _ in self._index(drive_id)}))
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
-        """The state of the generation whose newest frame is k. Raises KvCacheError where there is none."""
+        """Return state number `draw` of the generation whose newest frame is k. Raises KvCacheError if missing."""
         place = self._index(drive_id).get((k, draw))
         if place is None:
             raise KvCacheError(f"drive {drive_id}: no state of frame {k}, draw {draw}")
@@ -133,7 +133,7 @@ class KvCache:
 
 
 def begin(folder: Path, *, key: str, kv_dim: int, draws: int) -> None:
-    """Make a folder for states; raises OSError."""
+    """Create a cache folder. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     index = {"format": FORMAT, "key": key, "kv_dim": kv_dim, "draws": draws}
     write_whole(folder / INDEX, json.dumps(index) + "\n")
@@ -153,7 +153,7 @@ def _read(folder: Path, drive_id: str) -> Mapping[str, Any]:
 
 
 def write_states(folder: Path, drive_id: str, sha256: str, states: Sequence[Made], kv_dim: int) -> None:
-    """First the numbers, then what says that they are whole."""
+    """Write a drive's states: first the array, then the JSON file that marks it as complete."""
     rows = np.concatenate([state.kv for state in states] or [np.zeros((0, kv_dim), np.float16)])
     partial = folder / f"{drive_id}.{os.getpid()}.partial"
     with partial.open("wb") as file:

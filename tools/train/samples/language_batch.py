@@ -1,7 +1,7 @@
-"""The language model over rows of different lengths at once: `LanguageModel.forward`'s numbers, at training speed.
+"""The language model on batches of rows of different length, with the results of `LanguageModel.forward`.
 
-Rows are padded on the right, where causal attention never looks. Only what is asked for is computed: the last layer's
-queries and the vocabulary's scores at the positions whose next token matters.
+Rows are padded on the right, which causal attention ignores. The last layer's queries and the logits are computed only
+at the positions whose next token is needed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from export.model.language import DecoderLayer, LanguageModel, RmsNorm, rotate
 from export.model.vision import fold_tokens
 
 IGNORED = -100
-"""Target where there is nothing to be said (torch's own value)."""
+"""Target at padded positions (torch's default)."""
 PLAIN_TOKENS = 512
-"""Rows up to this length take plain attention on a CPU; its memory grows with their square."""
+"""Longest rows, tokens, with plain attention on a CPU; its memory is quadratic in the length."""
 POOL = 32
-"""Batches that are sorted by length together: alike enough to waste little, mixed enough to be random."""
+"""Batches that are sorted by length together: a compromise between little padding and random order."""
 
 Halves = npt.NDArray[np.float16]
 
@@ -46,14 +46,14 @@ class FrameTokens(Protocol):
 
 
 def frames_of(tokens: FrameTokens, drive_id: str, frames: Sequence[int]) -> tuple[Halves, ...]:
-    """Tokens [tokens, D] of some frames of a drive."""
+    """Return the tokens [tokens, D] of some frames of a drive."""
     every = tokens.frames(drive_id)
     return tuple(every[k] for k in frames)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One prompt, its answer (with the end token; empty: nothing is said), and its frames' tokens [N, D], in order."""
+    """One prompt, its answer with the end token (may be empty), and its frames' tokens [N, D], in order."""
 
     prompt: tuple[int, ...]
     answer: tuple[int, ...]
@@ -65,32 +65,32 @@ class Row:
 
     @property
     def fed(self) -> tuple[int, ...]:
-        """What goes in: all but the answer's last token, after which there is nothing to predict."""
+        """Input tokens: all but the answer's last one, after which there is nothing to predict."""
         return (*self.prompt, *self.answer[:-1])
 
 
 @dataclass(frozen=True)
 class LanguageBatch:
-    """Rows on a device. `A`: the longest answer; a row without one asks for the token after its prompt."""
+    """Rows on a device. A: length of the longest answer; a row without answer needs the token after its prompt."""
 
     input_ids: Tensor
     """[B, T] int64, zeros on the right."""
     lengths: Tensor
-    """[B] int64: tokens of each row that are real."""
+    """[B] int64: number of real tokens in each row."""
     visual_tokens: Tensor
     """[F, N, D] float: the frames of all rows, in their order."""
     query_at: Tensor
-    """[B, A] int64: positions whose next token is wanted; the last one repeated."""
+    """[B, A] int64: positions whose next token is needed; the last one is repeated."""
     targets: Tensor
-    """[B, A] int64: that token, IGNORED behind a row's answer."""
+    """[B, A] int64: that token; IGNORED behind a row's answer."""
 
 
 @dataclass(frozen=True)
 class Pass:
-    """What one forward pass gives."""
+    """Results of one forward pass."""
 
     hidden: Tensor | None
-    """[B, A, hidden] after the final norm, at `query_at`; None where that was not asked for."""
+    """[B, A, hidden] after the final norm, at `query_at`; None if not requested."""
     last_layer_kv: Tensor
     """[B, T, kv_dim], in the layout of `LanguageModel`'s own; rows are real up to their length."""
     caches: tuple[tuple[Tensor, Tensor], ...]
@@ -98,7 +98,7 @@ class Pass:
 
 
 def collate(rows: Sequence[Row], *, img_context_id: int, device: torch.device) -> LanguageBatch:
-    """Pad rows; raises ValueError when a row's image places are not as many as its frames'."""
+    """Pad rows to a batch. Raises ValueError if the image positions of a row do not fit its frames."""
     length = max(len(row.fed) for row in rows)
     wanted = max(1, max(len(row.answer) for row in rows))
     ids = np.zeros((len(rows), length), dtype=np.int64)
@@ -121,14 +121,14 @@ def collate(rows: Sequence[Row], *, img_context_id: int, device: torch.device) -
 
 
 def check_places(rows: Sequence[Row], img_context_id: int) -> None:
-    """Raise ValueError unless every frame has as many image places as all others, and at least one."""
+    """Raise ValueError unless all frames have the same number of image positions, at least one."""
     found = {divmod(row.prompt.count(img_context_id), len(row.frames)) for row in rows}
     if len(found) != 1 or any(left or not places for places, left in found):
         raise ValueError(f"expected as many image places for every frame, found (places, left over) {sorted(found)}")
 
 
 def embed(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor) -> Tensor:
-    """[B, T, hidden]: token embeddings, with the frames' merged tokens in the places that are for them."""
+    """Compute the input embeddings [B, T, hidden], with the frames' merged tokens at the image positions."""
     images = language.merge(fold_tokens(visual_tokens, language.config.token_merge))
     x: Tensor = language.embed(input_ids)
     is_image = input_ids == language.config.img_context_id
@@ -136,40 +136,40 @@ def embed(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor) -> 
 
 
 def angles(language: LanguageModel, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotary cosines and sines [..., head_dim] of positions [...]."""
+    """Compute rotary cosines and sines [..., head_dim] of positions [...]."""
     angle = positions.float()[..., None] * language.inv_freq
     angle = torch.cat([angle, angle], dim=-1)
     return angle.cos(), angle.sin()
 
 
 def heads_of(x: Tensor, heads: int) -> Tensor:
-    """[B, T, heads·d] → [B, heads, T, d]."""
+    """Reshape [B, T, heads·d] to [B, heads, T, d]."""
     split: Tensor = x.unflatten(-1, (heads, -1))
     return split.transpose(1, 2)
 
 
 def keys_values(layer: DecoderLayer, h: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
-    """Keys, rotated, and values [B, kv_heads, T, d] of normed inputs [B, T, hidden]."""
+    """Compute rotated keys and values [B, kv_heads, T, d] of normalised inputs [B, T, hidden]."""
     v = heads_of(layer.v(h), layer.config.kv_heads)
     return rotate(heads_of(layer.k(h), layer.config.kv_heads), cos, sin).to(v.dtype), v
 
 
 def normed(norm: RmsNorm, x: Tensor) -> Tensor:
-    """A norm's output in the number format that the layers after it compute in, converted once for all of them."""
+    """Apply a norm and convert its output once to the dtype of the following layers."""
     h: Tensor = norm(x)
     kind = x.device.type
     return h.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else h
 
 
 def attention(device: torch.device, tokens: int) -> AbstractContextManager[None]:
-    """The quicker way to learn attention: on a CPU, for short rows, torch's plain one (an eighth of a step's time)."""
+    """Return a context with the faster attention for training: torch's plain one for short rows on a CPU."""
     return sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" and tokens <= PLAIN_TOKENS else nullcontext()
 
 
 def finish_layer(
     layer: DecoderLayer, x: Tensor, h: Tensor, cos: Tensor, sin: Tensor, k: Tensor, v: Tensor, mask: Tensor | None
 ) -> Tensor:
-    """The layer's output at queries x [B, Q, hidden] (h: normed). Without a mask they are all positions, causally."""
+    """Compute the layer's output at queries x [B, Q, hidden] (h: normalised); without mask causal, at all positions."""
     q = rotate(heads_of(layer.q(h), layer.config.heads), cos, sin).to(v.dtype)
     groups = layer.config.heads // layer.config.kv_heads
     attended = F.scaled_dot_product_attention(
@@ -186,7 +186,7 @@ def finish_layer(
 
 
 def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query_at: Tensor | None) -> Pass:
-    """All rows through all layers; the last one only at `query_at` [B, A] (None: its keys and values alone)."""
+    """Run all rows through all layers; the last one only at `query_at` [B, A] (None: only its keys and values)."""
     x = embed(language, input_ids, visual_tokens)
     position = torch.arange(input_ids.shape[1], device=input_ids.device)
     cos, sin = angles(language, position)
@@ -212,7 +212,7 @@ def run(language: LanguageModel, input_ids: Tensor, visual_tokens: Tensor, query
 
 
 def token_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
-    """-log p of every answer token [B, A], zero behind a row's answer (the terms of the paper's equation 3)."""
+    """Compute -log p of every answer token [B, A], zero behind a row's answer (terms of the paper's equation 3)."""
     with attention(batch.input_ids.device, batch.input_ids.shape[1]):
         hidden = run(language, batch.input_ids, batch.visual_tokens, batch.query_at).hidden
     assert hidden is not None
@@ -221,13 +221,13 @@ def token_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
 
 
 def row_losses(language: LanguageModel, batch: LanguageBatch) -> Tensor:
-    """Equation 3 for each row [B]: the mean over its answer's tokens."""
-    said = (batch.targets != IGNORED).sum(1).clamp(min=1)
-    return token_losses(language, batch).sum(1) / said
+    """Compute equation 3 for each row [B]: the mean over its answer's tokens."""
+    count = (batch.targets != IGNORED).sum(1).clamp(min=1)
+    return token_losses(language, batch).sum(1) / count
 
 
 def buckets(lengths: Sequence[int], size: int, rng: np.random.Generator) -> list[list[int]]:
-    """Shuffled batches of at most `size` indices of about equal length; every index once."""
+    """Return shuffled batches of at most `size` indices of similar length; every index occurs once."""
     order = rng.permutation(len(lengths))
     batches: list[list[int]] = []
     for start in range(0, len(order), size * POOL):

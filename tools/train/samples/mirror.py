@@ -1,7 +1,7 @@
-"""Drives as a mirror shows them: another place, in which all that is said holds with left and right exchanged.
+"""Mirrored drives for the language model: other places, with left and right exchanged in all texts.
 
-Twice as many places to learn to speak of, for the price of encoding one frame a second once more. The benchmark's and
-training's wordings have `left` and `right` as sides only, but for "all right".
+They double the number of places at the cost of encoding one more frame per second. In all wordings `left` and `right`
+are sides, except in "all right".
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _mirrored_plan(plan: Plan) -> Plan:
 
 
 def mirrored(anchor: Anchor) -> Anchor:
-    """The anchor of the mirrored drive; what is counted, and when, is the same."""
+    """Mirror an anchor; its progress is unchanged."""
     points = _across(anchor.points)
     return replace(
         anchor,
@@ -70,7 +70,7 @@ def _across(points: Waypoints) -> Waypoints:
 
 @dataclass(frozen=True)
 class Seconds:
-    """One picture a second of a drive, as it is or mirrored: what a cache of tokens asks a drive for."""
+    """Images of a drive at whole seconds, optionally mirrored, with the interface that a token cache needs."""
 
     drive: Drive
     mirrored: bool
@@ -79,14 +79,14 @@ class Seconds:
         return -(-len(self.drive) // TRACE_EVERY)
 
     def frame(self, k: int) -> NDArray[np.uint8]:
-        """Picture of second k, uint8 RGB [128, 128, 3]. Raises DriveError, IndexError."""
+        """Decode the image of second k as uint8 RGB [128, 128, 3]. Raises DriveError, IndexError."""
         picture = self.drive.frame(k * TRACE_EVERY)
         return np.ascontiguousarray(picture[:, ::-1]) if self.mirrored else picture
 
 
 @dataclass(frozen=True)
 class SecondsDataset(Dataset):
-    """A data set of whose drives one picture a second is looked at, for a cache of visual tokens of its own."""
+    """A data set with one image per second of each drive, for a separate token cache."""
 
     mirrored: bool = False
 
@@ -94,20 +94,20 @@ class SecondsDataset(Dataset):
     def of(  # type: ignore[override]  # makes one; the parent's picks drives
         dataset: Dataset, *, mirrored: bool = False
     ) -> SecondsDataset:
-        """The seconds of a data set, or of its mirror image."""
+        """Return the seconds of a data set, optionally mirrored."""
         entries = tuple(replace(each, frames=-(-each.frames // TRACE_EVERY)) for each in dataset.entries)
         return SecondsDataset(dataset.folder, entries, mirrored)
 
     def load(self, drive_id: str, *, pictures: bool = True) -> Seconds:  # type: ignore[override]  # all that a token cache asks of a drive
-        """One drive's. Raises DriveError."""
+        """Load one drive. Raises DriveError."""
         return Seconds(super().load(drive_id, pictures=pictures), self.mirrored)
 
 
 @dataclass(frozen=True)
 class Views:
-    """Visual tokens of drives: `plain` of every frame, `mirror` of one frame a second of the mirrored drives.
+    """Visual tokens of drives: `plain` of every frame, `mirror` of one frame per second of the mirrored drives.
 
-    `seconds`, where there is one: one frame a second of what has no more (`Anchor.by_seconds`).
+    `seconds`: one frame per second of drives that have no more (`Anchor.by_seconds`).
     """
 
     plain: FrameTokens
@@ -115,7 +115,7 @@ class Views:
     seconds: FrameTokens | None = None
 
     def of(self, anchor: Anchor, *, in_mirror: bool = False) -> tuple[Halves, ...]:
-        """Tokens [N, D] of an anchor's frames; in the mirror those of whole seconds, as anchors at seconds have."""
+        """Return the tokens [N, D] of an anchor's frames. Raises ValueError if there are none."""
         if not in_mirror and not anchor.by_seconds:
             every = self.plain.frames(anchor.drive_id)
             return tuple(every[k] for k in anchor.frames)
@@ -128,12 +128,12 @@ class Views:
 
 @dataclass(frozen=True)
 class Joined:
-    """Tokens of two data sets: `others`, and `tours` for drives of these ids."""
+    """Tokens of two data sets: `tours` for drives with these ids, `others` for the rest."""
 
     others: FrameTokens
     tours: FrameTokens
     ids: frozenset[str]
 
     def frames(self, drive_id: str) -> FrameRows:
-        """As its part has them."""
+        """Return the tokens of a drive, indexed by frame."""
         return (self.tours if drive_id in self.ids else self.others).frames(drive_id)

@@ -1,11 +1,11 @@
-"""Visual tokens of recorded drives, encoded once by the frozen encoder and kept on disk.
+"""Cache of visual tokens of recorded drives, encoded once by the frozen encoder.
 
-A folder belongs to one encoder: its name begins the hash of the weights. It has, for each drive, `ID.npy` f16
-[frames, tokens, width] and `ID.json` with the hash of the drive that it was made of. Both are written by rename, so a
-build that was ended goes on with the next drive, and drives that are added later (DAgger) cost only themselves.
+A folder belongs to one encoder and is named by the hash of its weights. It contains for each drive `ID.npy` f16
+[frames, tokens, width] and `ID.json` with the drive's hash. Both are written atomically, so that an interrupted build
+continues with the next drive; of drives that are added later (DAgger), only these are encoded.
 
-Tokens are those of the torch network in float32, rounded to f16: an exported graph's differ by that rounding and by
-what its own precision costs, which `tests/tools/train/samples/test_tokens.py` bounds for a float32 graph.
+Tokens are computed by the torch network in float32 and rounded to float16. An exported graph's tokens differ by this
+rounding and by the graph's precision; `tests/tools/train/samples/test_tokens.py` bounds both for a float32 graph.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from tools.train.run.job import QuietProgress, StageProgress
 
 FORMAT: Final = 1
 FOLDER: Final = "tokens"
-_MAX_OPEN: Final = 256  # a mapped file takes one of a process's descriptors, of which there may be 1024
+_MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descriptors
 Halves = NDArray[np.float16]
 
 
 class TokenCacheError(ValueError):
-    """Tokens that are not there or cannot be used; one line: what, expected, found, what to do."""
+    """Missing or unusable tokens; one line: what, expected, found, what to do."""
 
 
 def encoder_sha256(vision: VisionEncoder) -> str:
-    """Hash of an encoder's numbers and weights: the same weights give the same, whatever file they came from."""
+    """Hash an encoder's configuration and weights; it does not depend on the weights' file."""
     digest = hashlib.sha256(repr(vision.config).encode())
     for name, tensor in sorted(vision.state_dict().items()):
         digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
@@ -48,20 +48,20 @@ def encoder_sha256(vision: VisionEncoder) -> str:
 
 
 class TokenCache:
-    """Tokens of a data set's drives as one encoder sees them, in a folder of their own under `tokens/`."""
+    """Tokens of a data set's drives from one encoder, in a folder under `tokens/`."""
 
     def __init__(self, dataset: Dataset, vision: VisionEncoder, folder: Path | None = None) -> None:
-        """Opens what is there and makes nothing; `build` encodes what is missing. `folder` stands in for `tokens/`."""
+        """Open existing tokens; `build` encodes missing drives. `folder` replaces `tokens/`."""
         self.key = encoder_sha256(vision)
         self.folder = (dataset.folder / FOLDER if folder is None else folder) / self.key[:16]
         self.shape = (vision.config.tokens, vision.config.token_dim)
-        """Of one frame's tokens."""
+        """Shape of one frame's tokens."""
         self._dataset, self._vision = dataset, vision
         self._entries = {entry.id: entry for entry in dataset.entries}
         self._open: OrderedDict[str, Halves] = OrderedDict()
 
     def frames(self, drive_id: str) -> Halves:
-        """f16 [N, tokens, width] of all frames of a drive, mapped from a file. Raises TokenCacheError."""
+        """Return f16 [N, tokens, width] of all frames of a drive, mapped from a file. Raises TokenCacheError."""
         if drive_id not in self._open:
             entry = self._entry(drive_id)
             if not self.has(entry):
@@ -81,7 +81,7 @@ class TokenCache:
         return self._open[drive_id]
 
     def has(self, entry: Entry) -> bool:
-        """Whether this drive, as the data set has it now, is encoded."""
+        """Return whether the current version of a drive is encoded."""
         try:
             content = json.loads(self._json(entry.id).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -90,7 +90,7 @@ class TokenCache:
         return bool(content == expected) and self._npy(entry.id).exists()
 
     def missing(self, ids: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Drives of the data set (or of `ids`) that are still to be encoded, sorted."""
+        """Return the drives of the data set (or of `ids`) that are not encoded, sorted."""
         wanted = [self._entry(drive_id) for drive_id in (self._entries if ids is None else ids)]
         return tuple(sorted({entry.id for entry in wanted if not self.has(entry)}))
 
@@ -103,15 +103,15 @@ class TokenCache:
         ranks: Ranks = SINGLE,
         progress: StageProgress | None = None,
     ) -> int:
-        """Encode what is missing (of `ids`), `batch` frames at a time; the number of drives that this rank encoded.
+        """Encode missing drives (of `ids`), `batch` frames at a time; return how many this rank encoded.
 
-        The encoder is moved to `device` for it, and back. Ranks share the drives; all must call. Raises TokenCacheError
-        for tokens that f16 cannot hold, DriveError for a damaged drive, OSError.
+        The encoder is moved to `device` and back. Ranks share the drives; all must call this function. Raises
+        TokenCacheError for values beyond float16, DriveError for a damaged drive, OSError.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()
         missing = self.missing(ids)
-        ranks.barrier()  # everybody has looked before anybody adds
+        ranks.barrier()  # all ranks have checked before any writes
         own = missing[ranks.rank :: ranks.world]
         before = next(self._vision.parameters()).device
         was_training = self._vision.training
@@ -133,13 +133,13 @@ class TokenCache:
             pictures = np.concatenate([fit_frame(drive.frame(k), px) for k in chosen])
             tokens[start : start + len(chosen)] = encode(self._vision, pictures, device)
         if not np.isfinite(tokens).all():
-            raise TokenCacheError(f"drive {drive.id}: tokens beyond what float16 holds; train the encoder again")
+            raise TokenCacheError(f"drive {drive.id}: tokens exceed float16; train the encoder again")
         return tokens
 
     def _write(self, entry: Entry, tokens: Halves) -> None:
         path = self._npy(entry.id)
         partial = path.with_name(f"{path.name}.partial")
-        # The tokens first: without its JSON beside it, an array does not count.
+        # The array first: it is valid only with its JSON file.
         self._json(entry.id).unlink(missing_ok=True)
         with partial.open("wb") as file:
             np.save(file, tokens, allow_pickle=False)
@@ -161,6 +161,6 @@ class TokenCache:
 
 @torch.no_grad()
 def encode(vision: VisionEncoder, pictures: NDArray[np.uint8], device: str = "cpu") -> Halves:
-    """f16 [n, tokens, width] of pictures uint8 [n, px, px, 3]; the network is on the device, in evaluation mode."""
+    """Encode images uint8 [n, px, px, 3] as f16 [n, tokens, width]; the network is on `device`, in evaluation mode."""
     tokens = vision(torch.from_numpy(pictures).to(device))
     return np.asarray(tokens.to(torch.float16).cpu().numpy(), np.float16)

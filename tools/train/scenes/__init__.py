@@ -1,1 +1,1 @@
-"""Training scenes and tasks, and what is true of them: routes, progress, reasoning traces, walls."""
+"""Training scenes and tasks, and their ground truth: routes, progress, reasoning traces, walls."""

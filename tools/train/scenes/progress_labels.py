@@ -1,7 +1,6 @@
-"""How far along its told way a robot is: which turn is next, and how many openings of its kind it has passed.
+"""True progress along a described route: the next turn, and the number of openings of its kind that were passed.
 
-Counted on the openings that the instruction's ordinals count, so that words and labels agree: who takes the third door
-on the left has passed two.
+Openings are counted as the instruction's ordinals count them: before "the third door on the left" two are passed.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from tools.train.scenes.scenarios import Scenario
 
 Array = NDArray[np.float64]
 
-_SPACING_M: Final = 0.1
-_REACH_M: Final = 15.0
-_TURNED_M: Final = 1.0  # whoever is still in the corridor that a turn leaves has not turned until so far beyond it
-_BEYOND_M: Final = 0.3
-_ASIDE_M: Final = 2.0  # to the side of where one should have turned, in the corridor's going on
+_SPACING_M: Final = 0.1  # distance between two points of a route
+_REACH_M: Final = 15.0  # longest walking distance to the route that is computed exactly
+_TURNED_M: Final = 1.0  # within this distance past a turn, a robot still in the old corridor has not turned
+_BEYOND_M: Final = 0.3  # distance past an opening at which it counts as missed
+_ASIDE_M: Final = 2.0  # largest lateral distance from the turn at which a robot has driven straight past it
 
 
 class RouteProgress:
-    """Places a pose on a scenario's told way, however far from it the robot has strayed.
+    """Maps a pose to progress along a scenario's route, also far away from it.
 
-    A pose belongs to the point of the way to which one walks the shortest way, not through walls: who drives past a
-    turn stays at that turn, and who goes back is further back.
+    A pose belongs to the route's point with the shortest walking distance, around walls: a robot that drives past a
+    turn stays at that turn, and one that drives back loses progress.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -50,38 +49,38 @@ class RouteProgress:
 
     @property
     def length_m(self) -> float:
-        """Of the told way."""
+        """Length of the route, m."""
         return (len(self._points) - 1) * _SPACING_M
 
     def at(self, pose: SE2) -> Progress:
-        """Which turn is next, and how many openings of its kind were passed on its side since the turn before."""
+        """Return the next turn and the number of openings of its kind passed on its side since the previous turn."""
         index = self._step_at(pose)
         if index == len(self._steps):
             return Progress(index + 1, index, 0)
         return Progress(index + 1, len(self._steps), self._passed(index, pose))
 
     def next_step(self, pose: SE2) -> Step | None:
-        """The told step that is next; None on the last leg."""
+        """Return the next step of the route; None on the last leg."""
         index = self._step_at(pose)
         return self._steps[index] if index < len(self._steps) else None
 
     def to_next_m(self, pose: SE2) -> float:
-        """Way left to the next turn, or on the last leg to the goal, m."""
+        """Return the distance to the next turn, or on the last leg to the goal, m."""
         index, place = self._step_at(pose), self._place(pose)
         end = self._at[index] if index < len(self._steps) else len(self._points) - 1
         return max(0.0, (end - place) * _SPACING_M) + self._strayed(pose)
 
     def left_m(self, pose: SE2) -> float:
-        """Way left to the goal along the told way, m."""
+        """Return the distance to the goal along the route, m."""
         return (len(self._points) - 1 - self._place(pose)) * _SPACING_M + self._strayed(pose)
 
     def strayed_m(self, pose: SE2) -> float:
-        """How far one must walk to be on the told way, m; far from it only about so."""
+        """Return the walking distance to the route, m; approximate beyond 15 m."""
         row, column = self._grid.cell(pose.x_m, pose.y_m)
         return float(self._gap_m[row, column])
 
     def _strayed(self, pose: SE2) -> float:
-        """The same, less what is no more than driving beside the shortest line."""
+        """Return that distance minus 1 m, the tolerance for driving beside the line."""
         return max(0.0, self.strayed_m(pose) - 1.0)
 
     def _place(self, pose: SE2) -> int:
@@ -89,7 +88,7 @@ class RouteProgress:
         return int(self._nearest[row, column])
 
     def _step_at(self, pose: SE2) -> int:
-        """Index of the step that is next; their number on the last leg."""
+        """Return the index of the next step; on the last leg the number of steps."""
         place = self._place(pose)
         index = sum(place >= at for at in self._at)
         if index and self._overshot(index - 1, pose):
@@ -103,7 +102,7 @@ class RouteProgress:
         return index
 
     def _overshot(self, index: int, pose: SE2) -> bool:
-        """Whether one went straight on past a turn, across the corridor that it leads into."""
+        """Return whether the robot went straight past a turn, across the corridor that the turn leads into."""
         step = self._steps[index]
         if not step.ordinal:
             return False
@@ -119,7 +118,7 @@ class RouteProgress:
             return 0
         frame = Frame(step.ahead)
         area = self._scene.area_at(pose.x_m, pose.y_m)
-        # Beside the corridor (in a room, say) what counts is where one came out of it.
+        # Beside the corridor, such as in a room, the point where the robot left the corridor counts.
         on_leg = area is not None and (area.label in self._areas[index] or self._overshot(index, pose))
         point = (pose.x_m, pose.y_m) if on_leg else tuple(self._points[self._place(pose)])
         here = frame.along((float(point[0]), float(point[1])))
@@ -128,7 +127,7 @@ class RouteProgress:
         )
 
     def _is_taken(self, step: Step, middle_m: float, here: float) -> bool:
-        """Whether an opening is the one to take and not all of it lies behind: who turns in does not pass it."""
+        """Return whether an opening is the one to take and not completely behind: turning in does not pass it."""
         taken = step.counted[step.ordinal - 1]
         return middle_m == taken.middle_m and here <= taken.high_m
 
@@ -137,13 +136,13 @@ class RouteProgress:
         return int(np.argmin(gaps))
 
     def _area_before(self, index: int) -> str:
-        """Label of the area from which a step's turn leads away; "" outside all."""
+        """Return the label of the area before a step's turn; "" outside all areas."""
         x, y = self._points[max(0, self._at[index] - 2)]
         area = self._scene.area_at(float(x), float(y))
         return area.label if area is not None else ""
 
     def _area_labels(self, index: int) -> frozenset[str]:
-        """Areas that the way leads through up to a step, or to the goal, from the step before."""
+        """Return the areas on the route from the previous step to this one, or to the goal."""
         first = self._at[index - 1] if index else 0
         last = self._at[index] if index < len(self._steps) else len(self._points)
         found = (self._scene.area_at(float(x), float(y)) for x, y in self._points[first:last])
@@ -151,7 +150,7 @@ class RouteProgress:
 
 
 def _dense(path: tuple[Vec2, ...]) -> Array:
-    """[n, 2]: points of a path 0.1 m apart."""
+    """Return points [n, 2] of a path, 0.1 m apart."""
     line = np.array(path)
     steps = [hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(path)]
     along = np.concatenate(((0.0,), np.cumsum(steps)))
@@ -160,9 +159,9 @@ def _dense(path: tuple[Vec2, ...]) -> Array:
 
 
 def _nearest_points(grid: NavGrid, points: Array) -> tuple[NDArray[np.int64], Array]:
-    """[rows, columns] each: index of the point of a way that is nearest by walking, and how far it is, m.
+    """Return for every cell the index of the route's nearest point by walking, and the distance, m.
 
-    Of cells that are not free, or too far to walk, those of the nearest cell that is not.
+    Both are [rows, columns]. Cells that are occupied or too far away take the values of the nearest reachable cell.
     """
     ids, source, target, length = links(grid.free, grid.resolution_m)
     first: dict[int, int] = {}

@@ -1,7 +1,7 @@
-"""Tasks to train on: an episode with its scene, its way as it is told, and wordings that the benchmark never uses.
+"""Training scenarios: an episode with its scene, its route's description, and wordings that the benchmark never uses.
 
-A group is one fresh layout with several tasks. The same seed gives the same scenarios, whoever draws which of them, so
-that workers may share them out by their numbers.
+A group is one new layout with several tasks. A scenario depends on its seed and number alone, so that workers can
+divide scenarios by number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import WordingError, is_held_out, wordings
-from sim_hil.benchmark.language.route import RouteError, Told
+from sim_hil.benchmark.language.route import RouteDescription, RouteError
 from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.language.tasks import Task, make_task, sample_task
 from sim_hil.benchmark.suite.build import timeout_s
@@ -25,18 +25,18 @@ from sim_hil.scene.scene import Scene
 from tools.train.config.scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
 from tools.train.scenes.sites import Site
 
-WORDINGS: Final = 12  # of one task
+WORDINGS: Final = 12  # wordings of one task
 LEAST_WORDINGS: Final = 8
-FIRST_SEED: Final = 1_000_000  # of episodes: far above the suite's
+FIRST_SEED: Final = 1_000_000  # smallest seed of an episode, far above the benchmark's
 MAX_SEED: Final = 9_999
 KEPT_SEEDS: Final = range(9_001, 9_005)
-"""Evaluation's and reinforcement learning's: nothing is collected from these."""
+"""Seeds of evaluation and reinforcement learning; no drive is collected with them."""
 GROUPS: Final = 100_000  # layouts of one seed
-LAYOUT_TRIES: Final = 4
-_DRAWS: Final = 60  # for one task
-_LEAST_WAY_M: Final = 1.0  # of the straight line, before the goal has been reached
-_LEAST_LEG_M: Final = 2.0
-# Length of the way, m, and how often: the suite's tasks are 9..35 m indoors and 30..80 m outdoors.
+LAYOUT_TRIES: Final = 4  # layouts tried for one scenario
+_DRAWS: Final = 60  # tasks drawn at most for one scenario
+_LEAST_WAY_M: Final = 1.0  # least straight distance from the start to the success radius around the goal
+_LEAST_LEG_M: Final = 2.0  # shortest leg before a turn
+# (range of route length in m, share): the benchmark's routes are 9 to 35 m indoors and 30 to 80 m outdoors.
 _INDOORS: Final = (((4.0, 12.0), 0.30), ((9.0, 22.0), 0.40), ((18.0, 36.0), 0.30))
 _OUTDOORS: Final = (((6.0, 22.0), 0.30), ((20.0, 48.0), 0.40), ((40.0, 80.0), 0.30))
 _BANDS: Final = {"corridor": (((4.0, 14.0), 0.4), ((12.0, 27.0), 0.6))}
@@ -45,7 +45,7 @@ _CROWDS: Final = {
     "outdoors": ((20, 0.3), (50, 0.3), (80, 0.25), (120, 0.15)),
     CORRIDOR: ((0, 0.4), (2, 0.2), (5, 0.2), (8, 0.2)),
 }
-# A task is kept the more readily the more there is to learn from it: nothing to do, turns, turns to be counted.
+# Probability of keeping a task without turns, with turns, and with turns that must be counted.
 _KEEP: Final = (0.2, 0.6, 1.0)
 _TAG = 43
 
@@ -53,12 +53,12 @@ _T = TypeVar("_T")
 
 
 class ScenarioError(ValueError):
-    """Scenarios that cannot be drawn, or one that training may not use; one line."""
+    """Invalid arguments, no scenario found, or a scenario that training may not use; one line."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One task with its crowd and robot: what a drive is collected from, or a policy trained in."""
+    """One task with its crowd and robot, for one drive or rollout."""
 
     episode: Episode
     task: Task
@@ -75,31 +75,31 @@ class Scenario:
 
     @property
     def kind(self) -> str:
-        """Of its scene: hospital, office, warehouse, sidewalk or corridor."""
+        """Kind of its scene: hospital, office, warehouse, sidewalk or corridor."""
         return self.site.kind
 
     @property
     def layout_seed(self) -> int:
-        """Of its scene; data is split by it."""
+        """Seed of its scene; data is split into training and validation by it."""
         return self.site.layout_seed
 
     @property
     def scene(self) -> Scene:
-        """The world, for EpisodeWorld(episode, options, scene=scene)."""
+        """Scene, for EpisodeWorld(episode, options, scene=scene)."""
         return self.site.scene
 
     @property
-    def told(self) -> Told:
-        """The way in words' terms."""
+    def told(self) -> RouteDescription:
+        """Description of its route."""
         return self.task.told
 
     @property
     def wordings(self) -> tuple[str, ...]:
-        """Instructions that all say this way."""
+        """Instructions that describe the route."""
         return self.episode.instructions
 
     def told_json(self) -> list[dict[str, Any]]:
-        """The steps for a drive's header: side, kind, name, ordinal, at_end and where, m."""
+        """Return the route's steps for a drive's header: side, kind, name, ordinal, at_end and position, m."""
         return [
             {"side": step.side, "kind": step.kind, "name": step.name, "ordinal": step.ordinal, "at_end": step.at_end,
              "at": [round(v, 3) for v in step.at]}
@@ -115,7 +115,7 @@ def training_episodes(
     start: int = 0,
     tasks_per_scene: int = TASKS_PER_SCENE,
 ) -> Iterator[Scenario]:
-    """Scenarios number `start` to `start + count - 1` of a seed; `kinds` are shares of the layouts by kind.
+    """Yield scenarios number `start` to `start + count - 1` of a seed; `kinds` are shares of the layouts by kind.
 
     Raises ScenarioError.
     """
@@ -136,13 +136,13 @@ def training_episodes(
 
 
 def kind_of_group(seed: int, group: int, kinds: Mapping[str, float]) -> str:
-    """Which kind of layout a group has, by chance in the given shares. Raises ScenarioError."""
+    """Return the kind of a group's layout, distributed by the given shares. Raises ScenarioError."""
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise ScenarioError(f"unknown kind of scene {unknown[0]!r}, expected of {', '.join(KINDS)}")
     if not all(isfinite(share) and share >= 0 for share in kinds.values()) or sum(kinds.values()) <= 0:
-        raise ScenarioError(f"shares of kinds must be 0 or more, some of them more, found {dict(kinds)}")
+        raise ScenarioError(f"expected shares of kinds of 0 or more with a positive sum, found {dict(kinds)}")
     names = [name for name in KINDS if kinds.get(name, 0) > 0]
-    # Spread evenly rather than drawn: a short run has its shares too. The golden ratio leaves no gaps.
+    # A low-discrepancy sequence (golden ratio) and not random numbers: short runs have the right shares too.
     place = (0.5 + 0.618033988749895 * group + 0.37 * seed) % 1.0
     return _at(place, [(name, kinds[name]) for name in names])
 
@@ -150,14 +150,14 @@ def kind_of_group(seed: int, group: int, kinds: Mapping[str, float]) -> str:
 def scenario_group(
     seed: int, group: int, kinds: Mapping[str, float], count: int, tasks_per_scene: int = TASKS_PER_SCENE
 ) -> list[Scenario]:
-    """The first `count` scenarios of one group: as a rule of one layout. Raises ScenarioError."""
+    """Return the first `count` scenarios of one group, usually of one layout. Raises ScenarioError."""
     kind = kind_of_group(seed, group, kinds)
     sites: dict[int, Site] = {}
     return [_first_found(sites, kind, seed, group, group * tasks_per_scene + j) for j in range(count)]
 
 
 def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, number: int) -> Scenario:
-    """A scenario from the group's layout, or from the next one where none can be drawn there."""
+    """Find a scenario in the group's layout, or in the next one if it has none."""
     why = ""
     for attempt in range(LAYOUT_TRIES):
         layout_seed = RESERVED_BELOW + (seed * LAYOUT_TRIES + attempt) * GROUPS + group
@@ -193,7 +193,7 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
 
 
 def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: int, seed: int, number: int) -> Scenario:
-    """A task with wordings that are true of it; raises RouteError where there are none, or no way for the robot."""
+    """Add true wordings, robot and crowd to a task. Raises RouteError if there is no wording or no path."""
     try:
         texts = wordings(task.told, WORDINGS, wording_seed, held_out=False)
     except WordingError as error:
@@ -227,7 +227,7 @@ def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: i
 
 def _draw(site: Site, rng: np.random.Generator) -> Task:
     if site.kind == CORRIDOR and rng.uniform() < 0.6:
-        # As the demo begins, give or take a step.
+        # Near the demo's start.
         x, y, turn = (float(value) for value in rng.uniform((-0.5, -0.5, -0.3), (4.0, 0.5, 0.3)))
         thing = next(thing for thing in site.scene.objects if thing.label == "vending machine")
         return make_task(site.scene, site.grid, (round(x, 2), round(y, 2), round(turn, 3)), thing)
@@ -236,7 +236,7 @@ def _draw(site: Site, rng: np.random.Generator) -> Task:
 
 
 def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
-    """Whether it is worth training on, and sound."""
+    """Return whether to keep a task: randomly by its turns, and only if it is sound."""
     told = task.told
     if not _long_enough(site, task):
         return False
@@ -247,7 +247,7 @@ def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
 
 
 def is_sound(site: Site, task: Task) -> bool:
-    """Whether a task can be learned from, as the benchmark's validator means it: words and way agree."""
+    """Return whether a task is usable by the benchmark's checks: instruction and route agree."""
     return _long_enough(site, task) and _unmistakable(site, task)
 
 
@@ -259,12 +259,12 @@ def _long_enough(site: Site, task: Task) -> bool:
 
 
 def _unmistakable(site: Site, task: Task) -> bool:
-    """Nobody is at the goal beyond a wall from it, and the way bends where and as it is told."""
+    """Return whether no point behind a wall counts as the goal, and the route bends where its description says."""
     return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(task.told, task.path)
 
 
 def _at(place: float, choices: Sequence[tuple[_T, float]]) -> _T:
-    """The choice at a place in [0, 1) of (choice, share) pairs laid end to end."""
+    """Return the choice at position `place` in [0, 1) of the cumulative shares of (choice, share) pairs."""
     left = place * sum(share for _, share in choices)
     for choice, share in choices:
         left -= share

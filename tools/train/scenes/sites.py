@@ -1,4 +1,4 @@
-"""Scenes for training: fresh layouts of the four environments, and the demo's corridor; never one of the benchmark."""
+"""Training scenes: generated layouts of the four environments and the demo's corridor, never one of the benchmark."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from sim_hil.benchmark.language.tasks import goals
 from sim_hil.benchmark.language.visibility import Sightlines
-from sim_hil.benchmark.suite.robots import robot_grid, telling_grid
+from sim_hil.benchmark.suite.robots import robot_grid, route_grid
 from sim_hil.layouts import generate, is_reserved
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, load_scene
 from tools.train.config.scenes import CORRIDOR, KINDS, OUTDOORS
 
-# What can be told apart and gone to in the demo's corridor.
+# Objects of the demo's corridor that are distinguishable and can be goals.
 _CORRIDOR_LANDMARKS: Final = frozenset(
     ("vending machine", "bench", "water dispenser", "fire extinguisher", "cabinet", "notice board", "exit door")
 )
 _OUTDOOR_GOALS: Final = 8
-_MOVED_M: Final = 0.7  # along the wall: no two of them meet
+_MOVED_M: Final = 0.7  # largest shift of an object along the wall, small enough that no two meet
 
 
 class SiteError(ValueError):
-    """A scene that training may not use, or of an unknown kind; one line."""
+    """A scene of an unknown kind or of the benchmark; one line."""
 
 
 class Site:
-    """One scene with what is worked out about it, each when it is first asked for. Raises SiteError, LayoutError."""
+    """One scene with derived data, computed on first use. Raises SiteError, LayoutError."""
 
     def __init__(self, kind: str, layout_seed: int) -> None:
         if kind not in KINDS:
@@ -38,28 +38,28 @@ class Site:
             raise SiteError(f"layout seed {layout_seed} is the benchmark's: expected 100 or more")
         self.kind, self.layout_seed = kind, layout_seed
         made = corridor(layout_seed) if kind == CORRIDOR else generate(kind, layout_seed)
-        # The kind stays in front: people dress by it.
+        # The name begins with the kind, which determines the people's clothes.
         self.scene: Scene = replace(made, name=f"{kind}-{layout_seed}")
         self._robot_grids: dict[str, NavGrid] = {}
 
     @property
     def outdoors(self) -> bool:
-        """Whether there is no ceiling."""
+        """Whether the scene has no ceiling."""
         return self.kind in OUTDOORS
 
     @property
     def threshold_m(self) -> float:
-        """How near the goal has been reached, as in the benchmark."""
+        """Distance to the goal that counts as success, m, as in the benchmark."""
         return 3.0 if self.outdoors else 1.5
 
     @cached_property
     def grid(self) -> NavGrid:
-        """The floor by which ways are told."""
-        return telling_grid(self.scene)
+        """Grid of free floor by which routes are described."""
+        return route_grid(self.scene)
 
     @cached_property
     def goals(self) -> tuple[SceneObject, ...]:
-        """Landmarks to be sent to; outdoors some of them: to search the whole scene for each would take too long."""
+        """Landmarks that can be goals; outdoors a subset, because each needs a search of the whole scene."""
         found = goals(self.scene)
         if not self.outdoors or len(found) <= _OUTDOOR_GOALS:
             return tuple(found)
@@ -68,20 +68,20 @@ class Site:
 
     @cached_property
     def lines(self) -> Sightlines:
-        """Who can be seen from where."""
+        """Sightlines of the scene."""
         return Sightlines(self.scene)
 
     def robot_grid(self, robot: str) -> NavGrid:
-        """The floor that is free for a robot; raises ValueError for an unknown one."""
+        """Return the grid of floor that is free for a robot. Raises ValueError for an unknown robot."""
         if robot not in self._robot_grids:
             self._robot_grids[robot] = robot_grid(self.scene, robot)
         return self._robot_grids[robot]
 
 
 def corridor(layout_seed: int) -> Scene:
-    """The demo's corridor with names for what stands in it: as it is for an even seed, things moved for an odd one.
+    """Build the demo's corridor with named landmarks; for odd seeds the landmarks are moved.
 
-    What stands along the walls is moved along them a little, so that no place can be learnt by heart.
+    Landmarks at the walls are moved a little along them, so that their positions cannot be memorised.
     """
     scene = load_scene(CORRIDOR)
     (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m

@@ -45,32 +45,32 @@ from tools.train.scenes.trace_sentences import (
 
 Array = NDArray[np.float64]
 
-PEOPLE_M: Final = 6.0  # nobody further away is spoken of
-_MANY: Final = (1, 4)  # people in view within PEOPLE_M: few, many
+PEOPLE_M: Final = 6.0  # people farther away are not mentioned
+_MANY: Final = (1, 4)  # least number of people in view within PEOPLE_M that count as few, many
 _AHEAD_RAD: Final = radians(15.0)
 _STANDING_MPS: Final = 0.2
 _ALONG: Final = cos(radians(30.0))
-_BODY_M: Final = (0.35, 0.5, 1.7)  # a person: depth, width, height
-_SHOWN, _WHOLE_PX = 0.2, 4400.0  # of a body as it would be in the picture a metre away
-_SLEEVE_M: Final = 0.1  # whose middle is further beside the picture shows at most a sleeve
-_WAIT_M: Final = 0.5  # who means to get no further in three seconds waits
-_WAIT_FOR_M: Final = 2.5
-_INSIDE_M: Final = 0.2  # so far within an opening it is looked into
-_BACK_M: Final = -0.3  # who means to be so far behind itself in three seconds turns round
-_ROUND_RAD: Final = 2.0  # of its teacher's drives most turn round for what is so far to the side
-_HERE_M: Final = 0.05
-_ON_M: Final = 2.0  # whoever does not say where it means to be is taken to go on
-_EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # the Go2 stands on its legs
+_BODY_M: Final = (0.35, 0.5, 1.7)  # a person's depth, width, height
+_SHOWN, _WHOLE_PX = 0.2, 4400.0  # least visible share of a person, and a whole person's pixels at 1 m
+_SLEEVE_M: Final = 0.1  # a person whose centre is farther outside the image is not visible
+_WAIT_M: Final = 0.5  # a planned position in 3 s within this distance counts as waiting
+_WAIT_FOR_M: Final = 2.5  # the robot waits only for a person within this distance
+_INSIDE_M: Final = 0.2  # depth inside an opening of the point whose visibility is tested
+_BACK_M: Final = -0.3  # a planned x in 3 s below this counts as turning back
+_ROUND_RAD: Final = 2.0  # the expert usually turns around for targets beyond this bearing
+_HERE_M: Final = 0.05  # a planned position within this distance means staying
+_ON_M: Final = 2.0  # x in 3 s that is assumed without a plan: the robot drives on
+_EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # camera height; the Go2's while standing
 
 
 def turning_first(point: Vec2, turn_radps: float, speed_mps: float) -> Vec2:
-    """Where a robot gets in 3 s that turns towards a point in its frame, m, before it drives: as the expert does.
+    """Return the position in 3 s, m in the robot frame, of a robot that first turns to a point, as the expert does.
 
-    What lies well behind it comes out behind it, however little time the turn leaves: it means to turn round.
+    A point far behind gives a position behind the robot, which means turning around.
     """
     bearing, gap_m = atan2(point[1], point[0]), hypot(*point)
     if gap_m < _HERE_M:
-        return (_ON_M, 0.0)  # it means to be where it is, and waits for nobody
+        return (_ON_M, 0.0)  # it stays, without waiting for a person
     if abs(bearing) > _ROUND_RAD:
         return (2.0 * _BACK_M, 0.0)
     gone_m = max(3.0 - abs(bearing) / turn_radps, 0.0) * speed_mps
@@ -78,10 +78,10 @@ def turning_first(point: Vec2, turn_radps: float, speed_mps: float) -> Vec2:
 
 
 class Sight(Protocol):
-    """Tells what is seen of a thing, as `Sightlines` does."""
+    """Computes the visibility of objects (see `Sightlines`)."""
 
     def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
-        """px of a 128 x 128 picture."""
+        """Return the visible pixels of an object in a 128 x 128 image."""
         ...
 
 
@@ -91,7 +91,7 @@ class Tracer:
     def __init__(
         self, scenario: Scenario, progress: RouteProgress | None = None, lines: Sight | None = None
     ) -> None:  # fmt: skip
-        """`lines`: who can be seen from where, in place of the site's own."""
+        """`lines`: sightlines to use instead of the site's."""
         self._scene, told = scenario.scene, scenario.told
         self._lines: Sight = scenario.site.lines if lines is None else lines
         self.progress = RouteProgress(scenario) if progress is None else progress
@@ -137,7 +137,7 @@ class Tracer:
         return Situation(kind, sum(near >= least for least in _MANY))
 
     def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
-        """Indices and distances, m, of those that are seen within PEOPLE_M, nearest first."""
+        """Return indices and distances, m, of people in view within PEOPLE_M, nearest first."""
         gaps = np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m) if len(people) else np.zeros(0)
         found: list[tuple[int, float]] = []
         nearer: list[SceneObject] = []
@@ -154,11 +154,11 @@ class Tracer:
     def _seen(
         self, pose: SE2, thing: SceneObject, bodies: Sequence[SceneObject], least_px: float = MIN_PIXELS
     ) -> bool:  # fmt: skip
-        """Whether enough of a thing is in the picture, and nobody stands right before it."""
+        """Return whether enough of an object is in the image and no person covers it."""
         return self._pixels(pose, thing) >= least_px and not any(_covers(pose, body, thing) for body in bodies)
 
     def _pixels(self, pose: SE2, thing: SceneObject) -> float:
-        """What is seen of a thing in a 128 x 128 picture, px."""
+        """Return the visible pixels of an object in a 128 x 128 image."""
         reach_m = hypot(*thing.size_m[:2]) / 2
         if not self._in_frame(pose, thing, reach_m * (1.0 + tan(HFOV_RAD / 2))):
             return 0.0  # no need to cast rays
@@ -170,7 +170,7 @@ class Tracer:
         return (pose.x_m + ahead * cos(pose.theta_rad), pose.y_m + ahead * sin(pose.theta_rad))
 
     def _in_frame(self, pose: SE2, thing: SceneObject, margin_m: float) -> bool:
-        """Whether a thing's middle is between the picture's sides, or beside them by no more than the margin."""
+        """Return whether an object's centre is between the image's sides, or outside by at most the margin, m."""
         (x, y), c, s = self._eye(pose), cos(pose.theta_rad), sin(pose.theta_rad)
         dx, dy = thing.position_m[0] - x, thing.position_m[1] - y
         return abs(dy * c - dx * s) <= tan(HFOV_RAD / 2) * (dx * c + dy * s) + margin_m
@@ -201,9 +201,9 @@ class Tracer:
             left = opening.side == "left"
             across = self._border(frame, xy, opening) + (_INSIDE_M if left else -_INSIDE_M)
             point = frame.point(opening.middle_m, across)
-            # From close to the wall its far end is seen first.
+            # Close to the wall, the opening's far end is visible first.
             if self._in_sight(pose, point) or self._in_sight(pose, frame.point(opening.high_m - _INSIDE_M, across)):
-                # Along the corridor it is on the side on which it counts, however small the angle.
+                # Along the corridor its side is the one on which it counts, however small the angle.
                 along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
                 side = opening.side if along else _side(pose, point)
                 metres = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
@@ -211,17 +211,17 @@ class Tracer:
         return None
 
     def _border(self, frame: Frame, xy: Vec2, opening: Opening) -> float:
-        """Where an opening begins, across the direction of travel."""
+        """Return the lateral position at which an opening begins, m across the direction of travel."""
         low, high = frame.span(bounds_of(opening.area))[1]
         if not low < frame.across(xy) < high:
             return low if opening.side == "left" else high
-        # The corridor runs into or across that area: it opens where the corridor's own wall ends.
+        # The corridor runs into or across that area: the opening begins where the corridor's wall ends.
         own = self._scene.area_at(*xy)
         low, high = (frame.across(xy),) * 2 if own is None else frame.span(bounds_of(own))[1]
         return high if opening.side == "left" else low
 
     def _in_sight(self, pose: SE2, point: Vec2) -> bool:
-        """Whether a post as high as a table would be seen at a point."""
+        """Return whether a post of table height would be visible at a point."""
         post = SceneObject("post", "column", (*point, 0.0), 0.0, (0.1, 0.1, 0.8), (0.0, 0.0, 0.0), "")
         return self._pixels(pose, post) > 0
 
@@ -250,13 +250,13 @@ def _motion(pose: SE2, at: Array, velocity: Array) -> str:
 
 
 def _body(at: Array) -> SceneObject:
-    """Somebody as a thing to look at."""
+    """Return a person as a scene object."""
     heading = float(at[2]) if len(at) > 2 else 0.0
     return SceneObject("person", "column", (float(at[0]), float(at[1]), 0.0), heading, _BODY_M, (0.5, 0.5, 0.5), "")
 
 
 def _covers(pose: SE2, body: SceneObject, thing: SceneObject) -> bool:
-    """Whether somebody stands before a thing's whole width."""
+    """Return whether a person covers an object's whole width."""
     if _gap(pose, body) > _gap(pose, thing) - 0.3:
         return False
     (low, high), (right, left) = _bearings(pose, thing), _bearings(pose, body)
@@ -264,7 +264,7 @@ def _covers(pose: SE2, body: SceneObject, thing: SceneObject) -> bool:
 
 
 def _bearings(pose: SE2, thing: SceneObject) -> tuple[float, float]:
-    """Directions of a thing's right and left edges from the robot's heading, rad."""
+    """Return the bearings of an object's right and left edges, rad."""
     bearings = [
         wrap_angle(atan2(y - pose.y_m, x - pose.x_m) - pose.theta_rad) for x, y in thing.box.corners()
     ]  # fmt: skip

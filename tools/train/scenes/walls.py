@@ -1,9 +1,9 @@
-"""Walls around a robot, for plans that are to keep off them: known where drives were recorded, seen by no policy.
+"""Walls around the robot, for a loss on plans too close to them; ground truth that no policy receives.
 
-Imitation alone weighs half a metre through the free floor as it weighs half a metre through a doorpost; where a turn's
-place is uncertain, the plan in the middle of all is one that cuts the corner. What is imitated stays the measure: a
-plan may come as near to things as the expert's own does anywhere. Plans that graze are drawn off; of one that goes
-through a wall the steps up to there are, back from it: which way round is for imitation to say.
+The imitation loss weighs an error of half a metre on free floor like one through a doorpost; if the position of a turn
+is uncertain, the mean of the possible plans cuts the corner. The expert remains the measure: a plan may come as close
+to walls as the expert's plan does anywhere. Plans that touch a wall are pushed away. Of a plan through a wall, only the
+steps up to the wall count and are pushed back; the side of the obstacle is left to imitation.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from tools.train.scenes.sites import Site, SiteError
 
 CELL_M: Final = 0.1
 X_M: Final = (-0.6, 5.4)
-"""Of the floor that a sample carries, in the robot's frame; no plan of 5 s at 1 m/s comes further."""
+"""Extent of a sample's patch of floor in the robot frame, m; no plan of 5 s at 1 m/s leaves it."""
 Y_M: Final = (-3.0, 3.0)
 SHAPE: Final = (round((Y_M[1] - Y_M[0]) / CELL_M) + 1, round((X_M[1] - X_M[0]) / CELL_M) + 1)
 OPEN_M: Final = 2.0
-"""Clearance where nothing is near, or nothing is known."""
+"""Clearance without walls nearby, or without known walls, m."""
 _MIRRORED: Final = np.array((1.0, -1.0, -1.0))
 _EVERY_M, _MIDDLE_M, _FREE = 0.3, 0.15, 0.9
 
 
 @dataclass(frozen=True)
 class Body:
-    """What a robot's plan is measured by: two circles, one before and one behind its middle; m."""
+    """A robot's footprint as two circles of `radius_m`, `reach_m` before and behind its centre; m."""
 
     reach_m: float
     radius_m: float
@@ -44,7 +44,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Floor:
-    """A scene's clearances, m, at the middles of cells [rows (y), columns (x)]; all that is kept of its grid."""
+    """A scene's clearances, m, at the centres of cells [rows (y), columns (x)]."""
 
     scene: str
     clearances: NDArray[np.float32]
@@ -52,36 +52,36 @@ class Floor:
     cell_m: float
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """[..., 2] x m, y m -> [...]: blended from the cells around; beyond the floor as at its edge."""
+        """Interpolate clearances [...] at points [..., 2] x m, y m; outside the floor the edge's values apply."""
         cells = (points[..., ::-1] - self.origin_m[::-1]) / self.cell_m - 0.5
         where = np.moveaxis(cells, -1, 0)
         found: NDArray[np.float32] = map_coordinates(self.clearances, where, order=1, mode="nearest")
         return found
 
     def saw(self, walls: Walls, scene: str) -> bool:
-        """Whether a drive is of this scene as it is built now: of its name, and its way hardly ever through things."""
+        """Return whether a drive was recorded in this scene: same name, and almost no path through walls."""
         xy = walls.where()[:, :2]
         gone = np.cumsum(np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)) // _EVERY_M
-        way = xy[np.unique(gone, return_index=True)[1]]  # where it stands long counts once
+        way = xy[np.unique(gone, return_index=True)[1]]  # a long stop counts once
         return scene == self.scene and float(np.mean(self.at(way) >= _MIDDLE_M)) >= _FREE
 
 
 @dataclass(frozen=True)
 class Walls:
-    """The walls along one drive."""
+    """Walls along one drive."""
 
     floor: Floor
     pose: NDArray[np.float64]
-    """[N, 3] true poses: x m, y m, theta rad; in the mirror's scene if the drive is."""
+    """[N, 3] true poses: x m, y m, theta rad; mirrored if the drive is."""
     body: Body
     in_mirror: bool = False
 
     def where(self) -> NDArray[np.float64]:
-        """[N, 3]: poses in the scene itself, also of a mirrored drive."""
+        """Return the poses [N, 3] in the original scene, also for a mirrored drive."""
         return self.pose * _MIRRORED if self.in_mirror else self.pose
 
     def patches(self, ks: list[int]) -> NDArray[np.float16]:
-        """Clearances [g, rows (y), columns (x)], m, around the robot in its frame at some frames."""
+        """Return clearances [g, rows (y), columns (x)], m, around the robot at frames `ks`, in the robot frame."""
         x, y = np.meshgrid(np.linspace(*X_M, SHAPE[1]), np.linspace(*Y_M, SHAPE[0]))
         if self.in_mirror:
             y = -y
@@ -92,13 +92,13 @@ class Walls:
 
 
 class Scenes:
-    """The walls of drives' scenes, each worked out once."""
+    """Walls of scenes, each computed once."""
 
     def __init__(self) -> None:
         self._floors: dict[tuple[str, int, str], Floor] = {}
 
     def along(self, drive: Drive, *, in_mirror: bool = False) -> Walls | None:
-        """Those along a drive (its poses in the mirror, if it is a mirror's); None where its scene is not ours."""
+        """Return the walls along a drive (mirrored poses with `in_mirror`); None if its scene is unknown or changed."""
         about = drive.about
         key = (about.kind, about.layout_seed, about.robot)
         if key not in self._floors:
@@ -115,15 +115,15 @@ class Scenes:
 
 
 def nothing_near(count: int) -> NDArray[np.float16]:
-    """Patches of frames about which nothing is known."""
+    """Return patches without walls for `count` frames."""
     return np.full((count, *SHAPE), OPEN_M, np.float16)
 
 
 def room(plan: Tensor, patches: Tensor, body: Tensor) -> Tensor:
-    """Room [B, steps], m, between the robot and what is nearest to it along trajectories; below 0 inside a wall.
+    """Compute the distance [B, steps], m, between the robot and the nearest wall along plans; negative inside a wall.
 
-    `plan` [B, steps, 3] x m, y m, theta rad in the robot's frame, `patches` [B, rows, columns], `body` [B, 2] reach and
-    radius, m. It has a gradient towards the plan, but for places beyond the patch, which count as its edge.
+    `plan` [B, steps, 3] x m, y m, theta rad in the robot frame; `patches` [B, rows, columns]; `body` [B, 2] reach and
+    radius, m. Differentiable in the plan, except outside the patch, where the edge's values apply.
     """
     xy, heading = plan[..., :2], plan[..., 2]
     reach = body[:, :1, None] * torch.stack([torch.cos(heading), torch.sin(heading)], dim=-1)
@@ -132,7 +132,7 @@ def room(plan: Tensor, patches: Tensor, body: Tensor) -> Tensor:
 
 
 def _gaps(points: Tensor, patches: Tensor) -> Tensor:
-    """Clearances [B, n] at points [B, n, 2] in the robot's frame."""
+    """Interpolate clearances [B, n] at points [B, n, 2] in the robot frame."""
     low, high = points.new_tensor([X_M[0], Y_M[0]]), points.new_tensor([X_M[1], Y_M[1]])
     where = (points - low) / (high - low) * 2 - 1
     return F.grid_sample(
@@ -141,10 +141,10 @@ def _gaps(points: Tensor, patches: Tensor) -> Tensor:
 
 
 def too_near(plan: Tensor, target: Tensor, known: Tensor, patches: Tensor, body: Tensor, room_m: float) -> Tensor:
-    """How far [B], m, plans come nearer to things than both `room_m` and the label's nearest; mean over steps.
+    """Compute by how much plans are closer to walls than both `room_m` and the label's smallest distance: [B], m.
 
-    Steps beyond the first one whose middle is inside something do not count: a wall is thin, and its far side would
-    draw them on.
+    It is the mean over steps. Steps after the first one inside a wall do not count: a wall is thin, and its far side
+    would attract them.
     """
     with torch.no_grad():
         least = room(target, patches, body).masked_fill(~known, OPEN_M).amin(dim=1, keepdim=True)

@@ -1,7 +1,7 @@
-"""An anchor as a language model is shown it, never twice the same: a few frames earlier or later, through other noise.
+"""Augmentation of the language model's samples: frames shifted by up to 0.3 s, and noise on visual tokens.
 
-A small model learns the tokens of a thousand places by heart long before it reads them. The text of an instant holds
-for a third of a second before and after it; the waypoints are those of the very frame.
+A small model would memorise the tokens of a thousand places. The text of an anchor is valid for 0.3 s before and after
+it; the waypoints are those of the shifted frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tools.train.samples.language_batch import Halves
 
 
 def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anchor:
-    """The anchor a few frames off, where the drive has them; the same numbers are taken from `rng` whatever comes."""
+    """Shift an anchor by a few frames if the drive has them; the number of draws from `rng` is always the same."""
     by = int(rng.integers(-config.shift_frames, config.shift_frames + 1))
     jitter = rng.integers(-config.jitter_frames, config.jitter_frames + 1, 8)
     points = anchor.around[AROUND + by] if anchor.around else None
@@ -37,7 +37,7 @@ def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anc
 
 
 def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, ...]:
-    """Older frames a little elsewhere, in their order still."""
+    """Shift the older frames; their order is kept."""
     found: list[int] = []
     for frame, by in zip(frames[:-1], jitter, strict=False):
         found.append(min(max(frame + int(by), found[-1] + 1 if found else 0), frames[-1] - 1))
@@ -45,7 +45,7 @@ def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, 
 
 
 def disturbed(frames: tuple[Halves, ...], config: ShowConfig, rng: np.random.Generator) -> tuple[Halves, ...]:
-    """Visual tokens [N, D] of each frame with noise, some of them blank."""
+    """Add noise to the visual tokens [N, D] of each frame and set some of them to zero."""
     shown: list[Halves] = []
     for tokens in frames:
         values = tokens.astype(np.float32)

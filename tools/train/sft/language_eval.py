@@ -1,7 +1,7 @@
-"""How well the language model speaks of places that it has never seen: what it says against what is true.
+"""Evaluation of the language model on held-out layouts: decoded text against the true text.
 
-Twice: told the right progress of the generation before, as in training, and told what it said itself, generation after
-generation along a drive, as on the robot.
+The prompt contains either the true previous progress, as in training, or the progress that the model decoded itself in
+the previous generation along a drive, as on the robot.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ _TAG: Final = 0xE7A1
 
 
 class Score:
-    """Adds up answers; `numbers` are shares and means over them.
+    """Accumulates scores of answers; `numbers` are their shares and means.
 
-    A change is an anchor whose progress is not what it was at the generation before: there, repeating does not help.
-    A false change is another answer than the last one's where nothing has changed.
+    A change is an anchor whose progress differs from that of the previous generation. A false change is an answer with
+    new progress at an anchor without a change.
     """
 
     def __init__(self, gap_s: float) -> None:
-        """`gap_s`: how long before it the last generation looked."""
+        """`gap_s`: time since the previous generation's newest frame."""
         self._gap_s = gap_s
         self._count: Counter[str] = Counter()
         self._errors_m: list[list[float]] = []
 
     def add(self, text: str, anchor: Anchor) -> None:
-        """One answer to an anchor."""
+        """Add one answer to an anchor."""
         found = self._count
         found["answers"] += 1
         answer = parse_text(text)
@@ -57,16 +57,16 @@ class Score:
         if true_side is not None:
             found["sides"] += 1
             found["side right"] += side_of(answer) == true_side
-        said, there = landmarks_of(answer), landmarks_of(anchor.reasoning)
-        found["landmarks said"] += said.total()
-        found["landmarks there"] += there.total()
-        found["landmarks right"] += (said & there).total()
+        found_names, true_names = landmarks_of(answer), landmarks_of(anchor.reasoning)
+        found["landmarks said"] += found_names.total()
+        found["landmarks there"] += true_names.total()
+        found["landmarks right"] += (found_names & true_names).total()
         if waypoints is not None:
             pairs = zip(waypoints, anchor.points, strict=True)
             self._errors_m.append([hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs])
 
     def numbers(self) -> dict[str, Any]:
-        """JSON values; a share of nothing is None."""
+        """Return the scores as JSON values; a share without cases is None."""
         n = self._count
         errors = np.array(self._errors_m).reshape(-1, len(WAYPOINT_TIMES_S))
         return {
@@ -85,7 +85,7 @@ class Score:
         }
 
     def points(self) -> dict[str, object]:
-        """Those of `numbers` that an answer without reasoning has."""
+        """Return the scores that apply to answers without reasoning text."""
         numbers = self.numbers()
         return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
 
@@ -99,7 +99,7 @@ def evaluate(
     *,
     seed: int,
 ) -> dict[str, Any]:
-    """Scores under `taught` (right words before), `own` (its own words before) and `waypoints_only`."""
+    """Return scores as `taught` (true previous progress), `own` (its own previous progress) and `waypoints_only`."""
     rng = np.random.default_rng((seed, _TAG))
     speaker = Speaker(language, prompts, tokens, config)
     some = _some(anchors, config.anchors, rng)
@@ -122,7 +122,7 @@ def glance(
     *,
     seed: int,
 ) -> dict[str, float]:
-    """A few numbers for a curve, of `epoch_anchors` anchors, always the same ones; {} where there are none."""
+    """Return a few scores of `epoch_anchors` fixed anchors for a curve; empty if there are none."""
     some = _some(anchors, config.epoch_anchors, np.random.default_rng((seed, _TAG)))
     numbers = taught(Speaker(language, prompts, tokens, config), some, config.gap_s).numbers()
     found = {
@@ -138,7 +138,7 @@ def glance(
 def taught(
     speaker: Speaker, questions: Sequence[tuple[Anchor, str]], gap_s: float, *, waypoints_only: bool = False
 ) -> Score:
-    """Of answers to (anchor, wording) where the generation before, `gap_s` ago, was right."""
+    """Score answers to (anchor, wording) with the true progress of `gap_s` ago in the prompt."""
     drawn = [(anchor, Drawn(wording, anchor.before(gap_s), waypoints_only)) for anchor, wording in questions]
     score = Score(gap_s)
     for (anchor, _), text in zip(drawn, speaker.say(drawn), strict=True):
@@ -147,13 +147,13 @@ def taught(
 
 
 def _some(anchors: Sequence[Anchor], count: int, rng: np.random.Generator) -> list[tuple[Anchor, str]]:
-    """Anchors spread over all, each with one of its wordings."""
+    """Draw `count` anchors, each with one of its wordings."""
     chosen = [anchors[int(i)] for i in sorted(rng.permutation(len(anchors))[:count])]
     return [(anchor, anchor.wordings[int(rng.integers(len(anchor.wordings)))]) for anchor in chosen]
 
 
 class Speaker:
-    """Greedy answers of a language model, in batches of about one length."""
+    """Greedy decoding of a language model, in batches of similar length."""
 
     def __init__(self, language: LanguageModel, prompts: Prompts, tokens: FrameTokens, config: EvalConfig) -> None:
         self._language = language
@@ -185,8 +185,8 @@ class Speaker:
                 device=language.embed.weight.device,
             )
             answers = decode(language, batch, self._config.max_new_tokens, [constraints[i] for i in chosen])
-            for i, said in zip(chosen, answers, strict=True):
-                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(said.ids)
+            for i, decoded in zip(chosen, answers, strict=True):
+                texts[i] = (WAYPOINTS_START if questions[i][1].waypoints_only else "") + self._prompts.text(decoded.ids)
         return texts
 
 

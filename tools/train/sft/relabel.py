@@ -1,12 +1,12 @@
-"""The same drive under other instructions: routes to other goals from its start, and what is true along them.
+"""Relabelling of drives with instructions for other goals: other routes from the same start and their true texts.
 
-A drive shows one of many routes that its first pictures allow. A model that sees every corridor with one instruction
-memorises the corridors; with several instructions it has to read them. Where the drive leaves the other route, it shows
-a missed turn. Only the text is relabelled, and only where no person is near: the recording does not say where people
-stood, so what they hid, and how to pass them on another route, is unknown.
+A drive follows one of many routes that its first images allow. A model that sees every corridor with one instruction
+memorises the corridor and its turn; with several instructions it must read them. Behind the point where the drive
+leaves the other route, the relabelled drive shows a missed turn. Only texts are relabelled, and only where no person is
+near: the people's positions are not recorded, so occlusion and avoidance on the other route are unknown.
 
-Relabels lie beside the drives, a JSON file for each, in a folder whose name begins the hash of their numbers. They are
-written by rename, so a build that was interrupted continues with the next drive.
+Relabels are JSON files, one for each drive, in a folder named by the hash of their configuration. They are written
+atomically, so that an interrupted build continues with the next drive.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import SceneObject, Vec3
 from tools.train.config.collect import TRACE_EVERY
-from tools.train.config.sft import RetellConfig
+from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
@@ -47,24 +47,25 @@ from tools.train.scenes.traces import Sight, Tracer, turning_first
 FOLDER: Final = "retold"
 FORMAT: Final = 2
 LEAST_FRAMES: Final = 50
-"""That a retelling has; a shorter one teaches nothing."""
-_OFF_M: Final = 3.0  # so far from the other way a retelling ends: most of it is not of turns that were missed
-_APART_M: Final = 2.0  # between two goals
-_FREE: Final = 0.9  # of a drive's poses are on the scene's free floor, if it is the scene; a policy brushes walls
-_ARRIVE_SHARE: Final = 0.7  # of the distance that counts as arrived, as where drives end
-_REACH_M: Final = 10.0  # of a route: 9 s of it
+"""Shortest useful relabel, frames."""
+_OFF_M: Final = 3.0  # a relabel ends at this distance from its route, so that missed turns do not dominate
+_APART_M: Final = 2.0  # smallest distance between two goals
+_FREE: Final = 0.9  # least share of a drive's poses on free floor if the scene is unchanged; policies touch walls
+_ARRIVE_SHARE: Final = 0.7  # share of the success distance at which a relabel ends, as drives do
+_REACH_M: Final = 10.0  # planned length of a route: 9 s of driving
 _TAG: Final = 0x2E7E11
 
 
-class RetellError(ValueError):
+class RelabelError(ValueError):
     """Relabels that cannot be read; one line: what, expected, found, what to do."""
 
 
 @dataclass(frozen=True)
 class InstructionRelabel:
-    """The first N frames of a drive under another instruction.
+    """Another instruction for the first N frames of a drive.
 
-    `plan_xy` [N, 3, 2]: where one would be on it in 3, 6 and 9 s, m in the robot's frame; `traces`: one a second.
+    `told`: steps of its route; `plan_xy` [N, 3, 2]: positions on it in 3, 6 and 9 s, m in the robot frame; `traces`:
+    one per second.
     """
 
     wordings: tuple[str, ...]
@@ -77,7 +78,7 @@ class InstructionRelabel:
         return len(self.plan_xy)
 
     def of(self, drive: Drive) -> Drive:
-        """The drive as this tells it: nothing is known of what to do next, and its pictures are left out."""
+        """Return the relabelled drive, without action labels and images."""
         count = len(self)
         about = replace(
             drive.about, wordings=self.wordings, told=self.told, goal_xy=self.goal_xy, traces=self.traces
@@ -96,13 +97,13 @@ class InstructionRelabel:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """What `of_json` reads."""
+        """Return the content that `of_json` reads."""
         plan = [[[round(float(v), 3) for v in point] for point in frame] for frame in self.plan_xy]
         return {**asdict(self), "plan_xy": plan}
 
     @staticmethod
     def of_json(content: dict[str, Any]) -> InstructionRelabel:
-        """What `as_json` has written; raises KeyError, TypeError, ValueError."""
+        """Build the relabel that `as_json` wrote. Raises KeyError, TypeError, ValueError."""
         x, y = content["goal_xy"]
         lists = {name: tuple(content[name]) for name in ("wordings", "told", "traces")}
         plan = np.array(content["plan_xy"], np.float32).reshape(-1, len(PLAN_TIMES_S), 2)
@@ -110,10 +111,10 @@ class InstructionRelabel:
 
 
 class InstructionRelabels:
-    """Those of a data set's drives, by one set of numbers."""
+    """Relabels of a data set's drives with one configuration."""
 
-    def __init__(self, dataset: Dataset, config: RetellConfig, seed: int, speed_mps: float) -> None:
-        """Opens what is there; `build` makes what is missing. `speed_mps`: the expert's, at which waypoints are."""
+    def __init__(self, dataset: Dataset, config: RelabelConfig, seed: int, speed_mps: float) -> None:
+        """Open the existing relabels; `build` computes missing ones. `speed_mps`: the expert's speed."""
         numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **asdict(config)}
         self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
         self.folder = dataset.folder / FOLDER / self.key[:16]
@@ -124,14 +125,14 @@ class InstructionRelabels:
         self, ids: Sequence[str], *, ranks: Ranks = SINGLE, progress: StageProgress | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:  # fmt: skip
-        """Make what is missing of these drives. Ranks share the layouts; all must call.
+        """Compute the missing relabels of these drives. Ranks share the layouts; all must call this function.
 
         Raises DriveError, OSError, and KeyboardInterrupt when `stopped` on any rank.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()
         missing = [self._entries[drive_id] for drive_id in ids if self._read(drive_id) is None]
-        ranks.barrier()  # everybody has looked before anybody adds
+        ranks.barrier()  # all ranks have checked before any writes
         places: dict[tuple[str, int], list[Entry]] = {}
         for entry in missing:
             places.setdefault((entry.kind, entry.layout_seed), []).append(entry)
@@ -144,7 +145,7 @@ class InstructionRelabels:
                 if stopped():
                     break
                 drive = self._dataset.load(entry.id, pictures=False)
-                found = [] if site is None else retell(drive, site, self._config, self._seed, self._speed_mps)
+                found = [] if site is None else relabel(drive, site, self._config, self._seed, self._speed_mps)
                 content = {"drive_sha256": entry.sha256, "ways": [each.as_json() for each in found]}
                 write_whole(self._path(entry.id), json.dumps(content, separators=(",", ":")) + "\n")
                 done += 1
@@ -153,15 +154,15 @@ class InstructionRelabels:
             raise KeyboardInterrupt
 
     def anchors(self, drive: Drive) -> list[Anchor]:
-        """Those of a drive under its other instructions at which nobody is near; raises RetellError before `build`."""
+        """Return a drive's relabelled anchors without a person near. Raises RelabelError before `build`."""
         found = self._read(drive.id)
         if found is None:
-            raise RetellError(f"{self._path(drive.id)}: not the retellings of this drive; build them first")
+            raise RelabelError(f"{self._path(drive.id)}: not the relabels of this drive; build them first")
         alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == NO_PEOPLE}
         return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
 
     def _read(self, drive_id: str) -> list[InstructionRelabel] | None:
-        """What was written of a drive as it is now; None where nothing was, or where it cannot be read."""
+        """Read a drive's relabels; None if there are none, they are damaged, or the drive has changed."""
         try:
             content = json.loads(self._path(drive_id).read_text(encoding="utf-8"))
             found = [InstructionRelabel.of_json(each) for each in content["ways"]]
@@ -174,15 +175,15 @@ class InstructionRelabels:
 
 
 def _site(kind: str, layout_seed: int) -> Site | None:
-    """None for a scene that is not one of ours."""
+    """Build the scene; None if it is not a generated training scene."""
     try:
         return Site(kind, layout_seed)
     except (SiteError, LayoutError):
         return None
 
 
-def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps: float) -> list[InstructionRelabel]:
-    """Ways to other goals of its site, in an order by chance; the same numbers give the same."""
+def relabel(drive: Drive, site: Site, config: RelabelConfig, seed: int, speed_mps: float) -> list[InstructionRelabel]:
+    """Relabel a drive for other goals of its scene, in random order; equal arguments give equal relabels."""
     rng = np.random.default_rng((seed, _TAG, crc32(drive.id.encode())))
     things = [site.goals[int(index)] for index in rng.permutation(len(site.goals))[: config.tries]]
     first = drive.T_world_base(0)
@@ -195,19 +196,19 @@ def retell(drive: Drive, site: Site, config: RetellConfig, seed: int, speed_mps:
         if len(found) >= config.ways:
             break
         scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
-        if scenario is not None and (one := told_along(drive, scenario, speed_mps, lines)) is not None:
+        if scenario is not None and (one := relabel_along(drive, scenario, speed_mps, lines)) is not None:
             found.append(one)
     return found
 
 
 def _was_here(drive: Drive, site: Site) -> bool:
-    """Whether a drive is of a scene as it is built now: of its name, and through no wall of it."""
+    """Return whether the scene is the one in which the drive was recorded: same name, and no path through walls."""
     free = [site.robot_grid(drive.about.robot).is_free(float(x), float(y)) for x, y, _ in drive.pose[::TRACE_EVERY]]
     return drive.about.scene == site.scene.name and float(np.mean(free)) >= _FREE
 
 
 def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int) -> Scenario | None:
-    """The task to go to a thing from a drive's start; None where it cannot be told, or is the drive's own."""
+    """Make the task to go from a drive's start to an object; None if it has no instruction, or is the drive's own."""
     about = drive.about
     try:
         task = make_task(site.scene, site.grid, start, thing)
@@ -221,12 +222,12 @@ def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed:
         return None
 
 
-def told_along(
+def relabel_along(
     drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None
 ) -> InstructionRelabel | None:
-    """What is true along a drive of the way of a scenario that begins where it began; None where it hardly shows any.
+    """Relabel a drive with a scenario that has the same start; None if fewer than LEAST_FRAMES frames are usable.
 
-    Told up to where the drive is 3 m from that way, or has arrived. `lines`: as of `Tracer`.
+    It ends where the drive is 3 m off the scenario's route, or has arrived. `lines`: see `Tracer`.
     """
     progress = RouteProgress(scenario)
     count = _shown_frames(drive, scenario, progress)
@@ -254,7 +255,7 @@ def _with_people(alone: ReasoningText, own: ReasoningText) -> ReasoningText:
 
 
 def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:
-    """How many frames a drive has before it arrives at another goal, or is too far from the way there."""
+    """Count a drive's frames until it arrives at the other goal, or is too far from the route to it."""
     x, y = scenario.episode.goal_xy
     near = np.hypot(drive.pose[:, 0] - x, drive.pose[:, 1] - y) < _ARRIVE_SHARE * scenario.episode.threshold_m
     for k in range(len(drive)):
@@ -266,7 +267,7 @@ def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> 
 
 
 def _plans(drive: Drive, scenario: Scenario, speed_mps: float, count: int) -> NDArray[np.float32] | None:
-    """[count, 3, 2]: where one would be on the way, from every frame; None where the robot cannot get there."""
+    """Return positions on the route in 3, 6 and 9 s from every frame [count, 3, 2]; None if the goal is unreachable."""
     episode = scenario.episode
     robot, goal_xy = episode.robot, episode.goal_xy
     planner = RoutePlanner(
@@ -287,14 +288,14 @@ def _plans(drive: Drive, scenario: Scenario, speed_mps: float, count: int) -> ND
 
 
 class _Remembered:
-    """Sightlines that are asked the same for several ways along one drive."""
+    """Cache of sightlines, which several relabels of one drive share."""
 
     def __init__(self, lines: Sight) -> None:
         self._lines = lines
         self._known: dict[tuple[object, ...], float] = {}
 
     def pixels(self, eye: Vec3, heading_rad: float, thing: SceneObject, range_m: float) -> float:
-        """As `Sightlines.pixels`."""
+        """See `Sightlines.pixels`."""
         key = (eye, heading_rad, thing.label, thing.position_m, range_m)
         if key not in self._known:
             self._known[key] = self._lines.pixels(eye, heading_rad, thing, range_m)

@@ -1,7 +1,7 @@
-"""Stage 1: the language model learns reasoning with waypoints, and waypoints alone, over a frozen encoder (equation 3).
+"""Stage 1: the language model learns reasoning text with waypoints, and waypoints alone; the encoder is frozen (eq. 3).
 
-What is random — words, `before`, kind of answer, order — is a pure function of seed and epoch, so a run that was ended
-goes on exactly, and any number of ranks sees the same batches.
+All random choices (wording, previous progress, kind of answer, order) are functions of seed and epoch. An interrupted
+run resumes exactly, and the number of ranks does not change the batches.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
 PLANNED_TOUR_S: Final = 45.0
-_DECIDE: Final = 0.3  # share of anchors that decide, in `nano`'s 328 drives
-_RETOLD: Final = 0.2  # of a drive's anchors that each other way adds, in 16 drives
+_DECIDE: Final = 0.3  # share of deciding anchors, measured in `nano`'s 328 drives
+_RETOLD: Final = 0.2  # share of a drive's anchors that each other instruction adds, measured in 16 drives
 _DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
 
 
 class SftError(ValueError):
-    """Data or a checkpoint that cannot be learned from; one line."""
+    """Unusable data, or a checkpoint of another run; one line."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One drawn question and answer as ids, int32, and the anchor that it is about, as it is or in the mirror."""
+    """One drawn prompt and answer as token ids, int32, with its anchor, which may be mirrored."""
 
     anchor: int
     in_mirror: bool
@@ -63,21 +63,21 @@ class Sample:
     answer: npt.NDArray[np.int32]
     frames: tuple[int, ...]
     noise_seed: int | None = None
-    """Of what disturbs the visual tokens; None: nothing does."""
+    """Seed of the noise on visual tokens; None: no noise."""
 
     def __len__(self) -> int:
         return len(self.prompt) + len(self.answer)
 
 
 class Samples:
-    """What can be drawn from the anchors of some drives."""
+    """Draws samples from anchors."""
 
     def __init__(
         self, anchors: Sequence[Anchor], prompts: Prompts, views: Views, words: DrawConfig, mirrored: float = 0.0,
         deciding: int = 1, shown: ShowConfig | None = None,
     ) -> None:  # fmt: skip
-        """`mirrored`: share of samples that are of the mirrored drive; `deciding`: how often an anchor that decides
-        is drawn; `shown`: how its frames are disturbed (None: not at all)."""
+        """`mirrored`: share of mirrored samples; `deciding`: repetitions of a deciding anchor; `shown`: augmentation of
+        frames (None: none)."""
         self.anchors = tuple(anchors)
         self._shown = [i for i, each in enumerate(self.anchors) for _ in range(deciding if each.decides else 1)]
         self._prompts = prompts
@@ -90,7 +90,7 @@ class Samples:
         return len(self._shown)
 
     def draw(self, rng: np.random.Generator) -> list[Sample]:
-        """One sample of every anchor, `deciding` of those that decide."""
+        """Draw one sample of every anchor, and `deciding` samples of deciding anchors."""
         drawn: list[Sample] = []
         for index in self._shown:
             anchor = self.anchors[index]
@@ -98,16 +98,16 @@ class Samples:
             seed = None
             if self._show is not None:
                 near, seed = shifted(anchor, self._show, rng), int(rng.integers(2**31))
-                # In the mirror only whole seconds have tokens.
+                # Mirrored drives have tokens at whole seconds alone.
                 anchor = anchor if in_mirror else near
-            asked = mirrored(anchor) if in_mirror else anchor
-            prompt, answer = self._prompts.of(asked, draw(asked, self._words, rng))
+            view = mirrored(anchor) if in_mirror else anchor
+            prompt, answer = self._prompts.of(view, draw(view, self._words, rng))
             ids = np.array(prompt, np.int32), np.array(answer, np.int32)
             drawn.append(Sample(index, in_mirror, *ids, anchor.frames, seed))
         return drawn
 
     def rows(self, samples: Sequence[Sample]) -> list[Row]:
-        """The same with their frames' tokens."""
+        """Add the frames' visual tokens to samples."""
         return [
             Row(
                 tuple(each.prompt.tolist()),
@@ -126,7 +126,7 @@ class Samples:
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """(what, how many, which measured rate) before there are drives: they are planned to be 30 s long."""
+    """Return (description, number, key of the throughput) of this stage's work, planned with drives of 30 s."""
     config, collect = recipe.sft or SftConfig(), recipe.collect
     seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
     each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
@@ -146,7 +146,7 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Train on the run's data set; leaves the network with its new language model.
+    """Train on the run's data set and write the network with its new language model.
 
     Raises SftError, CollectError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
     """
@@ -174,7 +174,7 @@ def run(job: StageJob) -> dict[str, Any]:
 
 
 def _start(job: StageJob, config: SftConfig) -> tuple[TicVla, int, OptimConfig]:
-    """The network to begin with, for how many epochs it is trained and how."""
+    """Return the initial network, the number of epochs and the optimiser's configuration."""
     rounds = job.run_dir.retired(STAGE)
     if not rounds or not config.go_on_share:
         return start_network(job, STAGE), config.epochs, config.optim
@@ -193,9 +193,9 @@ def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
 def fit(
     job: StageJob, network: TicVla, dataset: Dataset, views: Views, more: Sequence[Anchor] = ()
 ) -> dict[str, Any]:  # fmt: skip
-    """Train `network.language` in place and say how well it speaks; the rest of the network is left as it is.
+    """Train `network.language` in place and return its scores; the other parts are not changed.
 
-    `more`: anchors to learn from beside those of the drives: of other instructions, of tours.
+    `more`: additional anchors, from relabelled drives and tours.
     """
     config, language = _config(job), network.language
     content = tokenizer_for(network.config, None)
@@ -204,7 +204,7 @@ def fit(
     data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
-        raise SftError(f"{dataset.folder}: no anchors with reasoning; collect drives, or import them with words")
+        raise SftError(f"{dataset.folder}: no anchors with reasoning text; collect drives, or import them with texts")
     per_epoch = -(-len(data) // config.batch)
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
@@ -246,7 +246,7 @@ def fit(
 
 
 def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence[Sample]) -> float:
-    """Equation 3 over given samples (one or more), in batches shared by the ranks."""
+    """Compute the mean of equation 3 over one or more samples, in batches shared by the ranks."""
     config = _config(job)
     order = sorted(range(len(questions)), key=lambda i: (len(questions[i]), i))
     batches = [order[at : at + config.batch] for at in range(0, len(order), config.batch)]
@@ -259,7 +259,7 @@ def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence
 
 
 def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, samples: Sequence[Sample]) -> float:
-    """One step from one global batch; returns its mean loss over all ranks."""
+    """Run one step with one global batch and return its mean loss over all ranks."""
     own = samples[job.ranks.rank :: job.ranks.world]
     value = 0.0
     if own:
@@ -278,7 +278,7 @@ def _batch(job: StageJob, network: TicVla, data: Samples, samples: Sequence[Samp
 
 
 def _held(held: Samples, config: SftConfig, seed: int) -> list[Sample]:
-    """Questions of held-out layouts, the same after every epoch, spread over all drives."""
+    """Choose fixed samples of held-out layouts, spread over all drives."""
     rng = np.random.default_rng((seed, _HELD))
     samples = held.draw(rng)
     chosen = rng.permutation(len(samples))[: config.held_anchors]
@@ -291,10 +291,10 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 
 
 def _tours(job: StageJob, dataset: Dataset) -> Dataset:
-    """Those to learn from now, made where they are not there yet."""
+    """Return the tours to train on; missing ones are recorded."""
     collected = job.recipe.collect or CollectConfig()
     config, rounds = _config(job), job.run_dir.retired(STAGE)
-    job.progress.say("carrying robots about")
+    job.progress.say("recording tours")
     tours = build_tours(
         dataset, config.tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
         stopped=lambda: job.stop.asked,
@@ -307,7 +307,7 @@ def _tours(job: StageJob, dataset: Dataset) -> Dataset:
 
 
 def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) -> Views:
-    """Tokens of tours beside those of the drives."""
+    """Add the tokens of tours to those of the drives."""
     seconds = TokenCache(SecondsDataset.of(tours), network.vision)
     _encode(job, seconds, tours.ids)
     mirror = views.mirror
@@ -319,16 +319,16 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
 
 
 def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
-    """Of every drive to learn from, under each of its other instructions; told anew where that has not been done."""
+    """Return the anchors of relabelled training drives; missing relabels are computed."""
     collected = job.recipe.collect or CollectConfig()
-    retellings = InstructionRelabels(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
-    job.progress.say("telling other ways")
-    retellings.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
-    return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in retellings.anchors(drive)]
+    relabels = InstructionRelabels(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
+    job.progress.say("relabelling drives")
+    relabels.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
+    return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in relabels.anchors(drive)]
 
 
 def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
-    """One anchor a drive of a robot that has waited at its start for one generation or more."""
+    """Yield one anchor per drive of a robot that has waited at its start for one to three generations."""
     for number, drive in enumerate(dataset.drives(ids, pictures=False)):
         for anchor in anchors_of(drive)[:1]:
             yield waiting(anchor, 1 + number % 3)
@@ -343,7 +343,7 @@ def _config(job: StageJob) -> SftConfig:
 def _key(
     job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, more: Sequence[Anchor]
 ) -> str:  # fmt: skip
-    """What a checkpoint must have been made with to be gone on from."""
+    """Hash what a checkpoint depends on; only an equal hash can be resumed."""
     made = {
         "seed": job.seed,
         "config": asdict(config),
@@ -357,7 +357,7 @@ def _key(
 
 
 class _State:
-    """The stage's checkpoint: weights, moments, step and the last numbers."""
+    """The stage's checkpoint: weights, optimiser, step and the last losses."""
 
     def __init__(self, job: StageJob, network: TicVla, optimiser: Optimiser, key: str) -> None:
         self._job = job
@@ -367,20 +367,22 @@ class _State:
         self._path: Path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
 
     def save(self, numbers: Mapping[str, float]) -> None:
-        """Written by the first rank alone: all have the same."""
+        """Write the checkpoint, in the first rank alone: all ranks have equal weights."""
         if self._job.ranks.first:
             weights = checkpoint.with_prefix("language", self._network.language.state_dict())
             meta = {"key": self._key, "step": self._optimiser.step_count, "numbers": dict(numbers)}
             checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
 
     def load(self) -> dict[str, float]:
-        """Go on if asked to and able to; gives the last numbers. Raises SftError for another run's checkpoint."""
+        """Resume if requested and possible; return the last losses. Raises SftError for another run's checkpoint."""
         if not (self._job.resume and self._path.exists()):
             self._rewind(-1)
             return {}
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
-            raise SftError(f"{self._path}: of other data, another encoder or another recipe; delete it to begin anew")
+            raise SftError(
+                f"{self._path}: checkpoint of other data, another encoder or another recipe; delete it to start again"
+            )
         self._network.language.load_state_dict(checkpoint.under("language", tensors))
         self._optimiser.restore(tensors)
         self._rewind(int(meta["step"]))

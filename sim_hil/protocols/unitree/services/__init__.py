@@ -1,1 +1,1 @@
-"""Services of the simulated Go2, one module each: what a request does and what is answered."""
+"""Services of the simulated Go2: handling of requests, one module per service."""

@@ -1,7 +1,7 @@
-"""Obstacle avoidance of the simulated Go2: how far is the next thing, how fast may one drive towards it. Pure.
+"""Obstacle avoidance of the simulated Go2: distance to the next obstacle, and the speed allowed towards it. Pure.
 
-The range finder looks along the direction of travel, over the width of the robot, at everything that a foot or the body
-would meet: solid boxes of the scene and people. It knows the scene, as the robot's own lidar would show it.
+The range finder casts rays along the direction of travel over the robot's width. Obstacles are boxes of the scene at
+the height of body and feet, and people. It uses ground truth in place of the robot's lidar.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ Vec3 = tuple[float, float, float]
 
 OBSTACLES_AVOID_VERSION: Final = "1.0.0.2"
 RANGE_M: Final = 4.0
-# Our choices: half the width that must be free, from the middle of the body to its end and a little more, and how hard
-# the trot can brake.
+# Our choices: half the width that must be free; stopping distance from the body's centre (half its length plus a
+# margin); deceleration of the trot.
 HALF_WIDTH_M: Final = 0.28
 STOP_M: Final = 0.60
 BRAKE_MPS2: Final = 0.6
 REACTION_S: Final = 0.25
-_LOW_M, _HIGH_M = 0.05, 0.50  # what is wholly outside this height is stepped on or walked under
+_LOW_M, _HIGH_M = 0.05, 0.50  # range of heights: the robot steps on lower boxes and passes under higher ones
 _RAYS: Final = np.linspace(-HALF_WIDTH_M, HALF_WIDTH_M, 7)
 _SWITCH_SET, _SWITCH_GET, _MOVE, _USE_API = 1001, 1002, 1003, 1004
 _VELOCITY, _BY, _TO = 0, 1, 2  # "mode" of a Move
 
 
 class RangeFinder:
-    """Free distance from the robot's middle in any direction, for boxes that stand still and people who do not."""
+    """Range finder: free distance from the robot's centre in any direction, for static boxes and moving people."""
 
     def __init__(self, boxes: Sequence[Box]) -> None:
-        met = [
+        relevant = [
             box
             for box in boxes
             if box.centre_m[2] - box.size_m[2] / 2 < _HIGH_M and box.centre_m[2] + box.size_m[2] / 2 > _LOW_M
         ]
-        self._centres = np.array([box.centre_m[:2] for box in met]).reshape(-1, 2)
-        self._axes = np.array([box.axis for box in met]).reshape(-1, 2)
-        self._halves = np.array([(box.size_m[0] / 2, box.size_m[1] / 2) for box in met]).reshape(-1, 2)
+        self._centres = np.array([box.centre_m[:2] for box in relevant]).reshape(-1, 2)
+        self._axes = np.array([box.axis for box in relevant]).reshape(-1, 2)
+        self._halves = np.array([(box.size_m[0] / 2, box.size_m[1] / 2) for box in relevant]).reshape(-1, 2)
 
     def free_m(self, x_m: float, y_m: float, direction_rad: float, people: NDArray[np.float64]) -> float:
-        """Free distance over the robot's width, at most RANGE_M; `people` [n, >= 2] are positions, m."""
+        """Return the free distance over the robot's width, m, at most RANGE_M; `people` [n, >= 2]: positions, m."""
         c, s = math.cos(direction_rad), math.sin(direction_rad)
         starts = np.stack((x_m - s * _RAYS, y_m + c * _RAYS), axis=1)
         nearest = RANGE_M
@@ -62,7 +62,7 @@ class RangeFinder:
         return nearest
 
     def _boxes(self, starts: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-        """Distance to the first box along parallel rays (slabs in each box's own frame)."""
+        """Return the distance to the first box along parallel rays (slab method in each box's own frame)."""
         ax, ay = self._axes[:, 0], self._axes[:, 1]
         gap = starts[:, None, :] - self._centres[None, :, :]
         local = np.stack((gap[..., 0] * ax + gap[..., 1] * ay, gap[..., 1] * ax - gap[..., 0] * ay), axis=-1)
@@ -86,14 +86,14 @@ def _circles(start: NDArray[np.float64], direction: NDArray[np.float64], people:
 
 
 def allowed_mps(free_m: float) -> float:
-    """The speed from which it still stops STOP_M before what is `free_m` away, at BRAKE_MPS2 after REACTION_S."""
+    """Return the speed from which braking (BRAKE_MPS2, after REACTION_S) ends STOP_M before an obstacle at `free_m`."""
     room_m = max(free_m - STOP_M, 0.0)
     pause = BRAKE_MPS2 * REACTION_S
     return math.sqrt(pause * pause + 2.0 * BRAKE_MPS2 * room_m) - pause
 
 
 def slowed(velocity: Vec3, free_m: float) -> Vec3:
-    """A velocity (m/s, m/s, rad/s) no faster than is allowed towards what is `free_m` away; turning stays free."""
+    """Reduce a velocity (m/s, m/s, rad/s) to the speed allowed at a free distance; turning is not limited."""
     vx, vy, wz = velocity
     speed_mps = math.hypot(vx, vy)
     share = min(1.0, allowed_mps(free_m) / speed_mps) if speed_mps > 0.0 else 1.0
@@ -101,7 +101,7 @@ def slowed(velocity: Vec3, free_m: float) -> Vec3:
 
 
 def towards(pose: SE2, goal: SE2) -> Vec3 | None:
-    """The velocity with which a robot at `pose` goes to `goal`, both in one frame; None when it is there."""
+    """Return the velocity from `pose` towards `goal`, both in one frame; None at the goal."""
     left = pose.inverse() @ goal
     turn = math.atan2(math.sin(left.theta_rad), math.cos(left.theta_rad))
     distance_m = math.hypot(left.x_m, left.y_m)
@@ -112,9 +112,9 @@ def towards(pose: SE2, goal: SE2) -> Vec3 | None:
 
 
 class Pilot:
-    """Where the velocities of all services go: to the robot, slowed before obstacles or on the way to a goal.
+    """Common path of all services' velocities to the robot: slows down before obstacles and drives to goals.
 
-    `step` at some 20 Hz; times are the robot's clock. A velocity counts for `hold_s`, as the robot itself holds it.
+    Call `step` at about 20 Hz with the robot's clock. A velocity is valid for `hold_s`, as on the robot.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Pilot:
         *,
         hold_s: float = 1.0,
     ) -> None:
-        """`command` drives the robot; `free_m` is the free distance in a direction of the body frame, rad."""
+        """Create the pilot; `command` drives the robot, `free_m` returns the free distance in a body direction, rad."""
         self.avoids = False
         self._command = command
         self._free_m = free_m
@@ -135,7 +135,7 @@ class Pilot:
         self._goal: SE2 | None = None
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float, /, *, avoiding: bool) -> None:
-        """Command a velocity of the body frame; it ends the way to a goal."""
+        """Command a velocity in the body frame; it cancels a goal."""
         self._goal = self._wanted = None
         if not avoiding:
             self._command(vx_mps, vy_mps, wz_radps)
@@ -144,15 +144,15 @@ class Pilot:
         self._drive(self._wanted)
 
     def go_to(self, goal: SE2) -> None:
-        """Go to a pose of the odometry frame, slowed before obstacles."""
+        """Drive to a pose in the odometry frame, slowing down before obstacles."""
         self._goal, self._wanted = goal, None
 
     def stop(self) -> None:
-        """Forget what is under way; the robot has been told to stop otherwise."""
+        """Discard velocity and goal; the caller stops the robot."""
         self._goal = self._wanted = None
 
     def step(self, now_s: float, pose: Callable[[], SE2]) -> None:
-        """Keep the speed fitting to the surroundings; `pose` gives the reported T_odom_base."""
+        """Adapt the speed to the free distance; `pose` returns the reported T_odom_base."""
         self._now_s = now_s
         if self._goal is not None:
             velocity = towards(pose(), self._goal)
@@ -173,23 +173,23 @@ class Pilot:
 
 
 class ObstaclesAvoid:
-    """The service obstacles_avoid: its own Move, obeyed only after UseRemoteCommandFromApi(true)."""
+    """Service obstacles_avoid; its Move is obeyed only after UseRemoteCommandFromApi(true)."""
 
     def __init__(self, pilot: Pilot, pose: Callable[[], SE2]) -> None:
-        """`pose`: the reported T_odom_base now."""
+        """Create the service; `pose` returns the reported T_odom_base."""
         self.enabled = True
         self._from_api = False
         self._pilot = pilot
         self._pose = pose
 
     def switch(self, on: bool | None) -> bool:
-        """Switch it on or off, None leaves it; returns what it is then."""
+        """Switch avoidance on or off, None: no change; return the resulting state."""
         if on is not None:
             self.enabled = on
         return self.enabled
 
     def handle(self, api_id: int, parameter: str) -> Answer:
-        """One request."""
+        """Handle one request."""
         if api_id == _MOVE:
             return self._move(parameter), ""
         if api_id == _SWITCH_GET:

@@ -1,7 +1,7 @@
-"""All that the maker's services can make a Go2 do: the sport controller's actions, postures and shows, low level.
+"""Behaviour of a Go2 under the maker's services: sport actions, postures, shows and low-level mode.
 
-It takes the sport controller's place in the robot (`Go2.sport`), hands through what the controller knows, and drives
-the joints itself while the robot sits, poses, dances or is in low-level mode.
+It replaces the sport controller in the robot (`Go2.sport`) and delegates to it. It drives the joints itself while the
+robot sits, poses, dances or is in low-level mode.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from sim_hil.robots.go2.sport import (
 )
 from sim_hil.robots.go2.urdf import TOTAL_MASS_KG
 
-MODE_IDLE: Final = 0  # nothing of the sport controller's: released
+MODE_IDLE: Final = 0  # sport controller released
 GAIT_TROT: Final = 1
 GAIT_RUN: Final = 2
 _STILL_RADPS: Final = 0.5
 _STILL_S: Final = 0.25
-_PATIENCE_S: Final = 4.0  # a robot that is held or pushed may never stand still
-_AUTO_RECOVERY_S: Final = 2.0  # our choice: how long it lies before it gets up by itself
+_PATIENCE_S: Final = 4.0  # longest wait for standing still, s: a robot that is pushed may never stand still
+_AUTO_RECOVERY_S: Final = 2.0  # our choice: time on the ground before the robot stands up by itself
 _WEIGHT: Final[Vec3] = (0.0, 0.0, -TOTAL_MASS_KG * GRAVITY_MPS2 / 4)
-_KP, _KD = 90.0, 2.5  # what the sport controller stands with
+_KP, _KD = 90.0, 2.5  # joint gains of the sport controller's stand
 _RETURN_S: Final = 0.6
 
 
 @dataclass(frozen=True)
 class Gait:
-    """A gait of the sport service: the number that is reported while it walks, and how fast it walks at most."""
+    """Gait of the sport service: reported number and top speed."""
 
     gait_type: int = GAIT_TROT
     top_mps: float = math.inf
 
 
-# All are the one trot that is simulated; a slow gait is its slow part. Limits are our choice.
+# All gaits use the one simulated trot; slow gaits limit its speed. The limits are our choice.
 GAITS: Final = {
     "ClassicWalk": Gait(),
     "FreeWalk": Gait(),
@@ -57,11 +57,11 @@ GAITS: Final = {
     "EconomicGait": Gait(top_mps=0.6),
     "TrotRun": Gait(GAIT_RUN),
 }
-SPEED_SHARE: Final = {-1: 0.5, 0: 1.0, 1: 1.0}  # SpeedLevel: slow, normal, fast; the trot has no faster than normal
+SPEED_SHARE: Final = {-1: 0.5, 0: 1.0, 1: 1.0}  # SpeedLevel: slow, normal, fast; the trot has no fast level
 
 
 class Go2Behaviour:
-    """Stands in for `SportController` in a Go2; call `step` once every `dt_s`. Deterministic, no physics inside."""
+    """Replacement of `SportController` in a Go2; call `step` every `dt_s`. Deterministic, without physics."""
 
     def __init__(self, sport: SportController, dt_s: float) -> None:
         self.low_level = LowLevel()
@@ -83,29 +83,29 @@ class Go2Behaviour:
         self._fell_s: float | None = None
 
     def __getattr__(self, name: str) -> Any:
-        """What a posture changes nothing about is the sport controller's to answer."""
+        """Delegate everything that postures do not change to the sport controller."""
         return getattr(self._sport, name)
 
     @property
     def time_s(self) -> float:
-        """Simulated time since it was switched on, s."""
+        """Simulated time since switch-on, s."""
         return self._time_s
 
     @property
     def mode(self) -> int:
-        """SportModeState.mode."""
+        """Value of SportModeState.mode."""
         if self._released:
             return MODE_IDLE
         return self._sport.mode if self._script is None else self._script.mode
 
     @property
     def gait_type(self) -> int:
-        """SportModeState.gait_type: the gait while it walks, else 0."""
+        """Value of SportModeState.gait_type: the gait while walking, else 0."""
         return self.gait.gait_type if self.mode == MODE_LOCOMOTION else 0
 
     @property
     def progress(self) -> float:
-        """SportModeState.progress: 1 while a show runs, else 0."""
+        """Value of SportModeState.progress: 1 during a show, else 0."""
         return 1.0 if self._script is not None and not self._script.stays and self._afterwards is None else 0.0
 
     @property
@@ -115,12 +115,12 @@ class Go2Behaviour:
 
     @property
     def commanded(self) -> Vec3:
-        """The velocity command in force: zero while anything but walking goes on."""
+        """Velocity command in force; zero unless the robot walks or stands."""
         return (0.0, 0.0, 0.0) if self._busy or self._released else self._sport.commanded
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity would be obeyed now."""
+        """Whether the robot would obey a velocity now."""
         return not (self._busy or self._released) and self._sport.ready
 
     @property
@@ -128,12 +128,12 @@ class Go2Behaviour:
         return self._script is not None or self._awaited is not None
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity, as the controller does; in a posture it is not obeyed, a turned attitude it only ends."""
+        """Request a velocity; ignored in a posture, and in a turned attitude it only ends the attitude."""
         if self._released:
             return
         moves = any((vx_mps, vy_mps, wz_radps))
         if self._script is not None and self._script.mode == MODE_BALANCE_STAND and moves:
-            self._stand_again()  # kept until it stands level, a velocity would be in force for longer than its second
+            self._stand_again()  # not stored until the robot stands level: a velocity is valid for 1 s only
             return
         if self._busy:
             return
@@ -144,14 +144,14 @@ class Go2Behaviour:
         self._sport.request_move(share * vx_mps, share * vy_mps, wz_radps)
 
     def request(self, action: SportAction) -> int:
-        """Start an action; 0 or the code of its refusal: 4202 where the posture, or the released mode, forbids it."""
+        """Start an action; return 0 or an error code: 4202 if the posture or the released mode forbids it."""
         if self._released:
             return ERROR_NOT_STANDING
         if action is SportAction.DAMP:
             self._drop()
             return self._sport.request(action)
         if action is SportAction.STOP_MOVE:
-            # It also sets back what the requests before it have set (the maker's page of the sport service).
+            # It also resets speed level and gait (the maker's page of the sport service).
             self.speed_level, self.gait = 0, GAITS["ClassicWalk"]
             if self._script is not None and self._script.mode == MODE_BALANCE_STAND:
                 self._stand_again()
@@ -163,7 +163,7 @@ class Go2Behaviour:
         return 0
 
     def show(self, script: Script) -> int:
-        """Take a posture or begin a show, from a stand; 0, or 4202 where it does not stand balanced."""
+        """Start a posture or a show from a stand; return 0, or 4202 if the robot does not stand balanced."""
         if self._released or self._sport.mode not in (MODE_BALANCE_STAND, MODE_LOCOMOTION):
             return ERROR_NOT_STANDING
         if self._script is not None:
@@ -176,34 +176,34 @@ class Go2Behaviour:
         return 0
 
     def turn_body(self, roll_rad: float, pitch_rad: float, yaw_rad: float) -> int:
-        """The Euler request: turn the body over its feet; all zero ends it."""
+        """Execute the Euler request: turn the body over its feet; three zeros end it."""
         if self._script is not None and self._script.mode == MODE_BALANCE_STAND and not any(
             (roll_rad, pitch_rad, yaw_rad)
         ):  # fmt: skip
             self._stand_again()
             return 0
-        posed = self.mode  # a pose stays a pose, however it is turned
+        posed = self.mode  # turning does not change the mode of a pose
         script = attitude(roll_rad, pitch_rad, yaw_rad)
         return self.show(script._replace(mode=posed) if self._script is not None else script)
 
     def stand_again(self) -> None:
-        """End a posture or a show; without one there is nothing to do."""
+        """End a posture or a show, if there is one."""
         if self._busy:
             self._stand_again()
 
     def release(self) -> None:
-        """Switch the sport controller off: from now on low commands drive the joints."""
+        """Switch the sport controller off, so that low commands drive the joints."""
         self._drop()
         self._sport.request(SportAction.DAMP)
         self.low_level.forget()
         self._released = True
 
     def engage(self) -> None:
-        """Switch the sport controller on again: limp, until it is asked to stand up."""
+        """Switch the sport controller on; the joints are damped until a stand-up request."""
         self._released = False
 
     def step(self, measured: Measured) -> tuple[float, ...]:
-        """Advance by `dt_s`; the 12 joint torques, N.m."""
+        """Advance by `dt_s` and return the 12 joint torques, N.m."""
         self._time_s += self._dt_s
         if self._released:
             return self.low_level.torques(measured, self._time_s)
@@ -252,7 +252,7 @@ class Go2Behaviour:
             if afterwards is not None:
                 afterwards()
             return
-        if self._afterwards is not None:  # it is on its way: a request that is repeated does not begin anew
+        if self._afterwards is not None:  # already returning to the stand: a repeated request does not restart it
             self._afterwards = afterwards if afterwards is not None else self._afterwards
             return
         back: tuple[Keyframe, ...] = ((_RETURN_S, self._home),)

@@ -1,7 +1,6 @@
-"""The low command, for the simulated robot only: what commands a real one must not even be able to decode it.
+"""Low command message, for the simulated robot only: code that commands a real robot must not be able to decode it.
 
-Types and names are the wire's (protocol facts, section 2); every octet is `byte`, see
-firmware_bridge/unitree/messages/idl.py.
+Type and member names are those of the wire; every octet is `byte`, see firmware_bridge/unitree/messages/idl.py.
 """
 
 # ruff: noqa: N801 - the names are the wire's type names

@@ -1,4 +1,4 @@
-"""The lease of a service: while somebody holds it, nobody else is obeyed. Pure; rules of protocol facts, section 2."""
+"""Lease of a service: while a client has it, requests of other clients are denied. Pure."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from firmware_bridge.unitree.messages import ids
 
 APPLY: Final = 101
 RENEW: Final = 102
-TERM_US: Final = 1_000_000  # the maker's server and client: one second, renewed after 0.3 of it
+TERM_US: Final = 1_000_000  # as in the maker's server; its client renews after 0.3 of the term
 ERROR_DENIED: Final = 3205
 ERROR_NOT_EXIST: Final = 3206
 ERROR_EXISTS: Final = 3207
 
 
 class Lease:
-    """At most one holder at a time; ids are times in microseconds, as the maker's server gives them."""
+    """Lease with at most one holder; ids are times in microseconds, as in the maker's server."""
 
     def __init__(self, term_us: int = TERM_US) -> None:
         self._term_us = term_us
-        self._id = 0  # 0: nobody
+        self._id = 0  # 0: no holder
         self._renewed_ns = 0
 
     def holder(self, now_ns: int) -> int:
-        """Id of the lease in force, 0 without one."""
+        """Return the id of the current lease, 0 if there is none."""
         if self._id and now_ns > self._renewed_ns + self._term_us * 1000:
             self._id = 0
         return self._id
 
     def denies(self, lease_id: int, now_ns: int) -> bool:
-        """Whether a request with this id (0: none) may not be obeyed now."""
+        """Return whether a request with this lease id (0: none) must be denied."""
         return self.holder(now_ns) != lease_id
 
     def handle(self, api_id: int, parameter: str, lease_id: int, now_ns: int) -> tuple[int, str]:
-        """One request of the service NAME_lease: code and data."""
+        """Handle a request of the service NAME_lease; return code and data."""
         if api_id == APPLY:
             return self._apply(parameter, now_ns)
         if api_id == RENEW:

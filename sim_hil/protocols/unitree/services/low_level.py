@@ -1,7 +1,7 @@
-"""Low-level mode: joints driven by `rt/lowcmd` alone, torque = tau + kp (q* - q) + kd (dq* - dq). Pure.
+"""Low-level mode: joints driven by `rt/lowcmd` only, torque = tau + kp (q* - q) + kd (dq* - dq). Pure.
 
-A command counts when its checksum is right; one that is not is ignored and counted, as the robot's motor board does.
-The head does not matter: the maker's examples fill it in, a binding that people drive real robots with leaves it zero.
+A command with a wrong checksum is ignored and counted, as by the robot's motor board. The head is not checked: the
+maker's examples fill it in, but a binding in use on real robots leaves it zero.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from sim_hil.protocols.unitree.services.idl_command import LowCmd_
 from sim_hil.robots.go2.sport import Measured, motor_torque
 
 LOW_COMMAND_TOPIC: Final = "rt/lowcmd"
-LOW_COMMAND_LAYOUT: Final = struct.Struct("<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55BxI")  # 808 bytes, the crc follows
-MODE_FOC: Final = 0x01  # a motor that is driven; 0 stops it
-POSITION_STOP_RAD: Final = 2.146e9  # the maker's "no position control": such a number is no angle
+LOW_COMMAND_LAYOUT: Final = struct.Struct(
+    "<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55BxI"
+)  # 808 bytes, followed by the crc
+MODE_FOC: Final = 0x01  # motor driven; 0 stops it
+POSITION_STOP_RAD: Final = 2.146e9  # the maker's value for "no position control"
 VELOCITY_STOP_RADPS: Final = 16000.0
-SILENCE_S: Final = 0.2  # our choice: without a command for this long the joints are only damped
-_DAMPING_NMS: Final = 2.0  # per rad, what the sport controller's damping has
+SILENCE_S: Final = 0.2  # our choice: timeout after which the joints are only damped
+_DAMPING_NMS: Final = 2.0  # N.m.s per rad, as in the sport controller's damping
 _JOINTS: Final = 12
 
 
@@ -35,7 +37,7 @@ class MotorTarget(NamedTuple):
     kd: float
 
     def torque(self, q_rad: float, dq_radps: float) -> float:
-        """What the motor is asked for, N.m; a loop whose target is the maker's stop number is open."""
+        """Return the requested motor torque, N.m; a target equal to the maker's stop value disables that term."""
         if not self.driven:
             return 0.0
         torque = self.tau_nm
@@ -47,7 +49,7 @@ class MotorTarget(NamedTuple):
 
 
 def low_command_crc(command: LowCmd_) -> int:
-    """Value that belongs into `command.crc`."""
+    """Compute the checksum for `command.crc`."""
     motors: list[float] = []
     for motor in command.motor_cmd:
         motors += (motor.mode, motor.q, motor.dq, motor.tau, motor.kp, motor.kd, *motor.reserve)
@@ -61,7 +63,7 @@ def low_command_crc(command: LowCmd_) -> int:
 
 
 def motor_targets(command: LowCmd_) -> tuple[MotorTarget, ...] | None:
-    """The 12 joints of a command (FR, FL, RR, RL x hip, thigh, calf); None when it is damaged or no number."""
+    """Return the 12 joint targets (FR, FL, RR, RL x hip, thigh, calf); None for a wrong checksum or a NaN."""
     if command.crc != low_command_crc(command):
         return None
     targets = tuple(
@@ -72,16 +74,16 @@ def motor_targets(command: LowCmd_) -> tuple[MotorTarget, ...] | None:
 
 
 class LowLevel:
-    """The joints' drives, and the newest command that they have."""
+    """Joint drives in low-level mode, with the newest command."""
 
     def __init__(self) -> None:
         self.rejected = 0
-        """Commands that were damaged."""
+        """Number of invalid commands."""
         self._targets: tuple[MotorTarget, ...] | None = None
         self._taken_s = -math.inf
 
     def take(self, command: LowCmd_ | None, now_s: float) -> None:
-        """A command has arrived; None is one that did not decode."""
+        """Apply a received command; None: it could not be decoded."""
         targets = None if command is None else motor_targets(command)
         if targets is None:
             self.rejected += 1
@@ -89,11 +91,11 @@ class LowLevel:
         self._targets, self._taken_s = targets, now_s
 
     def forget(self) -> None:
-        """What was commanded before no longer counts."""
+        """Discard the last command."""
         self._targets, self._taken_s = None, -math.inf
 
     def torques(self, measured: Measured, now_s: float) -> tuple[float, ...]:
-        """The 12 joint torques, N.m, within the motors' limits."""
+        """Return the 12 joint torques, N.m, within the motors' limits."""
         targets = self._targets if now_s - self._taken_s <= SILENCE_S else None
         torques = []
         for joint, (q_rad, dq_radps) in enumerate(zip(measured.q_rad, measured.dq_radps, strict=True)):

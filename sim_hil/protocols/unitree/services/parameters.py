@@ -1,4 +1,4 @@
-"""Reading the JSON text of a request: from anybody, so nothing is believed. Pure."""
+"""Parsers for the JSON parameter of a request, which is untrusted input. Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _HUGE = 1e9
 
 
 def parse_table(parameter: str) -> dict[str, Any] | None:
-    """The JSON object of a request; None for anything else."""
+    """Parse a JSON object; None for anything else."""
     try:
         table = json.loads(parameter)
     except (ValueError, RecursionError):
@@ -19,7 +19,7 @@ def parse_table(parameter: str) -> dict[str, Any] | None:
 
 
 def parse_numbers(parameter: str, *keys: str) -> tuple[float, ...] | None:
-    """The finite numbers under `keys`; None unless all are there."""
+    """Return the finite numbers under `keys`; None if one is missing or invalid."""
     table = parse_table(parameter)
     numbers = []
     for key in keys:
@@ -31,7 +31,7 @@ def parse_numbers(parameter: str, *keys: str) -> tuple[float, ...] | None:
 
 
 def parse_flag(parameter: str, key: str) -> bool | None:
-    """The truth value under `key`, 0 and 1 included; None for anything else."""
+    """Return the boolean under `key`, also given as 0 or 1; None for anything else."""
     value = (parse_table(parameter) or {}).get(key)
     if isinstance(value, bool):
         return value
@@ -39,6 +39,6 @@ def parse_flag(parameter: str, key: str) -> bool | None:
 
 
 def parse_text(parameter: str, key: str) -> str | None:
-    """The text under `key`; None for anything else."""
+    """Return the text under `key`; None for anything else."""
     value = (parse_table(parameter) or {}).get(key)
     return value if isinstance(value, str) else None

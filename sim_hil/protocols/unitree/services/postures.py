@@ -1,6 +1,6 @@
-"""Postures and little shows of a standing Go2, as joint angles over time: sit, stretch, hello, dance, attitudes. Pure.
+"""Postures and shows of a standing Go2 as joint angles over time: sit, stretch, hello, dance, attitudes. Pure.
 
-The feet stay where they stand; the body is put elsewhere over them and the legs follow by inverse kinematics.
+The feet stay in place; the body moves over them, and the leg angles follow by inverse kinematics.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from sim_hil.robots.go2.gait import GaitConfig, neutral_feet
 from sim_hil.robots.go2.kinematics import Vec3, joint_angles
 
 Joints = tuple[float, ...]
-Keyframe = tuple[float, Joints]  # seconds to get there, 12 joint angles
+Keyframe = tuple[float, Joints]  # duration to reach it, s; 12 joint angles, rad
 
 MODE_POSE: Final = 2
 MODE_SIT: Final = 10
-# What the maker's Euler request allows, rad (protocol facts, section 2).
+# Limits of the maker's Euler request, rad.
 ROLL_LIMIT_RAD: Final = 0.75
 PITCH_LIMIT_RAD: Final = 0.75
 YAW_LIMIT_RAD: Final = 0.6
@@ -27,7 +27,7 @@ _FR: Final = 0
 
 
 class Script(NamedTuple):
-    """Keyframes, the mode reported while they run, and whether the last one is kept until something else is asked."""
+    """Motion by keyframes; `mode`: reported meanwhile; `stays`: keep the last keyframe until another request."""
 
     keyframes: tuple[Keyframe, ...]
     mode: int
@@ -35,7 +35,7 @@ class Script(NamedTuple):
 
 
 def _rotated_back(vector: Vec3, roll: float, pitch: float, yaw: float) -> Vec3:
-    """A level vector in the frame of a body turned by yaw, then pitch, then roll."""
+    """Express a level vector in the frame of a body rotated by yaw, then pitch, then roll."""
     x, y, z = vector
     x, y = cos(yaw) * x + sin(yaw) * y, cos(yaw) * y - sin(yaw) * x
     x, z = cos(pitch) * x - sin(pitch) * z, sin(pitch) * x + cos(pitch) * z
@@ -49,9 +49,9 @@ def body_over_feet(
     shift_m: Vec3 = (0.0, 0.0, 0.0),
     lifted: Mapping[int, Vec3] = MappingProxyType({}),
 ) -> Joints:
-    """Joint angles of a body turned (rad, positive pitch: nose down) and shifted over feet that stay.
+    """Return the joint angles for a body rotated (rad, positive pitch: nose down) and shifted over fixed feet.
 
-    `lifted`: by how much a foot (0..3 = FR, FL, RR, RL) is away from where it stands, level frame, m.
+    `lifted`: offset of a foot (0..3 = FR, FL, RR, RL) from its place on the ground, level frame, m.
     """
     angles: list[float] = []
     for leg, (x, y, z) in enumerate(neutral_feet(GaitConfig())):
@@ -65,7 +65,7 @@ STANDING: Final = body_over_feet()
 
 
 def attitude(roll: float, pitch: float, yaw: float) -> Script:
-    """The body turned as the Euler request asks, within its limits."""
+    """Return the posture of an Euler request, clipped to its limits."""
 
     def within(value: float, limit: float) -> float:
         return max(-limit, min(limit, value))

@@ -1,4 +1,4 @@
-"""The robot's end of a Unitree request/response service over two DDS topics."""
+"""Robot's side of a Unitree request/response service over two DDS topics."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, RequestIdentity_, Response_, ResponseHeader_, ResponseStatus_
 from sim_hil.protocols.unitree.services.leases import ERROR_DENIED, Lease
 
-_QUEUE_DEPTH: Final = 64  # requests that may wait between two polls
+_QUEUE_DEPTH: Final = 64  # requests queued between two polls
 _MAX_PARAMETER_CHARS: Final = 4096
-_NOOP: Final = 2  # of every service
-_LAST_INTERNAL: Final = 100  # API ids of every service; what a service itself does begins above
+_NOOP: Final = 2  # API id of every service
+_LAST_INTERNAL: Final = 100  # last API id common to all services; a service's own ids begin above
 
 Answer = tuple[int, str]  # error code (0: done), data
 
 
 @dataclass(frozen=True)
 class Received:
-    """One request as it arrived; `received_ns` is stamped when it is taken off the bus."""
+    """One received request; `received_ns` is stamped when it is read from the bus."""
 
     received_ns: int
     service: str
@@ -36,11 +36,11 @@ class Received:
 
 
 class ServiceServer:
-    """One service: `requests()` without waiting, `reply()` to each.
+    """Server of one service; `requests()` and `reply()` never wait.
 
-    The rules of the robot's own server: API id 1 is its version, a reply carries the request's identity, a request
-    marked `noreply` is never answered, not even with an error, and data stays empty beside an error code. With a
-    `lease`, requests outside `unleased` are denied to all but its holder.
+    Rules of the robot's own server: API id 1 returns the version; a reply carries the request's identity; a request
+    marked `noreply` is never answered; data is empty with an error code. With a `lease`, requests outside `unleased`
+    are denied to all clients but the holder.
     """
 
     def __init__(
@@ -57,14 +57,13 @@ class ServiceServer:
         self._version = version
         self._lease = lease
         self._unleased = unleased
-        # Reliable, as the writers of every known client are: the request that a client sends in the instant in which
-        # it is still being discovered is delivered, not lost.
+        # Reliable, like the writers of all known clients, so that a request sent during discovery is not lost.
         topic = ids.request_topic(service)
         self.reader: DataReader[Any] = bus.reader(topic, Request_, depth=_QUEUE_DEPTH, reliable=True)
         self._writer = bus.writer(ids.response_topic(service), Response_, depth=_QUEUE_DEPTH)
 
     def requests(self) -> Iterator[Received]:
-        """Requests that are waiting, oldest first; what does not decode or is absurdly long is counted and dropped."""
+        """Yield the waiting requests, oldest first; requests that are invalid or too long are counted and dropped."""
         for sample in take_each(self.reader):
             if sample is None or len(sample.parameter) > _MAX_PARAMETER_CHARS:
                 self.malformed += 1
@@ -90,10 +89,10 @@ class ServiceServer:
         try:
             self._writer.write(Response_(header, data, binary))
         except DDS_ERRORS:
-            return  # the client has gone or its queue is full; it will time out as on the real robot
+            return  # the client ended or its queue is full; it will time out, as on the real robot
 
     def answer(self, request: Received, handle: Callable[[int, str], Answer]) -> Answer:
-        """What is answered, by the server itself or by `handle(api_id, parameter)`."""
+        """Return the answer of the server itself or of `handle(api_id, parameter)`."""
         if request.api_id == ids.API_VERSION:
             return ids.OK, self._version
         if request.api_id == _NOOP:
@@ -106,7 +105,7 @@ class ServiceServer:
         return handle(request.api_id, request.parameter)
 
     def serve(self, handle: Callable[[int, str], Answer]) -> list[Received]:
-        """Answer everything that is waiting with `handle(api_id, parameter)`; returns it."""
+        """Answer all waiting requests with `handle(api_id, parameter)` and return them."""
         served = []
         for request in self.requests():
             served.append(request)
@@ -115,14 +114,14 @@ class ServiceServer:
 
 
 class LeaseServer(ServiceServer):
-    """The service `<name>_lease` beside a service that can be leased."""
+    """Server of the service `<name>_lease` for a service with a lease."""
 
     def __init__(self, bus: Bus, service: str, lease: Lease) -> None:
         super().__init__(bus, f"{service}_lease")
         self._given = lease
 
     def serve_leases(self) -> None:
-        """Answer everything that is waiting."""
+        """Answer all waiting requests."""
         for request in self.requests():
             answer = self._given.handle(request.api_id, request.parameter, request.lease_id, request.received_ns)
             self.reply(request, *answer)

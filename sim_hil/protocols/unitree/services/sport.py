@@ -1,4 +1,4 @@
-"""The sport service's plain actions and velocities, the names of all requests, and a log of what was commanded."""
+"""Actions and velocities of the sport service, names of all requests, and a summary of received commands."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _ACTIONS: Final = {
     ids.STAND_DOWN: SportAction.STAND_DOWN,
     ids.RECOVERY_STAND: SportAction.RECOVERY_STAND,
 }
-# A request that is not here leaves the velocity in force, or is counted as if it did: BalanceStand, a RecoveryStand on
-# its feet and an unknown id change nothing, and StandUp is not a way to stop a robot.
+# Requests that end motion. All others leave the velocity in force or count as if they did: BalanceStand, a
+# RecoveryStand of a standing robot and unknown ids have no effect, and StandUp is not meant to stop a robot.
 _ENDS_MOTION: Final = frozenset({ids.STOP_MOVE, ids.DAMP, ids.STAND_DOWN})
-_VELOCITY_MODE: Final = 0  # of an obstacles_avoid Move; the others are poses
+_VELOCITY_MODE: Final = 0  # mode of an obstacles_avoid Move with a velocity; other modes are poses
 AVOID_MOVE: Final = 1003
-_RELEASE_MODE: Final = 1003  # of the motion switcher
+_RELEASE_MODE: Final = 1003  # API id of the motion switcher
 _API_NAMES: Final = {
     ids.SPORT_SERVICE: {
         **ids.SPORT_API_NAMES,
@@ -43,10 +43,10 @@ _API_NAMES: Final = {
 
 
 class Robot(Protocol):
-    """The part of the simulation that the sport service commands."""
+    """Interface of the robot to the sport service."""
 
     def sport(self, action: SportAction, /) -> int:
-        """Start an action; 0 or a Unitree error code."""
+        """Start an action; return 0 or a Unitree error code."""
         ...
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float, /) -> None:
@@ -55,12 +55,12 @@ class Robot(Protocol):
 
 
 def api_name(service: str, api_id: int) -> str:
-    """Name of a request for the trace; the number where we know no name."""
+    """Return the name of a request for the trace; its number if the name is unknown."""
     return "Version" if api_id == ids.API_VERSION else _API_NAMES.get(service, {}).get(api_id, str(api_id))
 
 
 def parse_move(parameter: str) -> tuple[float, float, float] | None:
-    """Velocity of a Move's parameter `{"x","y","z"}`; None unless it is three finite numbers."""
+    """Parse the velocity of a Move, `{"x","y","z"}`; None unless it contains three finite numbers."""
     return _velocity(parameter, "z")
 
 
@@ -70,7 +70,7 @@ def _velocity(parameter: str, yaw: str) -> tuple[float, float, float] | None:
 
 
 def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
-    """One sport request: 3203 for what this robot cannot do, 3204 for a Move without three finite numbers."""
+    """Handle one sport request: 3203 if not implemented, 3204 for a Move without three finite numbers."""
     if api_id == ids.MOVE:
         velocity = parse_move(parameter)
         if velocity is None:
@@ -82,13 +82,13 @@ def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
 
 
 class CommandLog:
-    """What has been commanded over sport and obstacles_avoid, for the result: what was heard, not what was meant."""
+    """Summary of the commands received over sport and obstacles_avoid, for the result."""
 
     def __init__(self) -> None:
         self.commands = 0
         self.last_move: tuple[float, float, float] | None = None
         self.last_command: str | None = None
-        self._at_zero = True  # what the last motion request asked for
+        self._at_zero = True  # whether the last motion request was zero
 
     def note(self, request: Received) -> None:
         """Count one received request."""
@@ -115,7 +115,7 @@ class CommandLog:
         self._at_zero = velocity is not None and not any(velocity)
 
     def summary(self) -> dict[str, object]:
-        """The `wire` part of the result; a robot that was never told to move was last told zero."""
+        """Return the `wire` part of the result; without any motion request, `last_command_zero` is true."""
         return {
             "commands": self.commands,
             "last_move": None if self.last_move is None else list(self.last_move),

@@ -1,7 +1,7 @@
-"""The whole sport service of the simulated Go2: which request does what (ids: protocol facts, section 2).
+"""Sport service of the simulated Go2: handlers of all requests.
 
-What is not here is answered 3203, not implemented: flips, jumps, hand stand, upright walk and the other acrobatics. The
-real robot answers so in a mode that does not have them, and nothing else would be true of a trot and a few postures.
+Acrobatics (flips, jumps, hand stand, upright walk) are answered with 3203, not implemented, as by the real robot in a
+mode without them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim_hil.protocols.unitree.services.sport import handle_sport
 from sim_hil.robots.go2.sport import ERROR_NOT_STANDING, SportAction
 
 AUTO_RECOVERY_GET: Final = 2055
-UNLEASED: Final = frozenset({AUTO_RECOVERY_GET})  # it only asks
+UNLEASED: Final = frozenset({AUTO_RECOVERY_GET})  # read-only
 _SHOWS: Final[Mapping[int, str]] = MappingProxyType(
     {1016: "Hello", 1017: "Stretch", 1020: "Content", 1022: "Dance1", 1023: "Dance2"}
 )
@@ -33,22 +33,22 @@ _BAD: Final[Answer] = (ids.ERROR_PARAMETER, "")
 
 
 class Mover(Protocol):
-    """Where velocities go."""
+    """Receiver of velocities."""
 
     avoids: bool
-    """Whether they are slowed before obstacles."""
+    """Whether velocities are reduced before obstacles."""
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float, /, *, avoiding: bool) -> None:
-        """Command a velocity of the body frame for a second."""
+        """Command a velocity in the body frame for 1 s."""
         ...
 
     def stop(self) -> None:
-        """Forget what is under way."""
+        """Discard velocity and goal."""
         ...
 
 
 class SportService:
-    """Handles one request after the other. SwitchJoystick is taken and changes nothing: no stick moves this robot."""
+    """Handler of sport requests. SwitchJoystick is accepted without effect, because the robot has no joystick."""
 
     def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
         self._behaviour = behaviour
@@ -67,7 +67,7 @@ class SportService:
         }
 
     def handle(self, api_id: int, parameter: str) -> Answer:
-        """Code and data: 4202 for everything while the sport controller is released."""
+        """Handle one request; return code and data. While the sport controller is released, the code is 4202."""
         if self._behaviour.released:
             return ERROR_NOT_STANDING, ""
         if api_id in _SHOWS:
@@ -78,12 +78,12 @@ class SportService:
         return handler(parameter) if handler is not None else handle_sport(self, api_id, parameter)
 
     def sport(self, action: SportAction) -> int:
-        """An action of the sport controller; it ends whatever drives the robot."""
+        """Start an action of the sport controller; it cancels velocity and goal."""
         self._mover.stop()
         return self._behaviour.request(action)
 
     def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """A Move."""
+        """Execute a Move."""
         self._mover.move(vx_mps, vy_mps, wz_radps, avoiding=self._mover.avoids)
 
     def _euler(self, parameter: str) -> Answer:

@@ -1,7 +1,7 @@
-"""The services that switch others: motion_switcher (sport controller or low level) and robot_state. Pure.
+"""Services motion_switcher (sport controller or low level) and robot_state, which switch other services. Pure.
 
-Codes: the maker's motion_switcher_error.hpp (7001 parameter, 7002 busy, 7004 name) and robot_state_error.hpp; the
-client itself turns status 5 of a ServiceSwitch into 5202, service is protected.
+Error codes: the maker's motion_switcher_error.hpp (7001 parameter, 7002 busy, 7004 name) and robot_state_error.hpp. The
+client turns status 5 of a ServiceSwitch into 5202, service is protected.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from sim_hil.protocols.unitree.services.sport_service import Mover
 ERROR_SWITCH_PARAMETER: Final = 7001
 ERROR_SWITCH_BUSY: Final = 7002
 ERROR_SWITCH_NAME: Final = 7004
-BUSY_S: Final = 2.0  # our choice: how long the switcher takes to let go
-# The maker's modes: "normal" was the controller before firmware 1.1.6 and "mcf" is its name since, others had tricks.
+BUSY_S: Final = 2.0  # our choice: time during which the switcher is busy after a release
+# The maker's modes: "normal" is the controller before firmware 1.1.6, "mcf" its name since; the others add tricks.
 MODES: Final = ("normal", "mcf", "ai", "advanced")
 PROTECTED: Final = 5
 SPORT_MODE: Final = "sport_mode"
@@ -31,10 +31,10 @@ _SERVICE_SWITCH, _REPORT_FREQ, _SERVICE_LIST = 1001, 1002, 1003
 
 
 class MotionSwitcher:
-    """Which controller has the joints: one of MODES, or none, which leaves them to low commands."""
+    """Service that assigns the joints to one of MODES, or to none, which enables low commands."""
 
     def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
-        """`mover` is stopped when the joints are taken."""
+        """Create the service; `mover` is stopped on release."""
         self._behaviour = behaviour
         self._mover = mover
         self._name = MODES[0]
@@ -47,7 +47,7 @@ class MotionSwitcher:
         return self._name != ""
 
     def handle(self, api_id: int, parameter: str) -> Answer:
-        """One request."""
+        """Handle one request."""
         if api_id == _CHECK:
             return ids.OK, json.dumps({"form": "0", "name": self._name})
         if api_id == _SELECT:
@@ -66,7 +66,7 @@ class MotionSwitcher:
         return ids.ERROR_NOT_IMPLEMENTED, ""
 
     def select(self, name: str | None) -> int:
-        """Give the joints to the controller `name`; 7002 for BUSY_S after they were taken from one."""
+        """Assign the joints to the controller `name`; return 7002 within BUSY_S after a release."""
         if name is None:
             return ERROR_SWITCH_PARAMETER
         if name not in MODES:
@@ -79,7 +79,7 @@ class MotionSwitcher:
         return ids.OK
 
     def release(self) -> None:
-        """Take the joints from their controller."""
+        """Release the joints from their controller."""
         if self.engaged:
             self._mover.stop()
             self._behaviour.release()
@@ -87,18 +87,18 @@ class MotionSwitcher:
 
 
 class RobotState:
-    """Which services there are; the sport controller and the avoidance can be switched off, the others are protected.
+    """Service robot_state: lists services and switches sport controller and avoidance; the others are protected.
 
-    SetReportFreq is taken and changes nothing: what it reports on another topic is not among the published facts.
+    SetReportFreq is accepted without effect: its report topic is not published by the maker.
     """
 
     def __init__(self, switcher: MotionSwitcher, avoidance: Callable[[bool | None], bool]) -> None:
-        """`avoidance`: switches obstacles_avoid on or off, None leaves it; returns what it is then."""
+        """Create the service; `avoidance` switches obstacles_avoid (None: no change) and returns its state."""
         self._switcher = switcher
         self._avoidance = avoidance
 
     def handle(self, api_id: int, parameter: str) -> Answer:
-        """One request."""
+        """Handle one request."""
         if api_id == _SERVICE_LIST:
             return ids.OK, json.dumps(self._services())
         if api_id == _SERVICE_SWITCH:

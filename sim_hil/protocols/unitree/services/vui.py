@@ -1,4 +1,4 @@
-"""The vui service: volume, lamp and switch of the robot's face, kept and given back. Pure; nothing shines or sounds."""
+"""Service vui: stores volume, brightness and switch of the robot's face, without any effect. Pure."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from sim_hil.protocols.unitree.services.parameters import parse_numbers
 from sim_hil.protocols.unitree.services.service import Answer
 
 VUI_SERVICE: Final = "vui"
-# Set request -> its key and the highest value; the request after it reads the value back.
+# Set request -> key and highest value; the request with the next id reads the value back.
 _SETTINGS: Final = {1001: ("enable", 1), 1003: ("volume", 10), 1005: ("brightness", 10)}
 
 
 class Vui:
-    """Remembers what was set."""
+    """Service that stores settings."""
 
     def __init__(self) -> None:
         self._values = dict(_SETTINGS.values())
 
     def handle(self, api_id: int, parameter: str) -> Answer:
-        """One request."""
+        """Handle one request."""
         if api_id in _SETTINGS:
             key, top = _SETTINGS[api_id]
             value = parse_numbers(parameter, key)

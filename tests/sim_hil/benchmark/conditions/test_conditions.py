@@ -38,10 +38,10 @@ def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: fl
     assert latency is not None and latency.generation_s == (latency_s,)
 
 
-def test_the_goal_ends_an_episode_unless_it_is_asked_to_stay_where_it_thinks_that_it_is() -> None:
+def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
-    assert not free.stays and "stands" not in free.describe()
-    assert stays.stays and "stands where its texts" in stays.describe()
+    assert not free.stays and "halts" not in free.describe()
+    assert stays.stays and "halts at its own stop" in stays.describe()
 
 
 def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
@@ -67,12 +67,15 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
         (("--policy", "artifacts:"), "expected artifacts:DIR"),
         (("--policy", "expert:here"), "expected artifacts:DIR"),
-        (("--policy", "expert", "--mode", "sync"), "mode: belongs to a policy from artifacts"),
-        (("--policy", "expert", "--latency", "2"), "latency: expert does not think"),
+        (("--policy", "expert", "--mode", "sync"), "mode: expected one for artifacts:DIR and for no other policy"),
+        (
+            ("--policy", "expert", "--latency", "2"),
+            "latency: expected only with artifacts:DIR or external:ADDR, found with expert",
+        ),
         (("--policy", "random", "--variant", "full"), "with --policy artifacts:DIR"),
-        (("--policy", "expert", "--stay"), "stay: belongs to a policy from artifacts"),
-        (("--policy", "expert", "--decoding", "free"), "decoding: belongs to a policy from artifacts"),
-        (("--policy", "still", "--recovery", "off"), "recovery: belongs to a policy from artifacts"),
+        (("--policy", "expert", "--stay"), "stay: expected only with artifacts:DIR"),
+        (("--policy", "expert", "--decoding", "free"), "decoding: expected only with artifacts:DIR"),
+        (("--policy", "still", "--recovery", "off"), "recovery: expected only with artifacts:DIR"),
         (("--policy", "artifacts:nano", "--recovery", "off", "--stay"), "expected --recovery on with it, found off"),
         (("--policy", "artifacts:nano", "--variant", "../up"), "variant '../up'"),
         (("--policy", "still", "--camera", "big"), "expected auto or WxH"),
@@ -95,6 +98,6 @@ def test_conditions_of_another_kind_are_refused(change: dict[str, Any]) -> None:
 
 
 def test_a_model_needs_a_latency_in_lockstep() -> None:
-    with pytest.raises(ConditionsError, match="needs one in lockstep"):
+    with pytest.raises(ConditionsError, match="expected one for artifacts:DIR in lockstep"):
         Conditions(PolicySpec("artifacts", "/nano"), mode="async")
     Conditions(PolicySpec("artifacts", "/nano"), mode="async", latency=LatencyProfile.constant(1))

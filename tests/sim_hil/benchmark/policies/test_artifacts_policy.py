@@ -125,7 +125,7 @@ def asked(directory: Path, **changed: Any) -> Conditions:
 
 
 def test_a_worker_refuses_artifacts_that_are_not_those_of_the_run(artifacts_dir: Path) -> None:
-    with pytest.raises(ArtifactError, match="not the artifacts that this run was started with"):
+    with pytest.raises(ArtifactError, match="expected the artifacts that started this run"):
         open_policy(asked(artifacts_dir), manifest_sha256="0" * 64)
 
 
@@ -136,7 +136,7 @@ def test_artifacts_that_are_none_are_refused_before_any_episode(tmp_path: Path) 
 
 def test_the_world_renders_what_the_model_looks_at(policies: dict[str, ArtifactsPolicy], artifacts_dir: Path) -> None:
     assert camera_for(asked(artifacts_dir), policies["async"]) == (128, 128)
-    with pytest.raises(ConditionsError, match="looks at 128x128"):
+    with pytest.raises(ConditionsError, match="needs 128x128"):
         camera_for(asked(artifacts_dir, camera="320x180"), policies["async"])
 
 

@@ -100,7 +100,7 @@ def test_a_goal_without_a_way_to_it_is_refused() -> None:
     episode = corridor_episode(start=(-4.0, 0.0, 0.0), goal_xy=(4.0, 0.0))
     with (
         EpisodeWorld(episode, scene=hall(block(0.0, 0.0, 0.4, 10.0))) as world,
-        pytest.raises(ValueError, match="no way"),
+        pytest.raises(ValueError, match="no path"),
     ):
         ExpertPolicy().reset(episode, "Go.", world, 0)
 

@@ -217,7 +217,7 @@ def test_with_a_latency_an_answer_is_in_force_that_much_later_and_one_is_asked_a
         ({"type": "act", "step": 0, "velocity": [0.0, 0.0, 0.0], "text": "x" * 5000}, "at most 4096 characters"),
         ({"type": "act", "step": 0, "velocity": [0.0, 0.0, 0.0], "waypoints": [[1]]}, "waypoints to be 2 numbers"),
         ({"type": "welcome"}, "expected act, found 'welcome'"),
-        ({"type": "error", "message": "out of memory"}, "says: out of memory"),
+        ({"type": "error", "message": "out of memory"}, "reports: out of memory"),
     ],
 )
 def test_an_answer_that_is_wrong_is_one_clear_line(tmp_path: Path, said: dict[str, Any], why: str) -> None:

@@ -58,13 +58,13 @@ def test_a_directory_with_files_is_not_written_into(tmp_path: Path) -> None:
 
 
 def test_resuming_where_no_run_is_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="holds no benchmark run"):
+    with pytest.raises(StoreError, match="contains no benchmark run"):
         ResultStore.resume(tmp_path, CONFIG)
 
 
 def test_two_runs_cannot_share_a_directory_at_a_time(tmp_path: Path) -> None:
     store = made(tmp_path)
-    with pytest.raises(StoreError, match="another edge-bench is running"):
+    with pytest.raises(StoreError, match="another edge-bench uses this directory"):
         ResultStore.resume(store.directory, CONFIG)
     store.close()
     ResultStore.resume(store.directory, CONFIG).close()

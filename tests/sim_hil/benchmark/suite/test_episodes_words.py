@@ -11,7 +11,7 @@ import pytest
 from sim_hil import layouts
 from sim_hil.benchmark.language.instruction_reading import Claim, read, untrue
 from sim_hil.benchmark.language.instructions import WordingError, is_held_out, pattern, wordings
-from sim_hil.benchmark.language.route import RouteError, Told
+from sim_hil.benchmark.language.route import RouteDescription, RouteError
 from sim_hil.benchmark.language.tasks import Task, make_task, sample_task
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Wall
@@ -55,13 +55,13 @@ def comb() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def way() -> Told:
+def way() -> RouteDescription:
     scene = comb()
     machine = next(thing for thing in scene.objects if thing.label == "machine")
     return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).told
 
 
-def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: Told) -> None:
+def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescription) -> None:
     (step,) = way.steps
     assert (step.side, step.kind, step.ordinal, step.at_end) == ("left", "corridor", 2, False)
     assert [(thing.name, thing.side) for thing in step.passed] == [("potted plant", "right")]
@@ -117,7 +117,7 @@ def tee(door_x: float) -> Scene:
                  things, (), areas=areas)  # fmt: skip
 
 
-def told_in_tee(door_x: float, goal: str) -> Told:
+def told_in_tee(door_x: float, goal: str) -> RouteDescription:
     scene = tee(door_x)
     thing = next(thing for thing in scene.objects if thing.label == goal)
     return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).told
@@ -153,7 +153,7 @@ def test_a_goal_of_which_there_are_two_by_the_way_is_refused() -> None:
         "Find the red vending machine: take the second hallway on the left, follow the hallway to its end and stop.",
     ],
 )  # fmt: skip
-def test_true_words_are_accepted(text: str, way: Told) -> None:
+def test_true_words_are_accepted(text: str, way: RouteDescription) -> None:
     assert untrue(text, way) == []
 
 
@@ -175,7 +175,7 @@ def test_true_words_are_accepted(text: str, way: Told) -> None:
         ("Take the second left, mind the third step, stop at the vending machine.", "cannot be read"),
     ],
 )  # fmt: skip
-def test_what_is_not_so_is_found(text: str, problem: str, way: Told) -> None:
+def test_what_is_not_so_is_found(text: str, problem: str, way: RouteDescription) -> None:
     assert any(problem in line for line in untrue(text, way)), untrue(text, way)
 
 
@@ -186,14 +186,14 @@ def test_words_are_read_as_claims_in_their_order() -> None:
     ]  # fmt: skip
 
 
-def test_one_way_has_thousands_of_wordings_all_true(way: Told) -> None:
+def test_one_way_has_thousands_of_wordings_all_true(way: RouteDescription) -> None:
     texts = [text for seed in range(25) for text in wordings(way, 50, seed, held_out=False)]
     assert len(set(texts)) > 1000
     assert len({pattern(text) for text in texts}) > 700
     assert [text for text in texts if untrue(text, way)] == []
 
 
-def test_benchmark_and_training_share_no_pattern(way: Told) -> None:
+def test_benchmark_and_training_share_no_pattern(way: RouteDescription) -> None:
     ours = {pattern(text) for seed in range(10) for text in wordings(way, 20, seed, held_out=True)}
     theirs = {pattern(text) for seed in range(10) for text in wordings(way, 20, seed, held_out=False)}
     assert not ours & theirs
@@ -207,16 +207,16 @@ def test_a_pattern_hangs_neither_on_things_nor_on_sides_nor_on_counts() -> None:
     assert is_held_out(a) == is_held_out(b)
 
 
-def test_wordings_are_the_same_for_the_same_seed_and_different_from_each_other(way: Told) -> None:
+def test_wordings_are_the_same_for_the_same_seed_and_different_from_each_other(way: RouteDescription) -> None:
     first = wordings(way, 8, 3, held_out=True)
     assert first == wordings(way, 8, 3, held_out=True)
     assert first != wordings(way, 8, 4, held_out=True)
     assert len({pattern(text) for text in first}) == 8
 
 
-def test_a_turn_that_nothing_tells_from_others_is_refused(way: Told) -> None:
+def test_a_turn_that_nothing_tells_from_others_is_refused(way: RouteDescription) -> None:
     vague = replace(way.steps[0], ordinal=0, near=(), at_end=False)
-    with pytest.raises(WordingError, match="cannot be told"):
+    with pytest.raises(WordingError, match="cannot be described"):
         wordings(replace(way, steps=(vague,)), 4, 1, held_out=True)
 
 

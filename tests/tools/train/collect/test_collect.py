@@ -198,9 +198,9 @@ def test_what_is_drawn_has_the_shares_that_were_asked_for() -> None:
     draws = [Draw.of(config, 7, number) for number in range(3000)]
     shares = Counter(draw.drift for draw in draws)
     assert sum(draw.noise for draw in draws) / 3000 == pytest.approx(0.3, abs=0.03)
-    assert sum(draw.look.render_px == 256 for draw in draws) / 3000 == pytest.approx(0.2, abs=0.03)
+    assert sum(draw.camera.render_px == 256 for draw in draws) / 3000 == pytest.approx(0.2, abs=0.03)
     assert [shares[level] / 3000 for level in ("none", "typical", "severe")] == pytest.approx([0.4, 0.5, 0.1], abs=0.03)
-    assert {draw.look.jpeg_quality for draw in draws} == set(range(80, 96))
+    assert {draw.camera.jpeg_quality for draw in draws} == set(range(80, 96))
 
 
 def test_a_draw_depends_on_the_seed_and_the_number_alone() -> None:

@@ -24,7 +24,7 @@ from tests.support.train.training_drives import dataset, drive
 from tools.train.collect import dagger
 from tools.train.collect.collection import CollectError, Collection
 from tools.train.collect.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
-from tools.train.collect.record import DrivePlan, Look, record
+from tools.train.collect.record import CameraSettings, DrivePlan, record
 from tools.train.collect.steering import Velocity
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
@@ -70,7 +70,14 @@ def _nothing(_: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
 
 def test_a_policys_drive_is_labelled_by_the_expert(artifacts: Artifacts) -> None:
     episode = corridor_episode(robot="carter", timeout_s=4.0)
-    plan = DrivePlan(episode, load_scene("corridor"), np.array(((0.0, 0.0), (6.0, 0.0))), Look(), "none", pupil=True)
+    plan = DrivePlan(
+        episode,
+        load_scene("corridor"),
+        np.array(((0.0, 0.0), (6.0, 0.0))),
+        CameraSettings(),
+        "none",
+        policy_drives=True,
+    )
     with PolicyDriver(_options(artifacts, 0.0), episode, np.random.default_rng(1)) as policy:
         recorded = record(plan, ExpertPolicy(speed_mps=0.8), policy.steer, _nothing)
         assert policy.name == f"policy:{artifacts.manifest_sha256[:12]}"

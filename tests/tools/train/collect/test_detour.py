@@ -1,4 +1,4 @@
-"""Where a robot leaves its told way for: as a rule an opening that can be mistaken for the one it is to take."""
+"""Detours from the described route lead mostly into an opening that can be mistaken for the correct one."""
 
 from __future__ import annotations
 

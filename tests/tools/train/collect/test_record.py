@@ -19,8 +19,8 @@ from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tools.train.collect import record as recording
 from tools.train.collect.detour import Detour
 from tools.train.collect.record import (
+    CameraSettings,
     DrivePlan,
-    Look,
     NothingToLearnError,
     Recorded,
     Steer,
@@ -32,12 +32,12 @@ from tools.train.collect.record import (
 from tools.train.collect.steering import Velocity
 from tools.train.config.collect import CollectConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
-from tools.train.drives.windows import relative
+from tools.train.drives.futures import relative
 
 WAY = np.array(((0.0, 0.0), (6.0, 0.0)))
 
 
-def _as_wanted(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+def _expert_command(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
     return wanted, EXPERT
 
 
@@ -50,28 +50,28 @@ def _tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]
 
 
 def _drive(
-    steer: Steer, way: NDArray[np.float64] = WAY, look: Look | None = None, linger_s: float = 0.0,
+    steer: Steer, way: NDArray[np.float64] = WAY, camera: CameraSettings | None = None, linger_s: float = 0.0,
     detour: Detour | None = None, **changes: Any,
 ) -> Recorded:  # fmt: skip
     """Along the corridor; a policy's drive where `steer` is not the expert."""
     episode = corridor_episode(robot="carter", **changes)
-    pupil = steer is not _as_wanted
+    policy_drives = steer is not _expert_command
     plan = DrivePlan(
-        episode, load_scene("corridor"), way, look or Look(), "none", pupil=pupil, linger_s=linger_s,
-        detour=detour,
+        episode, load_scene("corridor"), way, camera or CameraSettings(), "none", policy_drives=policy_drives,
+        linger_s=linger_s, detour=detour,
     )  # fmt: skip
     return record(plan, ExpertPolicy(speed_mps=0.8, rests=True), steer, _tell)
 
 
 @pytest.fixture(scope="module")
 def reached() -> Recorded:
-    return _drive(_as_wanted)
+    return _drive(_expert_command)
 
 
 @pytest.fixture(scope="module")
 def standing() -> Recorded:
     """A policy that does not move, for 4 s, seen through a camera of twice the size."""
-    return _drive(_still, look=Look(256, 80), timeout_s=4.0)
+    return _drive(_still, camera=CameraSettings(256, 80), timeout_s=4.0)
 
 
 # -- the expert's drives ----------------------------------------------------------------------------------------------
@@ -124,7 +124,7 @@ def test_waypoints_lead_to_the_goal_and_end_there(reached: Recorded) -> None:
     assert pose[-1, 0] + plan[-1, 2, 0] == pytest.approx(6.0, abs=0.2)
 
 
-def test_a_trace_is_told_once_a_second_in_order(reached: Recorded) -> None:
+def test_traces_are_recorded_once_a_second_in_order(reached: Recorded) -> None:
     times = [trace["at"] for trace in reached.traces]
     assert times == [float(second) for second in range(len(times))]
     assert len(times) == (len(reached.arrays["pose"]) - 1) // 10 + 1
@@ -136,14 +136,14 @@ def test_pictures_are_of_128_pixels_and_show_something(reached: Recorded, standi
         assert picture.shape == (128, 128, 3) and picture.std() > 10
 
 
-def test_a_drive_beside_the_told_way_is_not_kept() -> None:
-    with pytest.raises(NothingToLearnError, match="left the way"):
-        _drive(_as_wanted, way=np.array(((0.0, 9.0), (6.0, 9.0))), timeout_s=4.0)
+def test_a_drive_off_the_described_route_is_rejected() -> None:
+    with pytest.raises(NothingToLearnError, match="left the described route"):
+        _drive(_expert_command, way=np.array(((0.0, 9.0), (6.0, 9.0))), timeout_s=4.0)
 
 
 def test_what_is_too_short_is_not_kept() -> None:
-    with pytest.raises(NothingToLearnError, match="less than 3 s before trouble"):
-        _drive(_as_wanted, timeout_s=1.0)
+    with pytest.raises(NothingToLearnError, match="less than 3 s are usable"):
+        _drive(_expert_command, timeout_s=1.0)
 
 
 # -- a policy's drives ------------------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def test_where_a_policy_drives_the_label_is_what_the_expert_would_do(standing: R
 
 
 def test_a_policy_that_stands_for_too_long_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording, "_PUPIL_STUCK_S", 3.0)
+    monkeypatch.setattr(recording, "_POLICY_STUCK_S", 3.0)
     recorded = _drive(_still, timeout_s=20.0)
     assert recorded.outcome == "cut" and len(recorded.arrays["pose"]) == 31
 
@@ -166,26 +166,28 @@ def _poses(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack((x, 0 * x, 0 * x), axis=1)
 
 
-def _plan(*, pupil: bool) -> DrivePlan:
-    return DrivePlan(corridor_episode(), load_scene("corridor"), WAY, Look(), "none", pupil=pupil)
+def _plan(*, policy_drives: bool) -> DrivePlan:
+    return DrivePlan(
+        corridor_episode(), load_scene("corridor"), WAY, CameraSettings(), "none", policy_drives=policy_drives
+    )
 
 
-def test_a_pupil_that_waits_for_less_or_creeps_on_is_not_hopeless() -> None:
-    plan = _plan(pupil=True)
+def test_a_policy_that_waits_for_less_or_creeps_is_not_hopeless() -> None:
+    plan = _plan(policy_drives=True)
     assert not is_hopeless(_poses(np.zeros(150)), plan)
     assert not is_hopeless(_poses(np.arange(200) * 0.004), plan)
     assert is_hopeless(_poses(np.arange(200) * 0.003), plan)
 
 
 def test_the_expert_may_wait_for_longer_but_not_for_ever() -> None:
-    plan = _plan(pupil=False)
+    plan = _plan(policy_drives=False)
     assert not is_hopeless(_poses(np.zeros(400)), plan)
     assert is_hopeless(_poses(np.zeros(401)), plan)
 
 
-def test_a_pupil_six_metres_off_the_way_is_hopeless_at_once() -> None:
-    assert not is_hopeless(np.array(((3.0, 5.9, 0.0),)), _plan(pupil=True))
-    assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), _plan(pupil=True))
+def test_a_policy_six_metres_off_the_route_is_hopeless_at_once() -> None:
+    assert not is_hopeless(np.array(((3.0, 5.9, 0.0),)), _plan(policy_drives=True))
+    assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), _plan(policy_drives=True))
 
 
 @pytest.mark.parametrize(
@@ -217,9 +219,9 @@ def test_of_a_timeout_the_waiting_at_its_end_is_not_kept() -> None:
         assert kept_frames(waited, outcome, None) == pytest.approx(104, abs=2)
 
 
-def test_a_pupils_collisions_are_kept_and_its_falls_are_not() -> None:
-    assert kept_frames(WALK, "reached", 60, pupil=True) == 100
-    assert kept_frames(WALK, "fell", 60, pupil=True) == 80
+def test_a_policys_collisions_are_kept_and_its_falls_are_not() -> None:
+    assert kept_frames(WALK, "reached", 60, policy_drives=True) == 100
+    assert kept_frames(WALK, "fell", 60, policy_drives=True) == 80
 
 
 # -- what is drawn ----------------------------------------------------------------------------------------------------
@@ -244,12 +246,12 @@ def test_numbers_that_make_no_sense_are_refused(changed: dict[str, Any], says: s
 
 def test_a_look_smaller_than_the_policys_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="128"):
-        Look(64)
+        CameraSettings(64)
 
 
 @pytest.mark.slow
 def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_frame() -> None:
-    lingering = _drive(_as_wanted, linger_s=6.0)
+    lingering = _drive(_expert_command, linger_s=6.0)
     pose = lingering.arrays["pose"]
     assert lingering.outcome == "reached"
     assert np.max(np.abs(pose[-10:] - pose[-1])) < 0.05
@@ -259,7 +261,7 @@ def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_fra
 
 @pytest.mark.slow
 def test_on_a_detour_it_leaves_its_way_and_the_label_is_what_brings_it_back() -> None:
-    aside = _drive(_as_wanted, detour=Detour((1.3, 0.5), 3.5, 1.0), timeout_s=60.0)
+    aside = _drive(_expert_command, detour=Detour((1.3, 0.5), 3.5, 1.0), timeout_s=60.0)
     by, pose = aside.arrays["by"], aside.arrays["pose"]
     assert aside.outcome == "reached" and set(by) == {EXPERT, NOISE}
     last = int(np.flatnonzero(by == NOISE)[-1])
@@ -269,4 +271,4 @@ def test_on_a_detour_it_leaves_its_way_and_the_label_is_what_brings_it_back() ->
 
 
 def test_where_there_is_no_way_to_it_there_is_no_detour() -> None:
-    assert set(_drive(_as_wanted, detour=Detour((500.0, 0.0), 1.0, 1.0)).arrays["by"]) == {EXPERT}
+    assert set(_drive(_expert_command, detour=Detour((500.0, 0.0), 1.0, 1.0)).arrays["by"]) == {EXPERT}

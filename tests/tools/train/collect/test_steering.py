@@ -1,4 +1,4 @@
-"""Disturbances come in bursts and are told apart; in DAgger whole stretches are the expert's."""
+"""Noise comes in bursts and is marked as such; in DAgger whole stretches are the expert's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import isclose
 import numpy as np
 import pytest
 
-from tools.train.collect.steering import NoiseLook, Shared, SteeringNoise, Velocity
+from tools.train.collect.steering import NoiseConfig, SharedControl, SteeringNoise, Velocity
 from tools.train.drives.drive import EXPERT, NOISE, POLICY
 
 WANTED: Velocity = (0.7, 0.0, 0.1)
@@ -30,12 +30,12 @@ def test_outside_a_burst_the_experts_command_is_not_touched() -> None:
 
 
 def test_bursts_and_pauses_last_as_long_as_they_should() -> None:
-    look = NoiseLook()
+    config = NoiseConfig()
     runs = _runs([by for _, by in _bursts(2)])
     bursts, pauses = ([ticks / 10 for who, ticks in runs if who == kind] for kind in (NOISE, EXPERT))
     assert len(bursts) > 20
-    assert look.burst_s[0] <= min(bursts) and max(bursts) <= look.burst_s[1]
-    assert look.pause_s[0] - 0.2 <= min(pauses) and max(pauses) <= look.pause_s[1]
+    assert config.burst_s[0] <= min(bursts) and max(bursts) <= config.burst_s[1]
+    assert config.pause_s[0] - 0.2 <= min(pauses) and max(pauses) <= config.pause_s[1]
 
 
 def test_a_burst_is_one_drifting_push_and_not_a_new_one_each_time() -> None:
@@ -59,11 +59,11 @@ def test_the_same_seed_disturbs_alike_and_another_does_not() -> None:
 
 
 def _shared(beta: float, ticks: int = 4000) -> list[tuple[Velocity, int]]:
-    shared = Shared(np.random.default_rng(1), beta)
+    shared = SharedControl(np.random.default_rng(1), beta)
     return [shared.command(WANTED, POLICYS) for _ in range(ticks)]
 
 
-def test_what_is_commanded_is_whose_it_is_said_to_be() -> None:
+def test_a_command_has_the_source_that_is_reported() -> None:
     assert set(_shared(0.5)) == {(WANTED, EXPERT), (POLICYS, POLICY)}
 
 
@@ -82,4 +82,4 @@ def test_nobody_drives_for_less_than_two_seconds() -> None:
 
 def test_a_chance_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match="0 to 1"):
-        Shared(np.random.default_rng(1), 1.5)
+        SharedControl(np.random.default_rng(1), 1.5)

@@ -1,4 +1,4 @@
-"""A tour shows along a told way what a drive would show there, once a second, and says what is true of it."""
+"""A tour records along a described route what a drive would record there, with true text once a second."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sim_hil.benchmark.policies.expert import driving_of
 from tests.support.train.train_drives import made_up_drive, write_dataset
 from tests.support.train.training_scenarios import progress_of, scenarios
 from tools.train.collect.collection import Collection
-from tools.train.collect.record import Look, Recorded
-from tools.train.collect.tour_world import Carriage, Glider, carried
+from tools.train.collect.record import CameraSettings, Recorded
+from tools.train.collect.tour_world import KinematicBase, TourWorld, record_tour
 from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.collect.worker import messages
 from tools.train.config.collect import CollectConfig, TourConfig
@@ -34,24 +34,26 @@ STRAIGHT = np.stack((np.arange(0, 8, 0.1), np.zeros(80)), axis=1)
 
 
 @pytest.fixture(scope="module")
-def carriage() -> Iterator[Carriage]:
-    with closing(Carriage(scenarios("office")[0].site, 10)) as made:
+def tour_world() -> Iterator[TourWorld]:
+    with closing(TourWorld(scenarios("office")[0].site, 10)) as made:
         yield made
 
 
-def _tour(carriage: Carriage, scenario: Scenario, config: TourConfig) -> Recorded:
-    return carried(scenario, carriage, config, Look(), "none", CollectConfig(), np.random.default_rng(3))
+def _tour(tour_world: TourWorld, scenario: Scenario, config: TourConfig) -> Recorded:
+    return record_tour(
+        scenario, tour_world, config, CameraSettings(), "none", CollectConfig(), np.random.default_rng(3)
+    )
 
 
 @pytest.fixture(scope="module")
 def straight_there() -> Iterator[Recorded]:
-    with closing(Carriage(scenarios("office")[0].site, 10)) as carriage:
-        yield _tour(carriage, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
+    with closing(TourWorld(scenarios("office")[0].site, 10)) as tour_world:
+        yield _tour(tour_world, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
 
 
 @pytest.fixture(scope="module")
-def with_a_detour(carriage: Carriage) -> Recorded:
-    return _tour(carriage, scenarios("office")[0], TourConfig(stray_share=1.0))
+def with_a_detour(tour_world: TourWorld) -> Recorded:
+    return _tour(tour_world, scenarios("office")[0], TourConfig(stray_share=1.0))
 
 
 @pytest.mark.slow
@@ -113,10 +115,10 @@ def test_where_it_has_arrived_it_says_to_stop(straight_there: Recorded) -> None:
 
 
 @pytest.mark.slow
-def test_nobody_begins_where_it_does(carriage: Carriage) -> None:
+def test_nobody_begins_where_it_does(tour_world: TourWorld) -> None:
     for scenario in scenarios("office"):
-        carriage.fill(scenario.episode)
-        gaps = np.hypot(*(carriage.people()[:, :2] - scenario.episode.start[:2]).T)
+        tour_world.fill(scenario.episode)
+        gaps = np.hypot(*(tour_world.people()[:, :2] - scenario.episode.start[:2]).T)
         assert gaps.min() > 2.0
 
 
@@ -155,7 +157,7 @@ def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_same_numbers_give_the_same_tour(straight_there: Recorded) -> None:
-    with closing(Carriage(scenarios("office")[0].site, 10)) as fresh:
+    with closing(TourWorld(scenarios("office")[0].site, 10)) as fresh:
         again = _tour(fresh, scenarios("office")[0], TourConfig(stray_share=0.0, linger_s=8.0))
     assert all(np.array_equal(again.arrays[name], array) for name, array in straight_there.arrays.items())
 
@@ -165,7 +167,7 @@ def test_a_body_glides_along_a_route_and_not_through_walls() -> None:
     x, y, heading = scenario.episode.start
     driving = replace(driving_of("go2"), speed_mps=0.8)
     grid = scenario.site.robot_grid("go2")
-    body = Glider(SE2(x, y, heading), driving, grid, np.random.default_rng(0))
+    body = KinematicBase(SE2(x, y, heading), driving, grid, np.random.default_rng(0))
     start, c, s = np.array((x, y)), np.cos(heading), np.sin(heading)
     for _ in range(600):  # far beyond any wall
         along = (np.array((body.pose.x_m, body.pose.y_m)) - start) @ (c, s)
@@ -175,7 +177,7 @@ def test_a_body_glides_along_a_route_and_not_through_walls() -> None:
 
 def test_a_halted_body_comes_to_rest() -> None:
     scenario = scenarios("office")[0]
-    body = Glider(SE2(*scenario.episode.start), driving_of("go2"), scenario.site.robot_grid("go2"),
+    body = KinematicBase(SE2(*scenario.episode.start), driving_of("go2"), scenario.site.robot_grid("go2"),
                   np.random.default_rng(0), speed_mps=0.8)  # fmt: skip
     for _ in range(20):
         gone = body.step(STRAIGHT, halted=True)
@@ -192,7 +194,7 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
     assert said[0]["drive"]["driver"] == drive.about.driver == TOUR_DRIVER
     assert np.array_equal(Seconds(drive, False).frame(1), drive.frame(10))
     assert np.array_equal(Seconds(drive, True).frame(1), drive.frame(10)[:, ::-1])
-    with pytest.raises(DriveError, match="no picture of frame 7"):
+    with pytest.raises(DriveError, match="frame 7 has no image"):
         drive.frame(7)
 
 
@@ -200,7 +202,7 @@ def test_only_a_tour_may_lack_pictures() -> None:
     drive = made_up_drive("a", 30)
     ends = drive.jpeg_end.copy()
     ends[5] = ends[4]
-    with pytest.raises(DriveError, match="growing ends"):
+    with pytest.raises(DriveError, match="increasing values"):
         replace(drive, jpeg_end=ends)
 
 

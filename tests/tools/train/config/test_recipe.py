@@ -67,7 +67,7 @@ def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says
         ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\nlayers = 3', "unknown key 'layers'"),
         ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sfd]', "unknown key 'sfd'"),
         ('schema = 1\nname = "a"\nseed = 1\n[model]\npreset = "nano"\n[sft]\nepoch = 1', "unknown key 'epoch'"),
-        ('schema = 1\nname = "a"\nseed = "b"\n[model]\npreset = "nano"', "seed, a whole number"),
+        ('schema = 1\nname = "a"\nseed = "b"\n[model]\npreset = "nano"', "an integer as seed"),
         ("schema =", "recipe.toml"),
     ],
 )

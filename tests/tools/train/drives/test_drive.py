@@ -48,7 +48,7 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
     drive().save(tmp_path / "a")
     found = Drive.load(tmp_path / "a", pictures=False)
     assert len(found) == 60 and found.T_odom_base(0).as_tuple() == (0.0, 0.0, 0.0)
-    with pytest.raises(DriveError, match="without its pictures"):
+    with pytest.raises(DriveError, match="without its images"):
         found.frame(0)
 
 
@@ -72,7 +72,7 @@ def test_the_trace_of_a_frame_is_the_newest_written_by_then() -> None:
         ("pose", np.zeros((59, 3)), "pose: expected"),
         ("state", np.zeros((60, 3)), "state: expected float32"),
         ("pose_odom", np.full((60, 3), np.nan), "not finite"),
-        ("jpeg_end", np.zeros(60, np.int64), "growing"),
+        ("jpeg_end", np.zeros(60, np.int64), "increasing"),
         ("future_steps", np.full(60, 51, np.int16), "0 to 50"),
     ],
 )
@@ -88,7 +88,7 @@ def test_traces_must_be_a_second_apart() -> None:
 
 @pytest.mark.parametrize("name", ["../a", "", "a/b", ".a"])
 def test_an_id_is_no_path(name: str) -> None:
-    with pytest.raises(DriveError, match="an id is made of"):
+    with pytest.raises(DriveError, match="expected an id of"):
         about(name)
 
 
@@ -99,7 +99,7 @@ def test_a_header_with_a_key_too_many_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DriveError, match="keys in its header"):
         Drive.load(tmp_path / "b")
     save_file(arrays, tmp_path / "c")
-    with pytest.raises(DriveError, match="not of a drive"):
+    with pytest.raises(DriveError, match="header is not a drive"):
         Drive.load(tmp_path / "c")
 
 
@@ -152,12 +152,12 @@ def test_verifying_finds_one_wrong_byte(tmp_path: Path) -> None:
     data[-1] ^= 1
     found.path("e0").write_bytes(data)
     Dataset.open(tmp_path)
-    with pytest.raises(DriveError, match="not the file that the index lists"):
+    with pytest.raises(DriveError, match="differs from the indexed file"):
         Dataset.open(tmp_path, verify=True)
 
 
 def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DriveError, match="make one with collect"):
+    with pytest.raises(DriveError, match="record one with collect"):
         Dataset.open(tmp_path)
 
 

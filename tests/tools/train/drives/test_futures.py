@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import pi
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,7 @@ from sim_hil.benchmark.policies.expert_motion import STEP_S, STEPS, Choice
 from sim_hil.benchmark.policies.expert_route import SPACING_M
 from tests.support.train.training_drives import arc
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
-from tools.train.drives.futures import chosen_future, driven_future, label_futures
-from tools.train.drives.windows import relative
+from tools.train.drives.futures import chosen_future, driven_future, label_futures, relative
 
 AHEAD = np.stack((np.arange(0.0, 10.0, SPACING_M), np.zeros(100)), axis=1)
 
@@ -153,3 +154,10 @@ def test_before_trouble_only_what_was_driven_is_known() -> None:
     assert np.allclose(future[90, :9], relative(poses[90], poses[91:]))
     assert np.allclose(future[90, 9:], future[90, 8])
     assert np.allclose(future[99], 0.0)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (2.0, -1.0, 3.1), (-4.0, 5.0, -2.0)])
+def test_relative_is_what_se2_says(origin: tuple[float, float, float]) -> None:
+    poses = np.array([(1.0, 2.0, 0.3), (-3.0, 0.5, -3.0), (0.0, 0.0, pi - 0.01)])
+    expected = [(SE2(*origin).inverse() @ SE2(*(float(v) for v in pose))).as_tuple() for pose in poses]
+    assert np.allclose(relative(np.array(origin), poses), expected, atol=1e-12)

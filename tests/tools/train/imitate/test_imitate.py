@@ -25,7 +25,7 @@ from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates, SampleError
 from tools.train.imitate.imitate import POINT_GOAL_FILE, ImitateError, budget, fit, run
 from tools.train.imitate.point_goal_net import PointGoalFileError, build_point_goal, load_point_goal
-from tools.train.imitate.trainable_policies import ExpertPupil, PointGoalPupil
+from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy
 from tools.train.pipeline.chain import Step, run_step
 from tools.train.run import optim
 from tools.train.run.job import StageJob
@@ -148,9 +148,9 @@ def test_a_devices_profile_says_under_which_ages_is_trained(tmp_path: Path, data
 def test_the_point_goal_baseline_learns_from_where_the_goal_is(tmp_path: Path, dataset: Dataset) -> None:
     config = dataclasses.replace(LONG, policy=POINT_GOAL)
     job = imitate_job(tmp_path, config)
-    pupil = PointGoalPupil(build_point_goal(tiny_model(), job.generator("start")), config.loss)
+    policy = PointGoalNetPolicy(build_point_goal(tiny_model(), job.generator("start")), config.loss)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, 32)
-    result = fit(job, pupil, dataset, MadeUpTokens(), states, of="test")
+    result = fit(job, policy, dataset, MadeUpTokens(), states, of="test")
     assert result["mean_age_s"] == 0.0 and set(result["held_out"]["all"]) == {"policy", "keep_state"}
     assert result["held_loss"] < 0.5 * next(iter(job.run_dir.lines()))["loss"]
 
@@ -161,9 +161,9 @@ def test_drives_without_states_cannot_be_learned_from(tmp_path: Path, dataset: D
             return ()
 
     job = imitate_job(tmp_path)
-    pupil = ExpertPupil(build(tiny_model(), 1).action, CONFIG.loss)
+    policy = ActionExpertPolicy(build(tiny_model(), 1).action, CONFIG.loss)
     with pytest.raises(SampleError, match="no frame"):
-        fit(job, pupil, dataset, MadeUpTokens(), Nobody(dataset), of="test")
+        fit(job, policy, dataset, MadeUpTokens(), Nobody(dataset), of="test")
 
 
 @pytest.mark.slow
@@ -210,7 +210,7 @@ def test_the_point_goal_stage_leaves_its_own_weights(tmp_path: Path) -> None:
     plans = network(torch.zeros(2, 4, 32), torch.zeros(2, 3), torch.tensor([[5.0, 0.0], [0.0, 0.0]]))
     assert plans.shape == (2, 30, 3) and torch.isfinite(plans).all()
     assert not stage_weights(tmp_path, "imitate").exists()
-    with pytest.raises(PointGoalFileError, match="other sizes"):
+    with pytest.raises(PointGoalFileError, match="another size"):
         load_point_goal(path, with_action(steps=10))
 
 

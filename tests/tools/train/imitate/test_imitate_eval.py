@@ -71,7 +71,7 @@ def test_errors_are_those_of_positions_and_of_the_command_a_second_ahead(samples
         later = torch.arange(1, 31)[:, None] / 10 * torch.tensor([0.3, 0.0, 0.0])
         return batch.target * torch.tensor([0.0, 0.0, 0.0]) + later
 
-    result = evaluate(faster, samples, FEW, seed=1, device=CPU, words=False)
+    result = evaluate(faster, samples, FEW, seed=1, device=CPU, semantics=False)
     assert set(result["all"]) == {"policy", "keep_state", "waypoints"}
     policy = result["all"]["policy"]
     # All drive 0.6 m/s but for the first second and the turn.
@@ -92,7 +92,7 @@ def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
         seen.extend(batch.latency[:, 0].tolist())
         return batch.target
 
-    again = evaluate(listening, samples, FEW, seed=1, device=CPU, words=False)
+    again = evaluate(listening, samples, FEW, seed=1, device=CPU, semantics=False)
     for each in again["by_delay"]:
         last = each["to_s"] == 10
         count = sum(each["from_s"] <= age + 1e-6 < each["to_s"] or (last and age > 9.99) for age in seen)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tools.train.drives.drive import Dataset
-from tools.train.drives.windows import relative
+from tools.train.drives.futures import relative
 from tools.train.importers import gnd, scand
 from tools.train.importers.__main__ import import_folder, main
 from tools.train.importers.cut import FRAMES, drives, pieces
@@ -222,7 +222,7 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("texts", "says"),
     [
-        ({"7": {"wordings": ["go"]}}, "words for episode 7, of 1"),
+        ({"7": {"wordings": ["go"]}}, "texts for episode 7; expected a number below 1"),
         ({"0": {"wordings": ["go"], "traces": [TRACE]}}, "expected 20 traces"),
         ({"0": {"wordings": ["go"], "mood": "good"}}, "wordings and traces"),
         ({"0": {"wordings": "go"}}, "list of texts"),
@@ -282,7 +282,7 @@ def test_a_quaternion_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_stamps_that_do_not_grow_are_refused(recording: Recording) -> None:
     stamps = recording.stamps_s.copy()
     stamps[5] = stamps[4]
-    with pytest.raises(ImportedError, match="stamps that grow"):
+    with pytest.raises(ImportedError, match="increasing stamps"):
         replace(recording, stamps_s=stamps)
 
 
@@ -316,7 +316,7 @@ def test_importing_again_adds_what_is_new(tmp_path: Path) -> None:
 def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gnd", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "holds no recording of gnd" in said
+    assert said.count("\n") == 1 and "found no recording of gnd" in said
 
 
 def test_the_command_writes_its_counts(tmp_path: Path) -> None:

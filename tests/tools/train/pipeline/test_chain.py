@@ -184,10 +184,10 @@ def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir,
 
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
     path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    with pytest.raises(NetworkFileError, match="language is not the recipe's"):
+    with pytest.raises(NetworkFileError, match="language differs from the recipe's"):
         read_network(path, with_overrides(TINY.model, {"language.layers": "2"}), 9)
     path.write_bytes(b"nothing")
-    with pytest.raises(NetworkFileError, match="not weights of ours"):
+    with pytest.raises(NetworkFileError, match="not weights of edge-train"):
         read_network(path, TINY.model, 9)
 
 
@@ -305,7 +305,7 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
 def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, capsys: Any) -> None:
     assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
     told = capsys.readouterr()
-    assert "dagger-1" in told.err and "in all" in told.err and not (tmp_path / "run").exists()
+    assert "dagger-1" in told.err and "  total " in told.err and not (tmp_path / "run").exists()
     assert json.loads(told.out)["budget"]
 
 
@@ -361,7 +361,7 @@ def test_a_run_keeps_its_own_copy_of_a_devices_delays(
     imitation = load_recipe(str(out / "recipe.toml")).imitate
     assert imitation is not None and Delays.of(imitation.delays).mean_s == pytest.approx(3.0, abs=0.1)
     assert run(*asked, "--resume") == EXIT_BAD_INPUT
-    assert "begun with other numbers (imitate.delays.profile" in capsys.readouterr().err
+    assert "started with another recipe (imitate.delays.profile" in capsys.readouterr().err
 
 
 def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[str, Any]]]:

@@ -47,7 +47,7 @@ def test_a_jagged_line_is_averaged_over_what_came_before() -> None:
 def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
     steps = steps_of("all", TINY)
     told = lines_of(TINY, steps, [Line("sft", "anchors", 5400, 54.0), Line("rl", "steps", 9, None)], "cpu")
-    assert "1 min 40 s" in told[-1] and "1 parts that nobody has measured" in told[-1]
+    assert "1 min 40 s" in told[-1] and "1 parts without a measured rate" in told[-1]
     assert {line.step for line in budget_of(TINY, steps, "cpu")} >= {"dagger-1", "evaluate"}
 
 

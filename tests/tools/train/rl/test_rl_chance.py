@@ -1,4 +1,4 @@
-"""What is random in a rollout is of its place; what a pilot is told and how it is slowed down are the runner's own."""
+"""Random numbers of a rollout depend on seed and position; delays and speed limits are the runner's."""
 
 from __future__ import annotations
 
@@ -21,11 +21,18 @@ from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tools.train.rl import worker as rl_worker
-from tools.train.rl.drive import CONTROL_S, DriveOptions, _Wheel, drive_episode
-from tools.train.rl.rollout import Chosen, EpisodeEnd, EpisodeSteps
+from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, PolicyOutput
 from tools.train.rl.vector_env import split
-from tools.train.rl.virtual_time_reasoner import START_NS, AsyncMind
-from tools.train.rl.worker import RolloutOrder, delays, scenarios
+from tools.train.rl.virtual_time_reasoner import START_NS, RolloutReasoner
+from tools.train.rl.worker import (
+    CONTROL_S,
+    CommandLimiter,
+    DriveOptions,
+    RolloutOrder,
+    delays,
+    drive_episode,
+    scenarios,
+)
 from tools.train.scenes.scenarios import FIRST_SEED
 
 TIMES = LatencyProfile("some", "drawn", (1.0, 2.0, 3.0))
@@ -61,37 +68,37 @@ def _replaced(made: Any, **changes: Any) -> Any:
     )
 
 
-# Chance
+# Random numbers
 
 
-def test_jobs_know_where_they_are_in_the_order() -> None:
+def test_parts_of_an_order_keep_their_position() -> None:
     parts = split(ORDER, 2)
     assert [(part.first, part.numbers) for part in parts] == [(0, (0, 1)), (2, (0, 1)), (4, (0,))]
     assert [Path(part.out).stem for part in parts] == ["000", "001", "002"]
 
 
-def test_a_task_that_comes_again_has_another_crowd(drawn: list[tuple[int, int]]) -> None:
+def test_a_repeated_task_has_another_crowd(drawn: list[tuple[int, int]]) -> None:
     seeds = [scenario.episode.seed for _, scenario in scenarios(ORDER)]
     assert len(set(seeds)) == len(ORDER.numbers) and min(seeds) >= FIRST_SEED
     assert seeds == [scenario.episode.seed for _, scenario in scenarios(ORDER)]
 
 
-def test_a_task_that_comes_again_thinks_for_other_times(drawn: list[tuple[int, int]]) -> None:
+def test_a_repeated_task_has_other_latencies(drawn: list[tuple[int, int]]) -> None:
     times = [[delays(SOME, scenario, place).draw().total_ns for _ in range(20)] for place, scenario in scenarios(SOME)]
     assert times[1] != times[3]
 
 
 def test_how_an_order_is_split_changes_nothing(drawn: list[tuple[int, int]]) -> None:
-    def told(order: RolloutOrder) -> list[tuple[int, str, int, int]]:
+    def drawn_for(order: RolloutOrder) -> list[tuple[int, str, int, int]]:
         return [
             (place, made.episode.id, made.episode.seed, delays(order, made, place).draw().total_ns)
             for place, made in scenarios(order)
         ]
 
-    assert told(ORDER) == [each for part in split(ORDER, 2) for each in told(part)]
+    assert drawn_for(ORDER) == [each for part in split(ORDER, 2) for each in drawn_for(part)]
 
 
-def test_exploration_is_of_the_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_exploration_noise_depends_on_the_position(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     explored: list[float] = []
 
     def drive(*given: Any) -> tuple[EpisodeSteps, EpisodeEnd]:
@@ -103,7 +110,7 @@ def test_exploration_is_of_the_place(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(rl_worker, "config_from_dict", lambda content: None)
     monkeypatch.setattr(rl_worker, "read_network", lambda *_: SimpleNamespace(eval=lambda: _Network()))
     monkeypatch.setattr(rl_worker.checkpoint, "load", lambda path: ({}, {"log_std": (-2.0, -2.0)}))
-    monkeypatch.setattr(rl_worker, "_point_goal_pilots", lambda *_: lambda scenario, place: None)
+    monkeypatch.setattr(rl_worker, "_point_goal_policies", lambda *_: lambda scenario, place: None)
     for part in split(replace(ORDER, out=str(tmp_path)), 2):
         list(rl_worker.messages(part.to_json()))
     assert len(set(explored)) == len(ORDER.numbers)
@@ -113,20 +120,20 @@ class _Network:
     config = SimpleNamespace(vision=SimpleNamespace(image_px=32))
 
 
-def test_the_mean_is_driven_among_the_scenarios_own_people(drawn: list[tuple[int, int]]) -> None:
+def test_without_exploration_the_crowd_is_the_scenarios_own(drawn: list[tuple[int, int]]) -> None:
     found = [scenario.episode.seed for _, scenario in scenarios(replace(SOME, explore=False))]
     assert found == [FIRST_SEED + number for number in SOME.numbers]
 
 
-def test_neighbours_are_drawn_together_and_once(drawn: list[tuple[int, int]]) -> None:
+def test_consecutive_scenarios_are_generated_together_and_once(drawn: list[tuple[int, int]]) -> None:
     assert len(list(scenarios(SOME))) == 4 and drawn == [(3, 3)]
 
 
 # Time and age
 
 
-class _Watching:
-    """Drives straight on and remembers when it was asked."""
+class _Recorder:
+    """A policy that drives straight ahead and records the time of every observation."""
 
     failure = None
     semantic: Sequence[Any] = ()
@@ -134,60 +141,63 @@ class _Watching:
     def __init__(self) -> None:
         self.times: list[float] = []
 
-    def see(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Any:
+    def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Any:
         self.times.append(time_s)
         return np.zeros((1, 2, 3), np.float32)
 
-    def choose(self, visual: Any, state: Any, goal_m: Any, time_s: float, T_odom_base: SE2) -> Chosen:
-        return Chosen((0.8, 0.0))
+    def choose(self, visual: Any, state: Any, goal_m: Any, time_s: float, T_odom_base: SE2) -> PolicyOutput:
+        return PolicyOutput((0.8, 0.0))
 
-    def think(self, time_s: float) -> None:
+    def start_generation(self, time_s: float) -> None:
         """Nothing."""
 
 
 @pytest.mark.slow
-def test_a_pilot_is_told_the_time_to_the_nanosecond() -> None:
+def test_a_policy_receives_the_time_to_the_nanosecond() -> None:
     episode = corridor_episode(timeout_s=1.2)
     scenario: Any = SimpleNamespace(
         episode=episode, wordings=episode.instructions, scene=load_scene("corridor"), kind="corridor"
     )
-    pilot = _Watching()
+    policy = _Recorder()
     options = DriveOptions(32, None, max_s=1.2)
-    drive_episode(scenario, lambda _: pilot, robot_config().limits, options, np.random.default_rng(0))
-    assert [round(time_s * 1e9) for time_s in pilot.times] == [k * 100_000_000 for k in range(13)]
+    drive_episode(scenario, lambda _: policy, robot_config().limits, options, np.random.default_rng(0))
+    assert [round(time_s * 1e9) for time_s in policy.times] == [k * 100_000_000 for k in range(13)]
 
 
-def _mind(age_s: float) -> AsyncMind:
-    """At time 0, with an answer of that age."""
+def _reasoner(age_s: float) -> RolloutReasoner:
+    """A reasoner at time 0 whose semantic state has that age."""
     runtime = SimpleNamespace(frame_offsets_s=(9.0, 0.0), max_new_tokens=4)
     models: Any = SimpleNamespace(
         ages=SemanticConfig(), artifacts=SimpleNamespace(runtime=runtime), language=None,
         policy=SimpleNamespace(tokens_shape=(1, 2, 3)),
     )  # fmt: skip
-    mind = AsyncMind(models, "go", lambda: None)  # type: ignore[arg-type, return-value]
+    reasoner = RolloutReasoner(models, "go", lambda: None)  # type: ignore[arg-type, return-value]
     anchor_ns = START_NS - round(age_s * 1e9)
-    mind._slot.state = SemanticState(
+    reasoner._slot.state = SemanticState(
         1, anchor_ns, SE2(0, 0, 0), anchor_ns, np.zeros((1, 1, 2), np.float32), {}, "", None
     )
-    return mind
+    return reasoner
 
 
-@pytest.mark.parametrize(("age_s", "told_s"), [(4.0, 4.0), (10.0, 10.0), (13.0, 10.0)])
-def test_an_age_is_told_as_the_runner_tells_it(age_s: float, told_s: float) -> None:
-    assert _mind(age_s).metadata(0.0, SE2(0, 0, 0))[0] == told_s
+@pytest.mark.parametrize(("age_s", "given_s"), [(4.0, 4.0), (10.0, 10.0), (13.0, 10.0)])
+def test_delay_is_clipped_as_in_the_runner(age_s: float, given_s: float) -> None:
+    assert _reasoner(age_s).metadata(0.0, SE2(0, 0, 0))[0] == given_s
 
 
 @pytest.mark.parametrize(
     ("age_s", "share"), [(4.0, 1.0), (10.0, 1.0), (12.5, 0.5), (14.0, 0.2), (15.0, 0.0), (20.0, 0.0)]
 )
-def test_an_answer_that_is_too_old_slows_down_and_stops(age_s: float, share: float) -> None:
-    assert _mind(age_s).speed_scale(0.0) == pytest.approx(share)
+def test_a_semantic_state_that_is_too_old_slows_the_robot_down_and_stops_it(age_s: float, share: float) -> None:
+    assert _reasoner(age_s).speed_scale(0.0) == pytest.approx(share)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.2])
-def test_what_is_slowed_down_is_driven_as_the_controller_does(share: float) -> None:
+def test_a_scaled_command_equals_the_controllers(share: float) -> None:
     limits = robot_config().limits
-    controller, wheel = Controller(ControllerConfig(limits, 0.1, 500.0, odometry_max_age_ms=100.0)), _Wheel(limits)
+    controller, limiter = (
+        Controller(ControllerConfig(limits, 0.1, 500.0, odometry_max_age_ms=100.0)),
+        CommandLimiter(limits),
+    )
     trajectory = np.zeros((30, 3), np.float32)
     trajectory[:, 0] = np.linspace(0.1, 3.0, 30)  # 1 m/s
     now_ns = 1_000_000_000
@@ -195,6 +205,6 @@ def test_what_is_slowed_down_is_driven_as_the_controller_does(share: float) -> N
     for _ in range(30):
         now_ns += round(CONTROL_S * 1e9)
         wanted = controller.step(ControllerInputs(trajectory, 0.0, 0.0, speed_scale=share), now_ns)
-        found = wheel.turned(min(1.0, limits.vx_max_mps), 0.0, share)
+        found = limiter.limit(min(1.0, limits.vx_max_mps), 0.0, share)
         assert found == pytest.approx((wanted.vx_mps, 0.0, wanted.wz_radps), abs=1e-6)
     assert found[0] == pytest.approx(min(1.0, share * limits.vx_max_mps))

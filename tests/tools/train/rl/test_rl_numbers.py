@@ -1,4 +1,4 @@
-"""Reinforcement learning's arithmetic: advantages, densities, the arc's twin, PPO on a world of one number."""
+"""The arithmetic of reinforcement learning: advantages, densities, arcs, and PPO on a one-parameter problem."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from firmware_bridge.core.config import LimitsConfig
 from sim_hil.benchmark.policies.select import robot_config
 from tools.train.config.rl import PpoConfig
 from tools.train.rl.command_policy import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
-from tools.train.rl.gae import advantages
-from tools.train.rl.ppo import PpoOptimiser, PpoStats
+from tools.train.rl.ppo import PpoOptimiser, PpoStats, advantages
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -34,7 +33,7 @@ def test_advantages_are_those_worked_out_by_hand() -> None:
     assert returns == pytest.approx(found + values)
 
 
-def test_nothing_comes_after_an_end_but_a_cut_off_has_a_future() -> None:
+def test_a_terminal_step_has_no_future_reward_but_a_cut_off_one_has() -> None:
     one = np.array([0.0])
     over, _ = advantages(one, one, 10.0, terminal=True, gamma=1.0, lam=1.0)
     cut, _ = advantages(one, one, 10.0, terminal=False, gamma=1.0, lam=1.0)
@@ -75,7 +74,7 @@ def test_the_gradient_of_the_mean_is_finite_wherever_the_target_is() -> None:
     assert trajectory.grad is not None and bool(torch.isfinite(trajectory.grad).all())
 
 
-def test_a_plan_beyond_the_limit_of_speed_can_be_taught_to_go_slower() -> None:
+def test_a_plan_beyond_the_speed_limit_can_learn_to_go_slower() -> None:
     trajectory = torch.zeros(1, 30, 3)
     trajectory[0, 9, 0] = 2.0
     trajectory.requires_grad_()
@@ -156,7 +155,7 @@ def test_ppo_is_the_same_twice() -> None:
     assert torch.equal(first.mean, second.mean) and torch.equal(first.worth, second.worth)
 
 
-def test_the_warm_up_teaches_the_value_alone() -> None:
+def test_the_warm_up_trains_the_value_alone() -> None:
     learner, generator = _one_number(), torch.Generator().manual_seed(0)
     learner.actions = torch.randn(128, 2, generator=generator)
     optimiser = PpoOptimiser(learner, PpoConfig(value_lr=0.05))

@@ -1,4 +1,4 @@
-"""The stage of reinforcement learning around made-up rollouts: what it logs, keeps, takes back and resumes."""
+"""The stage of reinforcement learning with made-up rollouts: logging, evaluation, reset and resume."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from tests.tools.train.rl.test_rl_tail import LIMITS, tiny_config, tiny_episode,
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import PpoConfig, RlConfig
 from tools.train.rl import rollout
-from tools.train.rl.learners import TailLearner
-from tools.train.rl.rl import STAGE, RlError, improve, run
-from tools.train.rl.state import Score, State
+from tools.train.rl.ppo import TailLearner
+from tools.train.rl.rl import STAGE, RlError, Score, State, improve, run
 from tools.train.rl.worker import RolloutOrder
 from tools.train.run.job import StageJob, StopFlag
 from tools.train.run.network_file import finish_network
@@ -92,8 +91,8 @@ def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
     driver = _driver(tiny_network(), lambda k: k == 2 or (last and k == 4))
 
-    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
-        driven = driver(order, **told)
+    def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
+        driven = driver(order, **options)
         if order.explore:
             return driven
         return replace(driven, ends=[replace(driven.ends[0], id=f"t1-site-{n}-0-go2") for n in range(4)])
@@ -103,8 +102,8 @@ def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
     assert (found["episodes"], found["layouts"], found["success"]) == (4, 1, gained)
     low, high = found["success_ci95"]
     assert low <= gained <= high and (low < gained or high > gained)
-    told = json.loads((tmp_path / "rl" / "rollouts" / "evaluation-00004.json").read_text())
-    assert [end["success"] for end in told] == [last] * 4
+    ends = json.loads((tmp_path / "rl" / "rollouts" / "evaluation-00004.json").read_text())
+    assert [end["success"] for end in ends] == [last] * 4
 
 
 @pytest.mark.slow
@@ -131,7 +130,7 @@ def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
     assert last["fell_back"] == 1.0
 
 
-def test_what_fell_back_goes_on_with_new_moments(tmp_path: Path) -> None:
+def test_a_reset_policy_has_a_new_optimiser(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig(ppo=PPO))
     state = State(job, TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), RlConfig(ppo=PPO, fall_back=0.1))
     state.best = Score(0.8, 0.1, 0.5)
@@ -141,7 +140,7 @@ def test_what_fell_back_goes_on_with_new_moments(tmp_path: Path) -> None:
     assert state.judge(Score(0.6, 0.1, 0.5)) and state.optimiser is not before
 
 
-def test_more_success_by_less_than_the_margin_is_luck(tmp_path: Path) -> None:
+def test_a_gain_below_the_margin_is_ignored(tmp_path: Path) -> None:
     config = RlConfig(ppo=PPO, keep_margin=0.06)
     state = State(_job(tmp_path, config), TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), config)
     state.best = Score(0.5, 0.2, 0.4)
@@ -172,21 +171,21 @@ def test_the_best_is_kept_only_if_it_is_ahead_on_fresh_scenarios(
     assert set(result["final"]) == {"start", "best"}
 
 
-def test_what_chooses_and_what_decides_are_other_scenarios_and_spread_over_layouts(tmp_path: Path) -> None:
+def test_evaluation_and_final_scenarios_differ_and_spread_over_layouts(tmp_path: Path) -> None:
     orders: list[RolloutOrder] = []
     driver = _driver(tiny_network(), lambda k: k == 2)
 
-    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
+    def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
         orders.append(order)
-        return driver(order, **told)
+        return driver(order, **options)
 
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, final_episodes=5)
     _improved(tmp_path, config, drive)
     explored = {order.scenario_seed for order in orders if order.explore}
-    looked = [order for order in orders if not order.explore]
-    by_seed = {order.scenario_seed: len(order.numbers) for order in looked}
+    evaluated = [order for order in orders if not order.explore]
+    by_seed = {order.scenario_seed: len(order.numbers) for order in evaluated}
     assert len(by_seed) == 2 and set(by_seed.values()) == {24, 5} and not explored & set(by_seed)
-    assert {order.tasks_per_scene for order in looked} == {2}
+    assert {order.tasks_per_scene for order in evaluated} == {2}
 
 
 def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> None:
@@ -208,32 +207,32 @@ def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Pat
     profile = LatencyProfile("orin", "measured there", (2.0, 3.0), (0.5, 0.7))
     (tmp_path / "orin.json").write_text(json.dumps(profile.as_json()))
     config = RlConfig(iterations=1, warmup_iterations=0, ppo=PPO, delay_profile=str(tmp_path / "orin.json"))
-    heard: list[LatencyProfile] = []
+    received: list[LatencyProfile] = []
     driver = _driver(tiny_network(), lambda _: True)
 
-    def drive(order: RolloutOrder, **told: Any) -> rollout.Rollout:
-        heard.append(RolloutOrder.of_json(json.loads(json.dumps(order.to_json()))).delays)
-        return driver(order, **told)
+    def drive(order: RolloutOrder, **options: Any) -> rollout.Rollout:
+        received.append(RolloutOrder.of_json(json.loads(json.dumps(order.to_json()))).delays)
+        return driver(order, **options)
 
     _improved(tmp_path / "run", config, drive)
-    assert heard and set(heard) == {profile}
+    assert received and set(received) == {profile}
 
 
-def test_every_episode_is_told_as_it_ends(tmp_path: Path) -> None:
+def test_progress_is_shown_after_every_episode(tmp_path: Path) -> None:
     config = RlConfig(iterations=1, episodes=4, evaluate_episodes=2, warmup_iterations=0, ppo=PPO)
     driver = _driver(tiny_network(), lambda _: True)
     progress = Mock()
 
-    def drive(order: RolloutOrder, *, told: Callable[[bool], None], **others: Any) -> rollout.Rollout:
+    def drive(order: RolloutOrder, *, finished: Callable[[bool], None], **others: Any) -> rollout.Rollout:
         for _ in order.numbers:
-            told(True)
+            finished(True)
         return driver(order, **others)
 
     job = replace(_job(tmp_path, config), progress=progress)
     learner = TailLearner(tiny_network(), LIMITS, config.log_std)
     improve(job, learner, _imitated(job), tmp_path / "artifacts", drive)
-    said = [call.args for call in progress.update.call_args_list]
-    assert [(done, of) for done, of in said if of == 4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    updates = [call.args for call in progress.update.call_args_list]
+    assert [(done, of) for done, of in updates if of == 4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
@@ -241,17 +240,17 @@ def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
         run(_job(tmp_path, RlConfig()))
 
 
-def test_an_action_expert_that_has_imitated_nobody_is_not_improved(tmp_path: Path) -> None:
+def test_an_untrained_action_expert_is_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
     finish_network(job, "sft", tiny_network())
-    with pytest.raises(RlError, match=r"sft/model.safetensors: its action expert has learned nothing yet"):
+    with pytest.raises(RlError, match=r"sft/model.safetensors: the action expert is untrained"):
         run(job)
 
 
-def test_weights_with_an_action_expert_of_chance_are_not_improved(tmp_path: Path) -> None:
+def test_start_weights_with_an_untrained_action_expert_are_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
     save_weights(tiny_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
-    with pytest.raises(RlError, match="has learned nothing yet"):
+    with pytest.raises(RlError, match="is untrained"):
         run(job)
 
 

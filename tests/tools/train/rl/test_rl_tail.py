@@ -27,8 +27,7 @@ from tools.train.rl.action_tail import (
     tail_parameters,
 )
 from tools.train.rl.command_policy import CommandLimits, command_mean
-from tools.train.rl.learners import TailLearner
-from tools.train.rl.ppo import PpoOptimiser
+from tools.train.rl.ppo import PpoOptimiser, TailLearner
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps
 
 LIMITS = CommandLimits(1.0, 1.0)
@@ -153,7 +152,7 @@ def test_a_rollout_is_read_as_it_was_driven(tmp_path: Path) -> None:
 def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
     path = tmp_path / "0.safetensors"
     path.write_bytes(b"half")
-    with pytest.raises(rollout.RolloutError, match="not whole"):
+    with pytest.raises(rollout.RolloutError, match="not readable"):
         rollout.read([path])
 
 

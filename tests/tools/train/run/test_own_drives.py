@@ -48,13 +48,13 @@ def test_a_second_call_changes_nothing(run_dir: RunDir, theirs: Dataset) -> None
 
 def test_a_run_that_has_collected_takes_no_others(run_dir: RunDir, theirs: Dataset) -> None:
     (run_dir.stage("collect") / "index.jsonl").write_text("")
-    with pytest.raises(RunDirError, match="has drives that are others"):
+    with pytest.raises(RunDirError, match="has other drives"):
         take_drives(run_dir, theirs.folder)
 
 
 def test_a_run_takes_one_data_set_only(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
     take_drives(run_dir, theirs.folder)
-    with pytest.raises(RunDirError, match="has drives that are others"):
+    with pytest.raises(RunDirError, match="has other drives"):
         take_drives(run_dir, dataset(tmp_path / "more", drive("c")).folder)
 
 
@@ -85,7 +85,7 @@ def test_links_among_their_files_are_followed(run_dir: RunDir, theirs: Dataset) 
 
 def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
     theirs.path("b").write_bytes(b"half")
-    with pytest.raises(DriveError, match="not the file that the index lists"):
+    with pytest.raises(DriveError, match="differs from the indexed file"):
         take_drives(run_dir, theirs.folder)
     assert not run_dir.begun("collect")
 
@@ -117,8 +117,8 @@ def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("sft", "--from", "b"), "both say where drives come from"),
-        (("all", "--checkpoint", "w", "--after", "imitate"), "goes on without drives"),
+        (("sft", "--from", "b"), "both name the drives"),
+        (("all", "--checkpoint", "w", "--after", "imitate"), "continues without earlier drives"),
         (("card",), "belongs to stages"),
         (("sft",), "not the index of a data set"),
     ],

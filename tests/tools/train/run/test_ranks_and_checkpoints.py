@@ -62,7 +62,7 @@ def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> Non
     later = load_recipe("tiny", ["sft.epochs=9"])
     assert load_recipe(str(RunDir.open(made.out, later).recipe_path)) == later
     (made.stage("sft") / "state").touch()
-    with pytest.raises(RunDirError, match=r"sft.epochs: 9 there, 8 asked for"):
+    with pytest.raises(RunDirError, match=r"sft.epochs: found 9, recipe 8"):
         RunDir.open(made.out, load_recipe("tiny", ["sft.epochs=8"]))
 
 
@@ -71,7 +71,7 @@ def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tm
     made = run_dir(tmp_path)
     RunDir.open(made.out, load_recipe("tiny", [setting]))
     (made.stage("collect") / "drive").touch()
-    with pytest.raises(RunDirError, match="was begun with other numbers"):
+    with pytest.raises(RunDirError, match="was started with another recipe"):
         RunDir.open(made.out, load_recipe("tiny"))
 
 
@@ -159,8 +159,8 @@ def learn(steps: int, path: Path | None = None, stop_at: int | None = None) -> t
         tensors, meta = checkpoint.load(path)
         model.load_state_dict(checkpoint.under("model", tensors))
         optimiser.restore(checkpoint.under("optimiser", tensors))
-        checkpoint.restore_generator(generator, tensors["generator"])
-        checkpoint.restore_rng(rng, meta["rng"])
+        generator.set_state(tensors["generator"])
+        rng.bit_generator.state = meta["rng"]
     losses = []
     while optimiser.step_count < (steps if stop_at is None else stop_at):
         x = torch.randn(8, 6, generator=generator) * float(rng.uniform(0.5, 1.5))
@@ -172,9 +172,9 @@ def learn(steps: int, path: Path | None = None, stop_at: int | None = None) -> t
         tensors = {
             **checkpoint.with_prefix("model", model.state_dict()),
             **checkpoint.with_prefix("optimiser", optimiser.tensors()),
-            "generator": checkpoint.generator_tensor(generator),
+            "generator": generator.get_state(),
         }
-        checkpoint.save(path, tensors, {"rng": checkpoint.rng_meta(rng)})
+        checkpoint.save(path, tensors, {"rng": dict(rng.bit_generator.state)})
     return model.weight.detach().clone(), losses
 
 
@@ -207,7 +207,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Pat
 def test_a_damaged_checkpoint_is_one_clear_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "c"
     path.write_bytes(content)
-    with pytest.raises(checkpoint.CheckpointFileError, match="delete it to begin anew") as caught:
+    with pytest.raises(checkpoint.CheckpointFileError, match="delete it to start again") as caught:
         checkpoint.load(path)
     assert "\n" not in str(caught.value)
 
@@ -354,7 +354,7 @@ def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tm
     if failing == "set-up":
         other = RunDir.open(tmp_path / "run", load_recipe("tiny", ["seed=5"]))
         (other.stage("collect") / "begun").touch()
-        line = "begun with other numbers (seed: 5 there, 1 asked for)"
+        line = "started with another recipe (seed: found 5, recipe 1)"
     (code, said), (others, heard) = two_ranks("tests.support.train.train_chain_rank", str(tmp_path), failing)
     assert (code, others) == (EXIT_BAD_INPUT, EXIT_BAD_INPUT)
     assert line in said and "edge-train: the first process has ended early" in heard

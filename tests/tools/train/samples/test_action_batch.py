@@ -14,7 +14,7 @@ from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.support.train.train_drives import tiny_model
 from tools.train.config.imitate import LossConfig
-from tools.train.imitate.trainable_policies import ExpertPupil
+from tools.train.imitate.trainable_policies import ActionExpertPolicy
 from tools.train.samples.action_batch import Group, collate, plan, smooth_l1, trunk
 
 CPU = torch.device("cpu")
@@ -161,7 +161,7 @@ def test_what_every_head_makes_small_is_about_its_own_frame(head: str) -> None:
 
     def value(given: Group) -> torch.Tensor:
         generator = torch.Generator().manual_seed(5)
-        return ExpertPupil(action, LossConfig()).errors(collate([given], CPU), generator)
+        return ActionExpertPolicy(action, LossConfig()).errors(collate([given], CPU), generator)
 
     first, second = value(one), value(other)
     assert first.shape == (3,) and torch.isfinite(first).all()

@@ -231,7 +231,7 @@ def test_draws_follow_from_the_seed(anchors: dict[int, Anchor]) -> None:
 def test_an_answer_that_does_not_fit_the_context_is_refused(anchors: dict[int, Anchor]) -> None:
     language = dataclasses.replace(NANO.language, max_context=120)
     narrow = Prompts(tokenizer(), dataclasses.replace(NANO, language=language))
-    with pytest.raises(ValueError, match="the model reads 120"):
+    with pytest.raises(ValueError, match="exceed the model's context of 120"):
         narrow.of(anchors[90], Drawn(WORDINGS[0], None))
 
 

@@ -57,7 +57,7 @@ def test_jpeg_comes_back_as_the_picture_in_the_same_colours() -> None:
 
 
 def test_what_is_no_jpeg_is_refused() -> None:
-    with pytest.raises(ValueError, match="no JPEG"):
+    with pytest.raises(ValueError, match="expected a JPEG"):
         decoded(np.zeros(10, np.uint8))
 
 

@@ -18,7 +18,7 @@ from tests.support.train.train_drives import MadeUpTokens, tiny_model, write_dat
 from tests.support.train.train_imitate_rank import FRAMES, SideStates, side_dataset, side_drive
 from tools.train.config.imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
 from tools.train.drives.drive import NOISE, Dataset, Drive
-from tools.train.imitate.data import Chosen, NoStates, SampleError, Samples, States
+from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Samples, States
 from tools.train.samples.action_batch import Group
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames, DriveFramesError
@@ -54,7 +54,7 @@ def with_interface(name: str) -> TicVlaConfig:
     return dataclasses.replace(model, action=dataclasses.replace(model.action, semantic_interface=name))
 
 
-def drawn(samples: Samples, count: int, seed: int = 0) -> list[tuple[Chosen, Group]]:
+def drawn(samples: Samples, count: int, seed: int = 0) -> list[tuple[SampleChoice, Group]]:
     found = []
     for number in range(count):
         rng = np.random.default_rng((seed, number))
@@ -139,7 +139,7 @@ def test_nothing_after_the_frame_reaches_the_inputs_of_its_sample(tmp_path: Path
         )
         drives = [DriveFrames.of(drive, 30, config.weights)]
         samples = Samples(drives, tokens, states, TEN_S, config, tiny_model())
-        choices = [Chosen(0, anchor, (k,) * 3, (k - anchor,) * 3) for anchor in (0, 30, 60)]
+        choices = [SampleChoice(0, anchor, (k,) * 3, (k - anchor,) * 3) for anchor in (0, 30, 60)]
         return [samples.take(choice, np.random.default_rng(choice.anchor)) for choice in choices]
 
     drive = side_drive("left-a")
@@ -158,7 +158,7 @@ def test_nothing_after_the_frame_reaches_the_inputs_of_its_sample(tmp_path: Path
 def test_a_spoiled_past_does_reach_them(tmp_path: Path) -> None:
     drive, k = side_drive("left-a"), 64
     dataset = write_dataset(tmp_path, [drive])
-    choice = Chosen(0, 60, (k,), (4,))
+    choice = SampleChoice(0, 60, (k,), (4,))
     taken = []
     for each in (drive, spoiled(drive, k - 1)):
         samples = Samples(
@@ -391,11 +391,11 @@ def test_odometry_noise_grows_with_the_way_and_leaves_the_age(dataset: Dataset) 
 def test_waypoints_that_guide_are_seen_from_each_frame(dataset: Dataset) -> None:
     samples = of(dataset, model=with_interface("waypoints"))
     for chosen, group in drawn(samples, 30):
-        said = samples.said(chosen)
-        assert said is not None and group.guidance.shape == (len(chosen.ks), 3, 2)
+        points = samples.waypoints_of(chosen)
+        assert points is not None and group.guidance.shape == (len(chosen.ks), 3, 2)
         for k, guidance in zip(chosen.ks, group.guidance, strict=True):
             offset = samples.drives[chosen.drive].offset(chosen.anchor, k)
-            np.testing.assert_allclose(guidance, waypoints_now(said, offset)[0], atol=1e-6)
+            np.testing.assert_allclose(guidance, waypoints_now(points, offset)[0], atol=1e-6)
 
 
 def test_states_without_waypoints_cannot_guide_by_them(dataset: Dataset) -> None:

@@ -20,15 +20,15 @@ from sim_hil.benchmark.language.tasks import Task, begins_ahead, make_task
 from tests.support.train.train_drives import made_up_drive, write_dataset
 from tests.support.train.training_scenarios import SPEED_MPS, drive_along, scenarios
 from tools.train.collect.record import off_way_m
-from tools.train.config.sft import RetellConfig
+from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import Drive
 from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import anchors_of
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario
-from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, RetellError, retell, told_along
+from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, RelabelError, relabel, relabel_along
 
-CONFIG = RetellConfig(ways=2, tries=24)
+CONFIG = RelabelConfig(ways=2, tries=24)
 CROWDED = "person ahead 2 m coming, person left 3 m standing"
 
 
@@ -36,7 +36,7 @@ CROWDED = "person ahead 2 m coming, person left 3 m standing"
 def _told(kind: str, number: int = 0) -> tuple[Scenario, Drive, tuple[InstructionRelabel, ...]]:
     scenario = scenarios(kind)[number]
     drive = drive_along(scenario)
-    return scenario, drive, tuple(retell(drive, scenario.site, CONFIG, 1, SPEED_MPS))
+    return scenario, drive, tuple(relabel(drive, scenario.site, CONFIG, 1, SPEED_MPS))
 
 
 @cache
@@ -58,7 +58,7 @@ KINDS = ("corridor", "office", "sidewalk")
 @pytest.mark.parametrize("kind", KINDS)
 def test_told_of_its_own_way_a_drive_is_what_it_was(kind: str) -> None:
     scenario, drive, _ = _told(kind)
-    own = told_along(drive, scenario, SPEED_MPS)
+    own = relabel_along(drive, scenario, SPEED_MPS)
     assert own is not None and own.wordings == drive.wordings and own.told == drive.about.told
     assert len(own.traces) > 4 and list(own.traces) == list(drive.traces[: len(own.traces)])
     # It ends where it arrives.
@@ -88,7 +88,7 @@ def test_no_wording_is_untrue_or_the_benchmarks(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_retelling_has_the_drives_frames_up_to_where_it_is_far_from_the_other_way(kind: str) -> None:
+def test_a_relabel_has_the_drives_frames_up_to_where_it_is_far_from_the_other_way(kind: str) -> None:
     scenario, drive, found = _told(kind)
     for each in found:
         other = each.of(drive)
@@ -138,10 +138,10 @@ def test_only_where_nobody_is_near_is_anything_learned(tmp_path: Path) -> None:
     scenario, drive, _ = _told("corridor")
     crowded = drive_along(scenario, "b", motion=CROWDED)
     dataset = write_dataset(tmp_path, [drive, crowded])
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    retellings.build(dataset.ids)
-    assert retellings.anchors(drive) and retell(crowded, scenario.site, CONFIG, 1, SPEED_MPS)
-    assert retellings.anchors(crowded) == []
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    relabels.build(dataset.ids)
+    assert relabels.anchors(drive) and relabel(crowded, scenario.site, CONFIG, 1, SPEED_MPS)
+    assert relabels.anchors(crowded) == []
 
 
 def test_anchors_are_asked_in_the_other_words_about_the_same_frames() -> None:
@@ -157,9 +157,9 @@ def test_anchors_are_asked_in_the_other_words_about_the_same_frames() -> None:
 @pytest.mark.slow
 def test_the_same_numbers_tell_the_same_and_another_seed_other_ways() -> None:
     scenario, drive, found = _told("office")
-    again = retell(drive, scenario.site, CONFIG, 1, SPEED_MPS)
+    again = relabel(drive, scenario.site, CONFIG, 1, SPEED_MPS)
     assert [each.as_json() for each in again] == [each.as_json() for each in found]
-    goals = [{each.goal_xy for each in retell(drive, scenario.site, CONFIG, seed, SPEED_MPS)} for seed in range(1, 5)]
+    goals = [{each.goal_xy for each in relabel(drive, scenario.site, CONFIG, seed, SPEED_MPS)} for seed in range(1, 5)]
     assert any(goal != goals[0] for goal in goals)
 
 
@@ -171,12 +171,12 @@ def test_a_drive_without_traces_or_from_elsewhere_is_left_alone(tmp_path: Path) 
         elsewhere,
         replace(drive, pose=drive.pose + np.array((0.0, 40.0, 0.0))),
     ):
-        assert retell(other, scenario.site, CONFIG, 1, SPEED_MPS) == []
+        assert relabel(other, scenario.site, CONFIG, 1, SPEED_MPS) == []
     foreign = [made_up_drive("real", kind="recorded"), made_up_drive("reserved", layout_seed=1)]
     dataset = write_dataset(tmp_path, foreign)
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    retellings.build(dataset.ids)
-    assert [retellings.anchors(each) for each in foreign] == [[], []]
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    relabels.build(dataset.ids)
+    assert [relabels.anchors(each) for each in foreign] == [[], []]
 
 
 # On disk
@@ -186,42 +186,42 @@ def test_a_drive_without_traces_or_from_elsewhere_is_left_alone(tmp_path: Path) 
 def test_what_is_written_is_read_and_made_only_once(tmp_path: Path) -> None:
     _, drive, found = _told("corridor")
     dataset = write_dataset(tmp_path, [drive])
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    with pytest.raises(RetellError, match=r"a\.json.*build"):
-        retellings.anchors(drive)
-    retellings.build(dataset.ids)
-    read = retellings.anchors(drive)
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    with pytest.raises(RelabelError, match=r"a\.json.*build"):
+        relabels.anchors(drive)
+    relabels.build(dataset.ids)
+    read = relabels.anchors(drive)
     assert [format_text(anchor.reasoning) for anchor in read] == [
         format_text(anchor.reasoning) for each in found for anchor in anchors_of(each.of(drive))
     ]
-    path = retellings.folder / "a.json"
+    path = relabels.folder / "a.json"
     made = path.stat().st_mtime_ns
-    retellings.build(dataset.ids)
+    relabels.build(dataset.ids)
     assert path.stat().st_mtime_ns == made
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"drive_sha256": "0", "ways": []}', '{"ways": [{}]}', "[]"])
 def test_what_cannot_be_read_or_is_of_another_drive_is_made_again(tmp_path: Path, content: str) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive("a", kind="recorded")])
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    retellings.build(dataset.ids)
-    whole = (retellings.folder / "a.json").read_text()
-    (retellings.folder / "a.json").write_text(content)
-    retellings.build(dataset.ids)
-    assert (retellings.folder / "a.json").read_text() == whole
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    relabels.build(dataset.ids)
+    whole = (relabels.folder / "a.json").read_text()
+    (relabels.folder / "a.json").write_text(content)
+    relabels.build(dataset.ids)
+    assert (relabels.folder / "a.json").read_text() == whole
 
 
 def test_asked_to_stop_it_ends_after_the_drive_and_keeps_what_is_made(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive(name, kind="recorded") for name in "abc"])
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
     with pytest.raises(KeyboardInterrupt):
-        retellings.build(dataset.ids, stopped=lambda: (retellings.folder / "a.json").exists())
-    assert [path.name for path in retellings.folder.iterdir()] == ["a.json"]
+        relabels.build(dataset.ids, stopped=lambda: (relabels.folder / "a.json").exists())
+    assert [path.name for path in relabels.folder.iterdir()] == ["a.json"]
 
 
 def test_other_numbers_have_a_folder_of_their_own(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive("a")])
-    several = [(config, seed) for config in (CONFIG, RetellConfig(ways=1)) for seed in (1, 2)]
+    several = [(config, seed) for config in (CONFIG, RelabelConfig(ways=1)) for seed in (1, 2)]
     assert len({InstructionRelabels(dataset, *each, SPEED_MPS).folder for each in several}) == 4
 
 
@@ -238,13 +238,13 @@ def test_ranks_share_the_layouts(tmp_path: Path) -> None:
 
     drives = [made_up_drive(name, kind="recorded", layout_seed=seed) for name, seed in (("a", 1), ("b", 2), ("c", 1))]
     dataset = write_dataset(tmp_path, drives)
-    retellings = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    retellings.build(dataset.ids, ranks=Waiting(0, 2))
-    assert sorted(path.stem for path in retellings.folder.iterdir()) == ["a", "c"]
-    retellings.build(dataset.ids, ranks=Waiting(0, 1))
-    assert sorted(path.stem for path in retellings.folder.iterdir()) == ["a", "b", "c"]
+    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
+    relabels.build(dataset.ids, ranks=Waiting(0, 2))
+    assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "c"]
+    relabels.build(dataset.ids, ranks=Waiting(0, 1))
+    assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "b", "c"]
 
 
 def test_the_numbers_are_checked() -> None:
     with pytest.raises(ValueError, match="0 to 64 ways"):
-        RetellConfig(ways=65)
+        RelabelConfig(ways=65)

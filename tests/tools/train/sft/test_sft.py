@@ -24,7 +24,7 @@ from tests.support.train.training_scenarios import drive_along, scenarios
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
-from tools.train.config.sft import RetellConfig, SftConfig
+from tools.train.config.sft import RelabelConfig, SftConfig
 from tools.train.drives.drive import Dataset
 from tools.train.pipeline.budget import budget_of
 from tools.train.pipeline.chain import Step, run_step
@@ -149,7 +149,7 @@ def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, epochs=1, evaluate=silent)
     plain = run(sft_job(tmp_path, config))
     shutil.rmtree(tmp_path / "sft")
-    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RetellConfig(ways=2, tries=24))))
+    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RelabelConfig(ways=2, tries=24))))
     assert plain["more_anchors"] == 0 < more["more_anchors"] == more["anchors"] - plain["anchors"]
 
 
@@ -173,7 +173,7 @@ def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
         return sum(count for _, count, key in lines(**changed) if key == "sft")
 
     assert anchors() == 10 * 30 * 2
-    assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RetellConfig(ways=2))
+    assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RelabelConfig(ways=2))
     assert anchors(tours=TourConfig(count=4)) == anchors() + 4 * 45 * 2
     assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
 
