@@ -28,7 +28,7 @@ import tools.train.cli
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
 from firmware_bridge import output_file
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 ROBOT = ROOT / "firmware_bridge" / "robots" / "go2.toml"
 AS_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root may make device nodes (CAP_MKNOD)")
 
