@@ -109,7 +109,7 @@ def test_a_detour_round_a_wall_is_progress_though_the_goal_grows_no_nearer() -> 
 def test_an_episode_without_a_way_is_refused_at_its_reset() -> None:
     walled = hall(block(0.0, 0.0, 0.5, 10.0))
     env = DynaNavEnv([corridor_episode(id="walled", start=(-2.0, 0.0, 0.0))], camera=None, scenes={"corridor": walled})
-    with pytest.raises(ValueError, match="expected a way"):
+    with pytest.raises(ValueError, match="expected a path"):
         env.reset()
     env.close()
 

@@ -18,7 +18,7 @@ from sim_hil.benchmark.policies.select import robot_config
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tests.support.train.train_drives import tiny_model
 from tools.train.imitate.point_goal_net import build_point_goal
-from tools.train.point_goal_export import Whole, export
+from tools.train.point_goal_export import PointGoalModel, export
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_the_graph_is_the_network(file: Path) -> None:
     policy = PointGoalNetPolicy(file, robot_config())
     seen = _seen()
     with torch.no_grad():
-        whole = Whole(build(config, 0).vision.eval(), net)
+        whole = PointGoalModel(build(config, 0).vision.eval(), net)
         wanted = whole(torch.from_numpy(seen.image)[None], torch.tensor([seen.state]), torch.tensor([[3.0, 1.0]]))
     feeds = {
         "frame": seen.image[None],
