@@ -150,11 +150,13 @@ def test_it_ends_by_itself_and_leaves_no_process(soaked: Soaked) -> None:
     assert not [line for line in lines if str(soaked.folder) in line]
 
 
+@pytest.mark.slow
 def test_tasks_follow_each_other_without_a_new_runner(soaked: Soaked) -> None:
     pairs = followed(list(read_lines(soaked.leg / EVENTS)))
     assert pairs and all(a["task"]["instruction"] != b["task"]["instruction"] for a, b in pairs)
 
 
+@pytest.mark.slow
 def test_the_runner_has_taken_every_instruction(soaked: Soaked) -> None:
     events = list(read_lines(soaked.leg / EVENTS))
     for _, event in followed(events):
@@ -165,6 +167,7 @@ def test_the_runner_has_taken_every_instruction(soaked: Soaked) -> None:
     assert all(after != "task_begin" for kind, after in itertools.pairwise(kinds) if kind == "not_told")
 
 
+@pytest.mark.slow
 def test_a_fault_takes_effect_and_the_runner_answers_it(soaked: Soaked) -> None:
     assert soaked.events("fault_effect")
     leg = json.loads((soaked.leg / ANALYSIS).read_text(encoding="utf-8"))
@@ -172,6 +175,7 @@ def test_a_fault_takes_effect_and_the_runner_answers_it(soaked: Soaked) -> None:
     assert any(fault["raised_ns"] is not None for fault in leg["faults"])
 
 
+@pytest.mark.slow
 def test_every_second_has_its_sample(soaked: Soaked) -> None:
     samples = list(read_lines(soaked.leg / SAMPLES))
     assert len(samples) >= 0.5 * DURATION_S  # a busy machine may skip some
@@ -180,6 +184,7 @@ def test_every_second_has_its_sample(soaked: Soaked) -> None:
     assert last["processes"]["edge-run"]["rss_bytes"] > 50e6 and last["pose"] is not None
 
 
+@pytest.mark.slow
 def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
     found = soaked.result["measures"]
     assert found["tick_ms.p999"]["count"] > 50 and found["delay_s.p50"]["value"] > 0
@@ -190,48 +195,57 @@ def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
     assert found["bridge_jitter_ms.p50"]["value"] == pytest.approx(statistics.median(off_ms), abs=0.01)
 
 
+@pytest.mark.slow
 def test_slopes_of_so_short_a_life_are_undecided(soaked: Soaked) -> None:
     lines = {line["measure"]: line for line in soaked.result["budget"]}
     assert lines["memory_slope_mib_per_h.edge-run"]["verdict"] == "UNDECIDED"
 
 
+@pytest.mark.slow
 def test_the_result_has_the_keys_of_edge_run(soaked: Soaked) -> None:
     result = soaked.result
     assert {"ticks", "missed", "tick_ms"} <= set(result["control"])
     assert set(result["delay_s"]) == {"p50", "p99", "max"} and set(result["power_w"]) == {"mean", "p99", "source"}
 
 
+@pytest.mark.slow
 def test_the_report_is_one_page_without_loads(soaked: Soaked) -> None:
     text = (soaked.folder / "report.html").read_text(encoding="utf-8")
     assert "untrained" in text and "camera stops" in text and "data:image/gif" in text
     assert "<script" not in text and 'src="http' not in text
 
 
+@pytest.mark.slow
 def test_flight_logs_are_deleted_once_they_are_read(soaked: Soaked) -> None:
     assert list(soaked.leg.glob("*.mcap")) == []
 
 
+@pytest.mark.slow
 def test_a_second_soak_does_not_overwrite_the_first(soaked: Soaked, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(soaked.arguments) == 2
     assert "--resume" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_resumed_when_it_is_over_there_is_nothing_left_to_do(soaked: Soaked) -> None:
     before = soaked.result["measures"]
     assert cli.main([*soaked.arguments, "--resume"]) == soaked.code
     assert soaked.result["measures"] == before
 
 
+@pytest.mark.slow
 def test_resumed_with_other_options_is_refused(soaked: Soaked, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*soaked.arguments, "--resume", "--people", "3"]) == 2
     assert "people" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_soak_that_is_over_needs_no_room_to_record(soaked: Soaked, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge.flightlog.recorder._free", lambda _: (60 << 30, 1000 << 30))
     assert cli.main([*soaked.arguments, "--resume"]) == soaked.code
 
 
+@pytest.mark.slow
 def test_what_a_killed_soak_had_written_is_counted(soaked: Soaked, tmp_path: Path) -> None:
     copy = tmp_path / "out"
     shutil.copytree(soaked.folder, copy)
