@@ -162,7 +162,7 @@ class ClientLink:
                     messages.append(decode(data))
                 except LinkError:
                     self.malformed += 1
-        if self._clients == present:  # whoever looks at `connected` sees a client go before the next one is there
+        if self._clients == present:  # a reader of `connected` sees a client go before the next connects
             self._accept()
         return messages
 

@@ -148,7 +148,7 @@ def hash_file(directory: Path, name: str, entry: Any) -> FileIdentity:
     with _open_listed(path, entry) as file:
         found = os.fstat(file.fileno())
         if found.st_nlink > 1:
-            # It is mapped while the robot drives: whoever has the other name could change it under the policy.
+            # It is mapped while the robot drives: another name of the file could change it under the policy.
             raise ArtifactError(f"{path}: has {found.st_nlink} names (hard links); copy the directory instead")
         while block := file.read(HASH_BLOCK_BYTES):
             digest.update(block)

@@ -84,7 +84,7 @@ class Recorder:
         self._picture_bytes_in = 0  # by `put`
         self._picture_bytes_out = 0
         self._ended = False
-        # Between the writer and whoever asks how it goes; `put` never takes it.
+        # Between the writer and readers of its counts; `put` never takes it.
         self._lock = threading.Lock()
         self._lost: Counter[str] = Counter()
         self._unsaved: Counter[str] = Counter()  # taken from the queue since the last flush
@@ -197,7 +197,7 @@ class Recorder:
 
     def _run(self, file: PartFile) -> None:
         with contextlib.suppress(OSError):
-            # Linux niceness is per thread: whoever drives the robot gets the core first.
+            # Linux niceness is per thread: the control thread gets the core first.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
             self._write_all(self._begin(file))

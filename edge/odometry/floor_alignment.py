@@ -178,7 +178,7 @@ def align_pictures(
     if inverse is None:
         return None
     covariance = config.correlation * inverse
-    # Take the prior out again: whoever adds up many such answers must not count it many times.
+    # Take the prior out again: a sum of many such answers must not count it many times.
     told = 1.0 - float(covariance[6, 6]) / config.tilt_sigma_rad**2
     tilt_rad, tilt_sigma_rad = 0.0, math.inf
     if told > 0.02:

@@ -1,4 +1,4 @@
-"""Remembers the velocity in force, for those who judge whether the robot does what it is told."""
+"""Keeps the velocity in force, for monitors that compare it with the robot's motion."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ COMPUTING = ("vision_encoder", "language_model.prefill")
 def with_exceptions(chosen: Precision, asked: Precision) -> Precision:
     """What the search chose, and the exceptions that the target asks for where they are more exact than its default.
 
-    Of two for one layer the more exact wins, whoever it comes from.
+    Of two for one layer the more exact wins, whatever its source.
     """
     order = PRECISIONS.index
     exact = [(layer, kind) for layer, kind in asked.overrides if order(kind) < order(chosen.default)]

@@ -1,4 +1,4 @@
-"""Perception of the robot: who sees it, for how long, and who has lost sight of it."""
+"""Perception of the robot: which people see it, for how long, and which have lost sight of it."""
 
 from __future__ import annotations
 

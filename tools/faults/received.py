@@ -73,7 +73,7 @@ class Hearing:
         return [heard for heard in self._heard if heard.t_ns >= t_ns and heard.source not in but]
 
     def sources(self) -> frozenset[int]:
-        """Who has ever been heard in the last two minutes."""
+        """Return the sources of the requests of the last two minutes."""
         self.update()
         return frozenset(heard.source for heard in self._heard)
 

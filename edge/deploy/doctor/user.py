@@ -46,7 +46,7 @@ class Whom:
 
 
 def current_user(euid: Callable[[], int] = os.geteuid) -> Whom:
-    """Whoever runs this."""
+    """The user that runs this process."""
     uid = euid()
     try:
         name = pwd.getpwuid(uid).pw_name
@@ -56,7 +56,7 @@ def current_user(euid: Callable[[], int] = os.geteuid) -> Whom:
 
 
 def user_named(name: str | None) -> Whom:
-    """That user, by default whoever runs this; raises ConfigError for one that this machine does not know."""
+    """Return that user, by default the one of this process. Raises ConfigError for an unknown user."""
     if name is None:
         return current_user()
     try:

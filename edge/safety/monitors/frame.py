@@ -122,7 +122,7 @@ class FrameMonitor:
         return FrameOutputs(self._usable, self._content, tuple(findings))
 
     def age(self, driven_ns: int | None, now_ns: int) -> tuple[Finding, ...]:
-        """Judge the age of the picture that is driven by (its capture), whoever is to blame: camera or encoder."""
+        """Judge the age of the picture that is driven by (its capture), whether camera or encoder delayed it."""
         age_ms = None if driven_ns is None else (now_ns - driven_ns) / 1e6
         if age_ms is not None and age_ms <= self._config.stopped_ms:
             return ()

@@ -1,6 +1,6 @@
 """What a Go2 reports, checked field by field: the robot is an untrusted peer (faults table, "Unitree, known hazards").
 
-A report with one impossible number is dropped whole; whoever reads counts it and, without better ones, sees silence.
+A report with one impossible number is dropped whole; the reader counts it and, without better ones, reports silence.
 """
 
 from __future__ import annotations
