@@ -16,7 +16,7 @@ PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demos nano faults test test-slow test-random test-all lint clean
+.PHONY: help demo demos nano faults test test-slow test-random test-all stops lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
@@ -27,6 +27,7 @@ help:
 	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
+	@echo "make stops  every stop and kill 20 times, with its times and distances (about 10 min)"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
 
@@ -74,13 +75,13 @@ test: lint
 	@echo "== fast tests, $(WORKERS) at a time"
 	$(PARALLEL) -m "not slow and not process"
 	@echo "== fast tests of processes, one at a time"
-	$(PYTEST) -m "process and not slow" $(PROCESS_FILES)
+	$(PYTEST) -m "process and not slow and not repeated" $(PROCESS_FILES)
 
 test-slow: .venv/.test-installed
 	@echo "== slow tests, $(WORKERS) at a time"
 	$(PARALLEL) --durations=15 -m "slow and not process"
 	@echo "== slow tests of processes, one at a time"
-	$(PYTEST) --durations=15 -m "slow and process" $(PROCESS_FILES)
+	$(PYTEST) --durations=15 -m "slow and process and not repeated" $(PROCESS_FILES)
 
 # Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
@@ -92,7 +93,10 @@ test-all: lint
 	@echo "== all tests but those of processes, $(WORKERS) at a time"
 	$(PARALLEL) --durations=15 -m "not process"
 	@echo "== all tests of processes, one at a time"
-	$(PYTEST) --durations=15 -m process $(PROCESS_FILES)
+	$(PYTEST) --durations=15 -m "process and not repeated" $(PROCESS_FILES)
+
+stops: .venv/.test-installed
+	$(PYTEST) -s -m repeated tests/process/bridge
 
 clean:
 	rm -rf out

@@ -550,7 +550,8 @@ def test_the_bridge_process_stays_small_enough_to_be_read_in_an_afternoon() -> N
     code = f"import firmware_bridge.bridge, sys; print(*{ours})"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     sizes = {path.name: lines_of_code(path.read_text()) for path in map(Path, done.stdout.split())}
-    assert sum(lines for name, lines in sizes.items() if name not in WIRE_TABLES | READS_THE_ROBOT_FILE) < MOST_LINES, sizes
+    read_by_people = {name: size for name, size in sizes.items() if name not in WIRE_TABLES | READS_THE_ROBOT_FILE}
+    assert sum(read_by_people.values()) < MOST_LINES, read_by_people
 
 
 def lines_of_code(source: str) -> int:

@@ -56,7 +56,7 @@ def is_not_driven_until_an_operator_arms(rig: Rig, wait_s: float = 0.7) -> None:
         wait_for(lambda: rig.robot.speed_mps > 0.3, 10, "the runner that an operator has armed")
 
 
-@pytest.mark.parametrize("repetitions", [1, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])])
 def test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms(rig: Rig, repetitions: int) -> None:
     with contextlib.ExitStack() as bridges:
         bridge = bridges.enter_context(rig.bridge())

@@ -1,6 +1,6 @@
 """Stops of the real `edge-bridge` process, judged by a robot that obeys, that is leased, or that is not alone.
 
-Each property is one function of one repetition: it runs once in `make test`, and 20 times or more with `-m slow`.
+Each property is one function of one repetition: it runs once in `make test`, and 20 times or more with `make stops`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.support.robot.fake_go2 import FakeGo2, standing
 MANY = 20
 Series = dict[str, list[float]]
 REPETITIONS = pytest.mark.parametrize(
-    "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+    "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
 )
 
 pytestmark = pytest.mark.process
@@ -210,7 +210,9 @@ class TestPermission:
         repeat("permission", repetitions, once)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("repetitions", [1, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+    @pytest.mark.parametrize(
+        "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
+    )
     def test_it_expires_after_ten_seconds(self, rig: Rig, bridge: Running, repetitions: int) -> None:
         rig.reset()
         assert rig.operate("stop")[0] == 0
