@@ -131,7 +131,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
+def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
     """Everything that can be refused without looking at the robot or the artifacts."""
     if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0):
         raise ConfigError(f"--duration {args.duration}: expected a positive number of seconds")
@@ -189,7 +189,7 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
             session.request_stop()
 
     try:
-        robot, options = _read(args)
+        robot, options = read_options(args)
         trust = None if args.trust is None else Trust(args.trust, args.state / "release.json")
         artifacts = load_artifacts(args.artifacts.absolute(), trust)
         # Before anything moves: a provider without its engine would compile for minutes while the robot drives.

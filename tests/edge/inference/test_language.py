@@ -108,14 +108,6 @@ def test_a_generations_keys_and_values_survive_the_next_generation(artifacts: Ar
     np.testing.assert_array_equal(first.last_layer_kv, kept)
 
 
-def test_one_row_of_keys_and_values_for_every_token_fed(artifacts: Artifacts) -> None:
-    language = model(artifacts, 64)
-    segments = language.prompt.build(frames(2, 64, 256), SENTENCE)
-    generation = language.generate(segments, max_new_tokens=5, cancelled=lambda: False)
-    fed = generation.prompt_tokens + generation.new_tokens
-    assert generation.last_layer_kv.shape == (1, fed, artifacts.runtime.kv_dim)
-
-
 def test_a_generation_stops_between_two_chunks(artifacts: Artifacts) -> None:
     language = model(artifacts, 8)
     segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
@@ -187,13 +179,6 @@ def test_what_was_interrupted_leaves_no_trace_in_the_next_generation(artifacts: 
     generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
     np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
     assert generation.token_ids == expected[1]
-
-
-def test_a_prompt_longer_than_the_context_is_refused(artifacts: Artifacts) -> None:
-    language = model(artifacts, 64)
-    segments = language.prompt.build(frames(4, 64, 256), SENTENCE) * 8
-    with pytest.raises(ContextOverflowError):
-        language.generate(segments, max_new_tokens=5, cancelled=lambda: False)
 
 
 @settings(max_examples=10)

@@ -158,11 +158,6 @@ def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts)
     assert schedule_for(artifacts, allowed={0}).shared
 
 
-def test_a_priority_of_zero_is_none(artifacts: Artifacts) -> None:
-    runtime = dataclasses.replace(artifacts.runtime, control_priority=0)
-    assert schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed={0}).control.priority is None
-
-
 def test_the_language_models_workers_are_as_patient_as_reasoning_is(artifacts: Artifacts) -> None:
     """Else they would be as urgent as the control thread, whatever the thread that calls them is."""
     core = min(os.sched_getaffinity(0))

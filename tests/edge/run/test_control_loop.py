@@ -27,15 +27,6 @@ def test_without_a_semantic_state_zero_is_sent_and_the_action_expert_is_not_run(
     assert bench.sink.commands == [(8, 0.0, 0.0)]
 
 
-def test_with_a_semantic_state_the_robot_is_driven(bench: Bench) -> None:
-    for _ in range(3):
-        bench.see()
-        bench.think(0)
-        speed, reason = bench.tick()
-    assert reason == "ok"
-    assert speed == pytest.approx(0.5)
-
-
 def test_the_delay_is_now_minus_the_anchor_and_the_offset_is_the_motion_since(bench: Bench) -> None:
     bench.see(x_m=1.0)
     bench.think(0, x_m=1.0)
@@ -90,13 +81,6 @@ def test_a_broken_action_expert_stops_the_robot_and_not_the_loop(bench: Bench) -
     bench.policy.broken = True
     bench.see()
     assert bench.tick() == (0.0, "output-not-finite")
-
-
-def test_sequence_numbers_continue_from_the_arming(bench: Bench) -> None:
-    for _ in range(3):
-        bench.see()
-        bench.tick()
-    assert [seq for seq, _, _ in bench.sink.commands] == [8, 9, 10]
 
 
 def test_the_loop_ends_when_the_bridge_has_stopped_the_robot(bench: Bench) -> None:

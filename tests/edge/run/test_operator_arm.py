@@ -57,13 +57,6 @@ class TestBridge:
         assert bench.status.blocked_by == "none"
         bench.arm()
 
-    def test_it_is_answered_in_words_after_a_refusal(self) -> None:
-        bench = bench_of().permit()
-        assert (bench.status.cause, bench.status.reason) == (
-            "none",
-            "permitted by an operator, waiting for the runner to arm",
-        )
-
     @pytest.mark.parametrize("end", ["client stops", "client goes", "deadman", "robot falls silent"])
     def test_it_serves_one_arming_whatever_ends_it(self, end: str) -> None:
         bench = permitted().arm()
@@ -207,12 +200,6 @@ class TestRunner:
         assert set(runner.waited) == {WAITING, ARMING}
         assert runner.waited == sorted(runner.waited, key=(WAITING, ARMING).index)
         assert len(runner.waited) >= 0.9 * runner.now_ms / 50
-
-    def test_while_it_waits_it_sends_no_commands(self) -> None:
-        runner = Runner()
-        runner.at_ms[60_000] = runner.permit
-        last_seq = runner.run()
-        assert last_seq == runner.bench.seq <= 10
 
     def test_nothing_else_that_is_in_the_way_ends_the_waiting(self) -> None:
         runner = Runner()

@@ -259,21 +259,19 @@ def test_a_tenth_of_the_states_lost_from_the_start_is_no_fault(monkeypatch: pyte
     assert rig.active == ()
 
 
-def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(rig: Rig) -> None:
+def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Attitude] = []
+    eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))
+    poller: dict[str, Callable[[Frame], None]] = {}
+    monkeypatch.setattr(robot_inputs, "VisualOdometry", lambda _geometry: eye)
+    monkeypatch.setattr(robot_inputs, "CameraPoller", lambda _request, **named: poller.update(see=named["on_frame"]))
+    rig = Rig(monkeypatch)
     began_ns = rig.bench.now_ns
     rig.alter = lambda state: replace(state, pitch_rad=(state.received_ns - began_ns) / 1e9)
     rig.drive(0.3)
-    rig.inputs._eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))  # type: ignore[assignment]
     jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1].tobytes()
-    rig.inputs._see(Frame(began_ns + 150 * MS, np.zeros((1, 32, 32, 3), dtype=np.uint8), jpeg))
+    poller["see"](Frame(began_ns + 150 * MS, np.zeros((1, 32, 32, 3), dtype=np.uint8), jpeg))
     assert [one.pitch_rad for one in seen] == [pytest.approx(0.15)]
-
-
-def test_whoever_drives_is_told_that_a_thread_has_died(rig: Rig) -> None:
-    rig.reader.on_death("robot state thread died: test")
-    rig.inputs.camera._on_death("camera thread died: test")
-    assert rig.deaths == ["robot state thread died: test", "camera thread died: test"]
 
 
 class FakeBus:

@@ -22,7 +22,7 @@ CONSTRAINED, ON, OFF = Decoding.CONSTRAINED, RecoverySwitch.ON, RecoverySwitch.O
 def asked(*arguments: str) -> SwitchOptions:
     """Switches that the runner's command line asks for."""
     command = ["--artifacts", "a", "--robot", str(ROBOT_FILE), "--instruction", "stop at the desk", *arguments]
-    return runner._read(runner.parser().parse_args(command))[1].switches
+    return runner.read_options(runner.parser().parse_args(command))[1].switches
 
 
 def in_force(*arguments: str, recovery: RecoverySwitch = ON) -> Switches:
