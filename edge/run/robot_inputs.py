@@ -19,7 +19,8 @@ from edge.flightlog.recorder import Recorder
 from edge.flightlog.records import Throttle, battery_record, odometry_record
 from edge.odometry.calibration import OdometryCalibration, load_calibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
-from edge.odometry.estimator import DriftEstimator, OdometryInputs, OdometryOutputs
+from edge.odometry.estimator import DriftEstimator, OdometryOutputs
+from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from edge.run.camera import CameraPoller
 from edge.safety.faults.findings import FindingQueue

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.calibration import OdometryCalibration
-from edge.odometry.estimator import DriftEstimator, OdometryInputs
+from edge.odometry.estimator import DriftEstimator
+from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualMotion
 from edge.state.pose_history import PoseHistory
 from tests.support.runner.odometry_drives import STATE_NS, drive, play, visual_motions

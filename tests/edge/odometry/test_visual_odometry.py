@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.odometry.camera_geometry import Attitude, CameraGeometry, FloorProjector
-from edge.odometry.visual_odometry import VisualConfig, VisualMotion, VisualOdometry, grey_frame
+from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
 from tests.support.runner.floor_pictures import GEOMETRY, HEIGHT_PX, WIDTH_PX, floor_texture, picture
 
 FRAME_NS = 100_000_000
@@ -127,7 +127,7 @@ def test_noise_without_a_floor_gives_no_answer() -> None:
 
 
 def test_corners_are_not_followed_across_a_pause() -> None:
-    eye = VisualOdometry(GEOMETRY, VisualConfig(max_gap_ns=200_000_000))
+    eye = VisualOdometry(GEOMETRY)
     poses = along(SE2(0.05, 0.0, 0.0), 12)
     stamps = [FRAME_NS * index + (1_000_000_000 if index >= 6 else 0) for index in range(12)]
     answers = [eye.step(picture(TEXTURE, p), ns, Attitude()) for p, ns in zip(poses, stamps, strict=True)]
