@@ -45,11 +45,11 @@ class FrontEndOptions:
 
 
 @dataclass(frozen=True)
-class Heard:
-    """One command as it came off the wire, for the trace; `received_ns` is time.monotonic_ns.
+class ReceivedCommand:
+    """One command as it was received, for the trace; `received_ns` is time.monotonic_ns.
 
-    `service` is the part of the protocol that it was sent to, `api_id` its number there, `name` what the protocol's
-    own page calls it, `parameter` its content in words. `request_id` is the sender's, 0 where there is none.
+    `service`: the part of the protocol that it was sent to. `api_id`: its number there. `name`: its name in the
+    protocol's specification. `parameter`: its content as text. `request_id`: the sender's, 0 if the protocol has none.
     """
 
     received_ns: int
@@ -78,7 +78,7 @@ class FrontEnd(Protocol):
         """Sleep until something arrives, at most `left_ns`."""
         ...
 
-    def serve(self) -> list[Heard]:
+    def serve(self) -> list[ReceivedCommand]:
         """Obey and answer what has arrived; returns it. Malformed input is counted and changes nothing."""
         ...
 

@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict, dataclass, field
 
 from tools.faults.host_stall import HostStall
-from tools.faults.received import Heard, first_lasting, longest_gap_ms, moves
+from tools.faults.received import ReceivedRequest, first_lasting, longest_gap_ms, moves
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row
 
@@ -95,7 +95,7 @@ def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
     before_mps = rig.speed_mps()
     time.sleep(max(0.0, WATCH_S - (time.monotonic_ns() - effect_ns) / 1e9))
     end_ns = effect_ns + round(WATCH_S * 1e9)
-    heard: list[Heard] = rig.hearing.since(effect_ns)
+    heard: list[ReceivedRequest] = rig.hearing.since(effect_ns)
     moving = moves(one for one in heard if one.moving)
     sample = Sample(longest_gap_ms(moving, effect_ns, end_ns), host.between_ns(effect_ns, end_ns) / 1e6)
     if any(not one.moving for one in heard if one.velocity is not None):

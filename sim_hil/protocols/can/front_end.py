@@ -28,7 +28,7 @@ from sim_hil.protocols.can.frames import Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
 from sim_hil.protocols.can.shim import FaultPlan, FaultShim
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.robots.carter.body import Carter
 from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
@@ -92,7 +92,7 @@ def _port(text: str) -> int:
 
 
 class CommandLog:
-    """What has been commanded over the bus, for the result: what was heard, not what was meant."""
+    """Commands received over the bus, for the result."""
 
     def __init__(self) -> None:
         self._commands = 0
@@ -136,7 +136,7 @@ class CanFrontEnd:
         self._inwards = FaultShim(link.faults, options.seed, 0)
         self._outwards = FaultShim(link.faults, options.seed, 1)
         self._log = CommandLog()
-        self._heard: list[Heard] = []
+        self._commands: list[ReceivedCommand] = []
         self._last_event: tuple[tuple[str, float], float] | None = None
         self._now_s = 0.0
         self._states = 0
@@ -186,7 +186,7 @@ class CanFrontEnd:
         return f"CAN {self._address}, {camera}"
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraStreamError."""
+        """Wait for the camera. Raises CameraProcessError."""
         if self._camera is None:
             return True
         self._camera.show(render_state)
@@ -197,26 +197,26 @@ class CanFrontEnd:
         assert self._link is not None
         self._link.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
+    def serve(self) -> list[ReceivedCommand]:
         """Obey what has arrived. Raises BusError when the bus has gone."""
         assert self._link is not None
         for received_ns, frame in self._link.receive():
             if self._faulty:
                 self._inwards.put(frame, self._now_s)
             else:
-                self._hear(frame, received_ns)
-        self._hear_late()
+                self._receive(frame, received_ns)
+        self._receive_late()
         if self._camera is not None:
-            self._camera.poll()
-        heard, self._heard = self._heard, []
-        return heard
+            self._camera.events()
+        commands, self._commands = self._commands, []
+        return commands
 
-    def _hear_late(self) -> None:
+    def _receive_late(self) -> None:
         if self._faulty:
             for frame in self._inwards.take(self._now_s):
-                self._hear(frame, time.monotonic_ns())
+                self._receive(frame, time.monotonic_ns())
 
-    def _hear(self, frame: Frame, received_ns: int) -> None:
+    def _receive(self, frame: Frame, received_ns: int) -> None:
         received = self._node.receive(frame, self._now_s)
         if received is None or received.name not in _SHOWN:
             return
@@ -224,7 +224,7 @@ class CanFrontEnd:
         if (received.good or stop) and not self._again(received):
             self._log.note(received)
             content = " ".join(f"{key}={received.signals[key]:g}" for key in _SHOWN[received.name])
-            self._heard.append(Heard(received_ns, "can", frame.identifier, received.name, content))
+            self._commands.append(ReceivedCommand(received_ns, "can", frame.identifier, received.name, content))
 
     def _again(self, received: Received) -> bool:
         """Whether this is one more frame of an event that is sent three times."""
@@ -239,7 +239,7 @@ class CanFrontEnd:
         assert self._link is not None
         self._now_s = stamp_s
         self._heed_faults()
-        self._hear_late()
+        self._receive_late()
         self._node.step(stamp_s)
         due = self._node.due(stamp_s, self._read)
         if self._faulty:
@@ -284,7 +284,7 @@ class CanFrontEnd:
             self._line.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Counts of what was received and sent, as JSON values."""
         counts, link = self._node.counts, self._link
         line_errors, sent, unsent = (0, 0, 0) if link is None else (link.line_errors, link.sent, link.unsent)
         can = {

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.camera_stream import CameraStream
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.mavlink.commands import Command
 from sim_hil.protocols.mavlink.faults import MavlinkFaults
 from sim_hil.protocols.mavlink.node import COMPONENT, MavlinkNode
@@ -160,7 +160,7 @@ class MavlinkFrontEnd:
         return f"MAVLink udp:{self._host}:{self._link.port}, system {self._node.system}, {camera}"
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraStreamError."""
+        """Wait for the camera. Raises CameraProcessError."""
         if self._camera is None:
             return True
         self._camera.show(render_state)
@@ -170,22 +170,22 @@ class MavlinkFrontEnd:
         """Until a datagram arrives."""
         self._link.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
+    def serve(self) -> list[ReceivedCommand]:
         """Obey and answer what has arrived."""
-        heard = []
+        received = []
         for data, address in self._link.receive():
             if self._muted:
                 continue
             received_ns = time.monotonic_ns()
             messages = self._reader.read(data)
             if messages and self._link.accept(address, self._now_s):
-                heard += [each for message in messages for each in self._hear(message, address, received_ns)]
+                received += [each for message in messages for each in self._receive(message, address, received_ns)]
         self._flush(self._node.answers())
         if self._camera is not None:
-            self._camera.poll()
-        return heard
+            self._camera.events()
+        return received
 
-    def _hear(self, message: Message, address: Address, received_ns: int) -> list[Heard]:
+    def _receive(self, message: Message, address: Address, received_ns: int) -> list[ReceivedCommand]:
         station = Station(message.get_srcSystem(), address)
         if not self._node.receive(message, station, self._now_s):
             return []
@@ -200,7 +200,7 @@ class MavlinkFrontEnd:
             for key, value in message.to_dict().items()
             if key not in _NOT_SHOWN and value and value == value  # MAVSDK fills what it does not use with NaN
         )
-        return [Heard(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
+        return [ReceivedCommand(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Let the rover's clock go on, and send what is due."""
@@ -241,7 +241,7 @@ class MavlinkFrontEnd:
         self._link.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Counts of what was received and sent, as JSON values."""
         counts, link = self._reader.counts, self._link
         mavlink = {
             "broken": counts.broken,

@@ -14,7 +14,7 @@ from edge.core.geometry import SE2
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
-from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.unitree.camera_process import CameraProcess
 from sim_hil.protocols.unitree.drifting import DriftingOdometry
 from sim_hil.protocols.unitree.remote import Remote
@@ -122,7 +122,7 @@ class UnitreeFrontEnd:
 
     def _tell_camera(self, line: bytes) -> None:
         if self._camera is not None:
-            self._camera.tell(line)
+            self._camera.send(line)
 
     def where(self) -> str:
         """Domain and interface."""
@@ -139,7 +139,7 @@ class UnitreeFrontEnd:
         """Until a request arrives."""
         self._waitset.wait(left_ns)
 
-    def serve(self) -> list[Heard]:
+    def serve(self) -> list[ReceivedCommand]:
         """Answer what is waiting at every service; the camera's are told of by its process."""
         received = self._serve_sport()
         self._leases.serve_leases()
@@ -150,7 +150,7 @@ class UnitreeFrontEnd:
             received += self._of_camera(event)
         for request in received:
             self._log.note(request)
-        return [_heard(request) for request in received]
+        return [_received_command(request) for request in received]
 
     def _serve_sport(self) -> list[Received]:
         if self._faults is None:
@@ -214,7 +214,7 @@ class UnitreeFrontEnd:
             self.bus.close()
 
     def summary(self) -> dict[str, object]:
-        """What was heard and sent."""
+        """Counts of what was received and sent, as JSON values."""
         malformed = self._video_malformed + self._behaviour.low_level.rejected
         malformed += sum(server.malformed for server in self._servers)
         return {
@@ -253,6 +253,8 @@ def _odometry(options: FrontEndOptions) -> OdometryFrame:
     return DriftingOdometry(start, OdometryNoise(LEVELS[options.odometry_noise], options.seed))
 
 
-def _heard(request: Received) -> Heard:
+def _received_command(request: Received) -> ReceivedCommand:
     name = api_name(request.service, request.api_id)
-    return Heard(request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id)
+    return ReceivedCommand(
+        request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id
+    )

@@ -34,7 +34,7 @@ _MODE_AFTER = {
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedCommand:
     """One request: when, which, and the velocity of a Move."""
 
     received_ns: int
@@ -52,7 +52,7 @@ class FakeGo2:
 
     def __init__(self, domain: int, bus: Bus | None = None) -> None:
         """`bus`: participant to use, by default one of its own."""
-        self.heard: list[Heard] = []
+        self.heard: list[ReceivedCommand] = []
         self.lease = Lease()
         self.reset()
         self.bus = Bus(DdsConfig(domain, "lo", ("127.0.0.1",))) if bus is None else bus
@@ -99,7 +99,7 @@ class FakeGo2:
         self.track: deque[tuple[int, float, float]] = deque(maxlen=20_000)
         self.heard.clear()
 
-    def moves(self) -> list[Heard]:
+    def moves(self) -> list[ReceivedCommand]:
         return [heard for heard in list(self.heard) if heard.api_id == ids.MOVE]
 
     def is_driven(self) -> bool:
@@ -118,7 +118,7 @@ class FakeGo2:
             self._waitset.wait(5_000_000)
             for request in self._server.requests():
                 velocity = parse_move(request.parameter) if request.api_id == ids.MOVE else None
-                self.heard.append(Heard(request.received_ns, request.api_id, velocity))
+                self.heard.append(ReceivedCommand(request.received_ns, request.api_id, velocity))
                 if request.api_id == ids.API_VERSION:
                     self._server.reply(request, ids.OK, self.version)
                 elif self.lease.denies(request.lease_id, request.received_ns):

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 import pytest
 
-from sim_hil.protocols.front_end import FrontEnd, FrontEndOptions, Heard
+from sim_hil.protocols.front_end import FrontEnd, FrontEndOptions, ReceivedCommand
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.physics import Simulation
 
@@ -81,11 +81,11 @@ class Rig:
             self.steps += 1
             self.front_end.publish(self.steps, self.steps * self.simulation.dt_s)
 
-    def tell(self, say: Callable[[], object]) -> list[Heard]:
+    def tell(self, say: Callable[[], object]) -> list[ReceivedCommand]:
         """Let the client say something and the robot hear it."""
         say()
         deadline = time.monotonic() + _WIRE_TIMEOUT_S
-        heard: list[Heard] = []
+        heard: list[ReceivedCommand] = []
         while not heard:
             assert time.monotonic() < deadline, "the front end heard nothing"
             self.front_end.wait(10_000_000)

@@ -1,4 +1,4 @@
-"""Who is trained: the action expert beside an asynchronous mind, and the paper's point-goal network."""
+"""The policies that are trained: the action expert beside asynchronous reasoning, and the point-goal network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tools.train.imitate.point_goal_net import PointGoalNet
 from tools.train.rl.action_tail import now_of, prefix, semantic_of, tail
 from tools.train.rl.command_policy import CommandLimits, command_mean
 from tools.train.rl.rollout import Chosen
-from tools.train.rl.virtual_time_reasoner import AsyncMind, Models
+from tools.train.rl.virtual_time_reasoner import Models, RolloutReasoner
 
 Floats = npt.NDArray[np.float32]
 
@@ -32,7 +32,7 @@ class TailPilot:
         instruction: str,
         draw: Callable[[], Timing],
     ) -> None:
-        self._mind = AsyncMind(models, instruction, draw)
+        self._reasoner = RolloutReasoner(models, instruction, draw)
         self._expert, self._limits, self._step_s = expert, limits, models.artifacts.runtime.step_s
         self._number: int | None = None
         self._tokens = torch.empty(0)
@@ -45,25 +45,25 @@ class TailPilot:
 
     @property
     def failure(self) -> str | None:
-        """Why reasoning has ended for good."""
-        return self._mind.failure
+        """Why reasoning has ended for this episode; None while it continues."""
+        return self._reasoner.failure
 
     def see(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
-        """Release what is due, encode the frame."""
-        return self._mind.see(time_s, image, T_odom_base)
+        """Release the generation that is due and encode the frame."""
+        return self._reasoner.observe(time_s, image, T_odom_base)
 
     def choose(
         self, visual: Floats, state: tuple[float, ...], goal_m: tuple[float, float], time_s: float, T_odom_base: SE2
     ) -> Chosen | None:
         """None before the first semantic state; the goal is not looked at."""
-        semantic = self._mind.semantic
+        semantic = self._reasoner.semantic
         if semantic is None:
             return None
         if semantic.generation != self._number:
             self._number = semantic.generation
             self._tokens = semantic_of(self._expert, torch.from_numpy(semantic.last_layer_kv))
             self._semantic.append(self._tokens[0].numpy().copy())
-        latency = self._mind.metadata(time_s, T_odom_base)
+        latency = self._reasoner.metadata(time_s, T_odom_base)
         now = now_of(self._expert, torch.from_numpy(visual), torch.tensor([state]), torch.tensor([latency]))
         x = prefix(self._expert, now, self._tokens)
         with torch.no_grad():
@@ -73,12 +73,12 @@ class TailPilot:
             x[0].numpy().copy(),
             latency,
             len(self._semantic) - 1,
-            self._mind.speed_scale(time_s),
+            self._reasoner.speed_scale(time_s),
         )
 
     def think(self, time_s: float) -> None:
         """Start the next generation if none is under way."""
-        self._mind.think(time_s)
+        self._reasoner.start_generation(time_s)
 
 
 class PointGoalPilot:

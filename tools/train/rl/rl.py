@@ -171,14 +171,14 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
 
 
 def _driven(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Rollout:
-    """An order's episodes, each told as it ends: an iteration takes minutes."""
+    """Drive the episodes of an order and show progress after each: an iteration takes minutes."""
     ended: list[bool] = []
 
-    def told(success: bool) -> None:
+    def finished(success: bool) -> None:
         ended.append(success)
         job.progress.update(len(ended), len(order.numbers), success=sum(ended) / len(ended))
 
-    return drive(order, jobs=config.jobs, per_job=config.episodes_per_job, told=told, stopped=job.should_stop)
+    return drive(order, jobs=config.jobs, per_job=config.episodes_per_job, finished=finished, stopped=job.should_stop)
 
 
 def _evaluate(job: StageJob, config: RlConfig, order: RolloutOrder, drive: Drive) -> Score:

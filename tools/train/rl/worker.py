@@ -21,7 +21,8 @@ from export.model.config_file import config_from_dict
 from export.model.network import TicVla
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.policies.select import robot_config
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_process import worker_main
+from sim_hil.processes.child_process import Message
 from tools.train.config.scenes import TASKS_PER_SCENE
 from tools.train.imitate.point_goal_net import PointGoalNet
 from tools.train.rl import rollout

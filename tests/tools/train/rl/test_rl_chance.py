@@ -24,7 +24,7 @@ from tools.train.rl import worker as rl_worker
 from tools.train.rl.drive import CONTROL_S, DriveOptions, _Wheel, drive_episode
 from tools.train.rl.rollout import Chosen, EpisodeEnd, EpisodeSteps
 from tools.train.rl.vector_env import split
-from tools.train.rl.virtual_time_reasoner import START_NS, AsyncMind
+from tools.train.rl.virtual_time_reasoner import START_NS, RolloutReasoner
 from tools.train.rl.worker import RolloutOrder, delays, scenarios
 from tools.train.scenes.scenarios import FIRST_SEED
 
@@ -157,31 +157,31 @@ def test_a_pilot_is_told_the_time_to_the_nanosecond() -> None:
     assert [round(time_s * 1e9) for time_s in pilot.times] == [k * 100_000_000 for k in range(13)]
 
 
-def _mind(age_s: float) -> AsyncMind:
+def _reasoner(age_s: float) -> RolloutReasoner:
     """At time 0, with an answer of that age."""
     runtime = SimpleNamespace(frame_offsets_s=(9.0, 0.0), max_new_tokens=4)
     models: Any = SimpleNamespace(
         ages=SemanticConfig(), artifacts=SimpleNamespace(runtime=runtime), language=None,
         policy=SimpleNamespace(tokens_shape=(1, 2, 3)),
     )  # fmt: skip
-    mind = AsyncMind(models, "go", lambda: None)  # type: ignore[arg-type, return-value]
+    reasoner = RolloutReasoner(models, "go", lambda: None)  # type: ignore[arg-type, return-value]
     anchor_ns = START_NS - round(age_s * 1e9)
-    mind._slot.state = SemanticState(
+    reasoner._slot.state = SemanticState(
         1, anchor_ns, SE2(0, 0, 0), anchor_ns, np.zeros((1, 1, 2), np.float32), {}, "", None
     )
-    return mind
+    return reasoner
 
 
 @pytest.mark.parametrize(("age_s", "told_s"), [(4.0, 4.0), (10.0, 10.0), (13.0, 10.0)])
 def test_an_age_is_told_as_the_runner_tells_it(age_s: float, told_s: float) -> None:
-    assert _mind(age_s).metadata(0.0, SE2(0, 0, 0))[0] == told_s
+    assert _reasoner(age_s).metadata(0.0, SE2(0, 0, 0))[0] == told_s
 
 
 @pytest.mark.parametrize(
     ("age_s", "share"), [(4.0, 1.0), (10.0, 1.0), (12.5, 0.5), (14.0, 0.2), (15.0, 0.0), (20.0, 0.0)]
 )
 def test_an_answer_that_is_too_old_slows_down_and_stops(age_s: float, share: float) -> None:
-    assert _mind(age_s).speed_scale(0.0) == pytest.approx(share)
+    assert _reasoner(age_s).speed_scale(0.0) == pytest.approx(share)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.2])

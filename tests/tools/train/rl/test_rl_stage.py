@@ -224,9 +224,9 @@ def test_every_episode_is_told_as_it_ends(tmp_path: Path) -> None:
     driver = _driver(tiny_network(), lambda _: True)
     progress = Mock()
 
-    def drive(order: RolloutOrder, *, told: Callable[[bool], None], **others: Any) -> rollout.Rollout:
+    def drive(order: RolloutOrder, *, finished: Callable[[bool], None], **others: Any) -> rollout.Rollout:
         for _ in order.numbers:
-            told(True)
+            finished(True)
         return driver(order, **others)
 
     job = replace(_job(tmp_path, config), progress=progress)
