@@ -12,6 +12,7 @@ import pytest
 import torch
 from tokenizers import Tokenizer
 
+from edge.state.reasoning_text import format_text
 from export.model.network import TicVla, build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
@@ -75,7 +76,7 @@ def test_a_state_is_what_the_language_model_leaves_of_prompt_and_true_text(
     assert cache.anchors("a") == tuple(anchor.k for anchor in anchors) == (0, 10, 20, 30)
     for anchor in anchors:
         state = cache.at("a", anchor.k)
-        assert state.text == anchor.reasoning and not state.own
+        assert state.text == format_text(anchor.reasoning) and not state.own
         assert state.waypoints == pytest.approx(np.round(anchor.points, 1))
         prompt, answer = prompts.of(anchor, Drawn(anchor.wordings[0], anchor.before(1.0)))
         assert state.prompt_tokens == len(prompt)
