@@ -64,7 +64,7 @@ class RenderProcess:
         lines = self._child.read()
         if self._child.at_end:
             code = self._child.wait(_END_TIMEOUT_S)  # None: it closed its output and lives on; `close` kills it
-            fate = "has closed its output, still running" if code is None else f"has died (exit status {code})"
+            fate = "closed its output but still runs" if code is None else f"died (exit status {code})"
             raise CameraProcessError(f"the camera process {fate}; see its output above")
         return [_event(line) for line in lines]
 
