@@ -127,7 +127,7 @@ def measure(
     activity = TickActivity(runtime.tick_period_ms * 1_000_000)
     policy = Policy(artifacts, schedule=schedule, activity=activity)
     language = LanguageModel(artifacts, schedule=schedule)
-    language.check_instruction(instruction, len(runtime.frame_offsets_s))
+    language.check_instruction(instruction)
     try:
         warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
     except (GraphError, ContextOverflowError) as error:

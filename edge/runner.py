@@ -28,7 +28,6 @@ from edge.core.cli import (
     command_line,
     write_result,
 )
-from edge.core.terminal import operator_lines
 from edge.flightlog.reader import parts
 from edge.inference import engines
 from edge.inference.release import ReleaseDelayError, parse_release_delay
@@ -38,6 +37,7 @@ from edge.reasoning.prompt import InstructionError
 from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
+from edge.run.service import operator_lines
 from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable

@@ -20,7 +20,7 @@ from edge.artifacts.files import (
     read_file,
     read_manifest_bytes,
 )
-from edge.artifacts.provider_options import wrong_option
+from edge.artifacts.providers import wrong_option
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from edge.state.switches import Decoding, RecoverySwitch

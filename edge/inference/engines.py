@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from edge.artifacts.files import HASH_BLOCK_BYTES, ArtifactError, FileIdentity, read_manifest
+from edge.artifacts.files import HASH_BLOCK_BYTES, FileIdentity, read_manifest
 from edge.artifacts.manifest import Artifacts, TensorContract
 from edge.core.cli import write_whole
 from edge.core.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
@@ -347,16 +347,3 @@ def _busy(say: Progress, line: str) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
-
-
-__all__ = [
-    "ENGINES_NAME",
-    "ArtifactError",
-    "EngineError",
-    "Machine",
-    "build",
-    "check",
-    "default_directory",
-    "needed",
-    "with_engines",
-]

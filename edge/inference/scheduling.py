@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from edge.artifacts.manifest import Artifacts
+from edge.core.deadline import run_in_thread
 from edge.core.device import shares_device
 
 Result = TypeVar("Result")
@@ -121,26 +122,18 @@ def _list(cores: Collection[int]) -> str:
     return ", ".join(str(core) for core in sorted(cores))
 
 
-def _set_fifo(priority: int) -> None:
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-
-
-def _set_niceness(niceness: int) -> None:
-    # Linux niceness is per thread.
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-
-
-def _set_cores(cores: Collection[int]) -> None:
-    os.sched_setaffinity(0, cores)
-
-
-@dataclass(frozen=True)
 class ThreadCalls:
     """What sets the calling thread's scheduling; each raises OSError when it is refused."""
 
-    set_cores: Callable[[Collection[int]], None] = _set_cores
-    set_fifo: Callable[[int], None] = _set_fifo
-    set_niceness: Callable[[int], None] = _set_niceness
+    def set_cores(self, cores: Collection[int]) -> None:
+        os.sched_setaffinity(0, cores)
+
+    def set_fifo(self, priority: int) -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+    def set_niceness(self, niceness: int) -> None:
+        # Linux niceness is per thread.
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
 
 
 def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
@@ -177,20 +170,12 @@ def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
     if role is None:
         return body()
     results: list[Result] = []
-    errors: list[BaseException] = []
 
     def target() -> None:
         enter(role)
-        try:
-            results.append(body())
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            errors.append(error)
+        results.append(body())
 
-    thread = threading.Thread(target=target, name=f"open-{role.name}")
-    thread.start()
-    thread.join()
-    if errors:
-        raise errors[0]
+    run_in_thread(f"open-{role.name}", target)
     return results[0]
 
 

@@ -17,10 +17,21 @@ import numpy as np
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry import pose_chain
 from edge.odometry.calibration import OdometryCalibration
-from edge.odometry.dead_reckoning import Cursor, Interval, OdometryModel, advance, bent, integrate, split
 from edge.odometry.drift_rate import Comparison, DriftMonitor, DriftRate
 from edge.odometry.gate import Increment, OdometryGate, OdometryInputs, StillCheck, age_findings
-from edge.odometry.pose_chain import HEADING, VISUAL, Array, Node
+from edge.odometry.pose_chain import (
+    HEADING,
+    VISUAL,
+    Array,
+    Cursor,
+    Interval,
+    Node,
+    OdometryModel,
+    advance,
+    bent,
+    integrate,
+    split,
+)
 from edge.odometry.visual_odometry import VisualMotion
 from edge.safety.faults.findings import Finding
 from edge.state.pose_history import StampedPose

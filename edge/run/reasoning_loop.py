@@ -18,6 +18,7 @@ from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.reasoning.anchor import Anchor, older_frames
 from edge.reasoning.generation_cycle import (
+    UNLIMITED,
     Action,
     Anchored,
     Cancelled,
@@ -29,10 +30,10 @@ from edge.reasoning.generation_cycle import (
     FrameMissed,
     GenerationCycle,
     Mode,
+    ReasoningBudget,
     ReasoningConfig,
 )
 from edge.reasoning.instruction_state import InstructionMemory, Job
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState, SharedState
 

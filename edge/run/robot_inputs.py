@@ -27,11 +27,30 @@ from edge.safety.faults.findings import FindingQueue
 from edge.safety.monitors.robot import LinkMonitor
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory
+from firmware_bridge.client import BridgeClient, BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.unitree.client import BatteryState, Go2Reader, RobotState
 
 ODOMETRY_LOG_HZ = 50.0
 BATTERY_LOG_HZ = 1.0
+
+
+class CommandTap:
+    """Keeps the velocity in force on its way to the bridge; any thread may read `commanded`."""
+
+    def __init__(self, bridge: BridgeClient) -> None:
+        self._bridge = bridge
+        self.commanded: tuple[float, float, float] | None = None
+        """(vx m/s, vy m/s, ωz rad/s) sent last; None before the first."""
+
+    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
+        """See `BridgeClient`."""
+        self.commanded = (vx_mps, vy_mps, wz_radps)
+        return self._bridge.send_velocity(seq, stamp_ns, vx_mps, vy_mps, wz_radps)
+
+    def poll(self) -> BridgeStatus | None:
+        """See `BridgeClient`."""
+        return self._bridge.poll()
 
 
 class RobotInputs:

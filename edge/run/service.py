@@ -1,18 +1,22 @@
-"""The runner as a service: ready, a status line, watchdog, stopping; nothing without systemd.
+"""The runner as a service (ready, a status line, watchdog, stopping; nothing without systemd), and its lines.
 
 Ready is a runner that drives on time, or one that waits for an operator who may take hours.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TextIO, cast
 
 from edge.safety.watchdog import WatchdogFeeder
+from firmware_bridge.line_log import LineLog
 from firmware_bridge.notify import Notifier
 
 STATUS_PERIOD_NS: Final = 5_000_000_000
+CAPACITY: Final = 512
+"""Lines for the operator that wait to be written."""
 
 
 class ServiceReporter:
@@ -80,3 +84,25 @@ class ServiceReporter:
     def stopping(self, text: str) -> None:
         """The run ends, by itself, by a fault or on request."""
         self._notifier.stopping(text)
+
+
+class Descriptor:
+    """What `LineLog` writes to. No buffer, so no lock that a blocked write would keep until the interpreter's end."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def write(self, text: str) -> int:
+        """Write all of it, however long the reader takes; raises OSError."""
+        data = memoryview(text.encode("utf-8", "backslashreplace"))
+        while data:
+            data = data[os.write(self._number, data) :]
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+
+def operator_lines(prefix: str, descriptor: int = 2) -> LineLog:
+    """Lines to standard error: a pager that is not read or a pipe that broke holds up nobody and ends nothing."""
+    return LineLog(cast(TextIO, Descriptor(descriptor)), prefix, capacity=CAPACITY)

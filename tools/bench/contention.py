@@ -31,7 +31,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.policy import Policy
 from edge.power.monitor import PowerMonitor
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from edge.artifacts.files import SCHEMA_VERSION, ArtifactError
 from edge.artifacts.manifest import load_artifacts
-from edge.artifacts.provider_options import wrong_option
+from edge.artifacts.providers import wrong_option
 from edge.inference.engines import PROFILES
 from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel

@@ -26,9 +26,9 @@ from edge.reasoning.generation_cycle import (
     FrameMissed,
     GenerationCycle,
     Mode,
+    ReasoningBudget,
     ReasoningConfig,
 )
-from edge.state.reasoning_budget import ReasoningBudget
 
 TOKENS = 8
 ENDS = ("anchored", "missed", "cancelled", "failed", "finished", "nothing")

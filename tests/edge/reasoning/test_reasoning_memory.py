@@ -11,10 +11,9 @@ import pytest
 from edge.core.geometry import SE2
 from edge.inference.generation_task import GenerationModels
 from edge.reasoning.decoding_rules import BACK, DONE, EITHER_WAY, FREE, MAX_REFUSALS, ONWARD, TurnObservation
-from edge.reasoning.generation_cycle import Mode, ReasoningConfig
+from edge.reasoning.generation_cycle import Mode, ReasoningBudget, ReasoningConfig
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.reasoning.path_memory import PathMemory, Way, way_of
-from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.reasoning_text import LEFT, RIGHT, Progress
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SharedState

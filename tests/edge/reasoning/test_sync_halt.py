@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from edge.core.geometry import SE2
-from edge.reasoning.sync_halt import seen_standing
+from edge.reasoning.generation_cycle import seen_standing
 
 HALT_NS = 5_000_000_000
 TICK_NS = 100_000_000

@@ -9,9 +9,8 @@ from collections.abc import Callable
 import pytest
 
 from edge.reasoning.decoding_rules import DecodingContext
-from edge.reasoning.generation_cycle import FAILURES
+from edge.reasoning.generation_cycle import FAILURES, ReasoningBudget
 from edge.run.reasoning_loop import ReasoningLoop
-from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.switches import Decoding
 from tests.support.runner.reasoning_bench import TEXT, Bench, Clock, FakeRun
 

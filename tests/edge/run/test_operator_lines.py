@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from edge.core.terminal import operator_lines
+from edge.run.service import operator_lines
 
 CHATTERS = (
-    "from edge.core.terminal import operator_lines\n"
+    "from edge.run.service import operator_lines\n"
     "lines = operator_lines('edge-run')\n"
     "for number in range(2000):\n"
     "    lines.say('x' * 200)\n"
