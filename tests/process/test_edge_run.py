@@ -81,6 +81,14 @@ def drive(robot: Robot, *more: object) -> Running:
     return running("edge.runner", *robot.arguments(*more), folder=robot.folder, ready="driving")
 
 
+def check_zero_in_time(robot: Robot, since_ns: int, host: HostStall) -> None:
+    """The robot gets zero within the bound, and nothing but zero after that."""
+    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= since_ns]
+    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
+    check_stop_latency(zero_ns - since_ns, STOP_BOUND_NS, since_ns, host)
+    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
+
+
 def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> None:
     need_room_to_record(robot.folder)
     flight = robot.folder / "flight.mcap"
@@ -122,10 +130,7 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
         killed_ns = time.monotonic_ns()
         runner.process.wait(5)
     time.sleep(1.0)
-    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= killed_ns]
-    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    check_stop_latency(zero_ns - killed_ns, STOP_BOUND_NS, killed_ns, host)
-    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
+    check_zero_in_time(robot, killed_ns, host)
 
 
 @pytest.mark.slow
@@ -152,10 +157,7 @@ def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands
         time.sleep(1.0)
         runner.process.send_signal(signal.SIGCONT)
         status = runner.process.wait(20)
-    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= frozen_ns]
-    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    check_stop_latency(zero_ns - frozen_ns, STOP_BOUND_NS, frozen_ns, host)
-    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
+    check_zero_in_time(robot, frozen_ns, host)
     assert status == 1, "a run that the bridge had to stop is a failed run"
 
 

@@ -95,14 +95,6 @@ def test_a_bound_tick_plans_what_a_graph_of_its_own_plans(policy: Policy, artifa
     np.testing.assert_array_equal(found, graph.run(feeds)[0][0])
 
 
-def test_a_plan_survives_the_next_tick(policy: Policy, artifacts: Artifacts) -> None:
-    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
-    first = policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state)
-    kept = first.copy()
-    policy.act(tokens, (0.9, 0.0, 0.9), 9.0, HERE, state)
-    np.testing.assert_array_equal(first, kept)
-
-
 def test_a_context_that_does_not_fit_the_graph_is_a_failure_of_that_tick_only(
     policy: Policy, artifacts: Artifacts
 ) -> None:

@@ -202,18 +202,17 @@ def test_reports_that_stay_late_limit_the_speed_for_as_long_as_they_do(rig: Rig,
         assert fault in rig.active
 
 
-def test_two_speeds_that_disagree_stop_the_run_within_their_bound(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("spin_radps", "alter"),
+    [
+        (0.0, lambda state: replace(state, vx_mps=state.vx_mps + 0.8)),
+        (1.0, lambda state: replace(state, gyro_wz_radps=0.0)),
+    ],
+    ids=["velocity", "a gyro that shows no turn"],
+)
+def test_two_speeds_that_disagree_stop_the_run_within_their_bound(rig: Rig, spin_radps: float, alter: Alter) -> None:
     began_ns = rig.bench.now_ns
-    rig.alter = lambda state: replace(state, vx_mps=state.vx_mps + 0.8)
-    rig.drive(1)
-    assert "odometry-speed-mismatch" in rig.active and rig.bench.loop.supervision.stop
-    assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-speed-mismatch"].bound_ms
-
-
-def test_a_gyro_that_shows_no_turn_while_the_robot_turns_stops_the_run(rig: Rig) -> None:
-    began_ns = rig.bench.now_ns
-    rig.spin_radps = 1.0
-    rig.alter = lambda state: replace(state, gyro_wz_radps=0.0)
+    rig.spin_radps, rig.alter = spin_radps, alter
     rig.drive(1)
     assert "odometry-speed-mismatch" in rig.active and rig.bench.loop.supervision.stop
     assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-speed-mismatch"].bound_ms
@@ -244,19 +243,16 @@ def test_half_of_the_states_lost_from_the_start_limits_the_speed(monkeypatch: py
     rig.drive(2.5)
     assert rig.active == ("link-lossy",)
     assert rig.command[0] == pytest.approx(0.4)
+    few = Rig(monkeypatch)
+    few.alter = every(10, 1)
+    few.drive(6)
+    assert few.active == (), "a tenth is no fault"
 
 
 def test_half_of_the_states_lost_later_is_found_in_time(rig: Rig) -> None:
     rig.alter = every(4, 2)
     rig.drive(FAULTS["link-lossy"].bound_ms / 1e3)
     assert "link-lossy" in rig.active
-
-
-def test_a_tenth_of_the_states_lost_from_the_start_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Rig(monkeypatch)
-    rig.alter = every(10, 1)
-    rig.drive(6)
-    assert rig.active == ()
 
 
 def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(monkeypatch: pytest.MonkeyPatch) -> None:
