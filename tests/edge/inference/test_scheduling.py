@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from edge.inference.scheduling import (
     GAP_NS,
-    REASONING_NICENESS,
     GiveWay,
     Role,
     Schedule,
@@ -143,12 +142,6 @@ def test_nothing_that_is_refused_is_an_error() -> None:
     assert len(enter(CONTROL, Calls("cores", "fifo", "niceness"))) == 2
 
 
-def test_a_role_without_wishes_changes_nothing() -> None:
-    machine = Calls()
-    assert enter(Role("reasoning"), machine) == []
-    assert machine.done == []
-
-
 def test_threads_started_in_a_role_inherit_its_urgency() -> None:
     """As ONNX Runtime's workers do."""
 
@@ -164,11 +157,6 @@ def test_threads_started_in_a_role_inherit_its_urgency() -> None:
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     assert run_as(Role("reasoning", niceness=19), body) == 19
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
-
-
-def test_what_fails_in_a_role_fails_for_the_caller() -> None:
-    with pytest.raises(ValueError, match="no"):
-        run_as(Role("reasoning", niceness=REASONING_NICENESS), lambda: int("no"))
 
 
 @pytest.mark.parametrize("wrong", [{"priority": 0}, {"priority": 100}, {"niceness": 20}])

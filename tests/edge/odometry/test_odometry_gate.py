@@ -56,12 +56,6 @@ def test_a_pose_that_jumps_and_stays_is_one_jump_and_no_motion() -> None:
     assert sum(v.increment.dx_m for v in verdicts if v.increment) == pytest.approx(0.29, abs=1e-6)
 
 
-def test_a_pose_that_jumps_on_and_on_is_found_every_time() -> None:
-    verdicts = feed([report(0), *[report(i, x=float(2 * i)) for i in range(1, 5)]])
-    assert all("odometry-jump" in names(v) for v in verdicts[1:])
-    assert all(v.increment is None for v in verdicts)
-
-
 @pytest.mark.parametrize(
     "fields",
     [
@@ -116,8 +110,9 @@ def test_reports_that_come_in_a_burst_have_the_speed_of_the_robots_clock() -> No
     assert all("odometry-speed-mismatch" not in names(v) for v in feed(reports))
 
 
-def test_a_robots_clock_that_is_set_back_is_not_lag() -> None:
-    ahead = [replace(r, robot_stamp_ns=r.received_ns + 3_600_000_000_000) for r in walking(50)]
+@pytest.mark.parametrize("ahead_s", [2, 3600])
+def test_a_robots_clock_that_is_set_back_is_not_lag(ahead_s: int) -> None:
+    ahead = [replace(r, robot_stamp_ns=r.received_ns + ahead_s * 10**9) for r in walking(50)]
     back = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(60)[50:]]
     verdicts = feed([*ahead, *back])
     assert all(not v.findings for v in verdicts)
@@ -130,12 +125,6 @@ def test_a_robots_clock_that_runs_a_little_fast_or_slow_is_no_delay(ppm: int) ->
         report(i, robot_stamp_ns=round((i + 1) * STEP_NS * (1 + ppm * 1e-6)) + 10**9) for i in range(0, 200000, 40)
     ]
     assert all(not v.findings for v in feed(reports))
-
-
-def test_a_robots_clock_that_is_set_back_a_little_is_not_lag() -> None:
-    before = [replace(r, robot_stamp_ns=r.received_ns + 2_000_000_000) for r in walking(50)]
-    after = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(60)[50:]]
-    assert all(not v.findings for v in feed([*before, *after]))
 
 
 def turning(count: int, yaw_radps: float, gyro_radps: float) -> list[OdometryInputs]:

@@ -311,33 +311,26 @@ def frames(after_ns: int, moved: SE2) -> list[tuple[int, SE2]]:
     return [(HALT_NS + after_ns - TICK_NS, there), (HALT_NS + after_ns, there @ moved)]
 
 
+STILL = SE2(0.0, 0.0, 0.0)
+COASTS = SE2(0.05, 0.0, 0.0)
+
+
 @pytest.mark.parametrize(
-    ("moved", "stands"),
+    ("seen", "halted_ns", "stands"),
     [
-        (SE2(0.0, 0.0, 0.0), True),
-        (SE2(0.009, 0.0, 0.0), True),
-        (SE2(0.011, 0.0, 0.0), False),
-        (SE2(0.0, -0.011, 0.0), False),
-        (SE2(0.0, 0.0, -0.019), True),
-        (SE2(0.0, 0.0, 0.021), False),
+        (frames(3 * TICK_NS, STILL), HALT_NS, True),
+        (frames(3 * TICK_NS, SE2(0.009, 0.0, 0.0)), HALT_NS, True),  # 0.1 m/s
+        (frames(3 * TICK_NS, SE2(0.011, 0.0, 0.0)), HALT_NS, False),
+        (frames(3 * TICK_NS, SE2(0.0, -0.011, 0.0)), HALT_NS, False),
+        (frames(3 * TICK_NS, SE2(0.0, 0.0, -0.019)), HALT_NS, True),  # 0.2 rad/s
+        (frames(3 * TICK_NS, SE2(0.0, 0.0, 0.021)), HALT_NS, False),
+        (frames(-1, STILL), HALT_NS, False),  # from before the halt
+        (frames(10 * TICK_NS - 1, COASTS), HALT_NS, False),
+        (frames(10 * TICK_NS, COASTS), HALT_NS, True),  # 1 s after the halt, whatever odometry reports
+        (frames(TICK_NS, STILL)[1:], HALT_NS, False),  # one frame gives no speed
+        (frames(0, COASTS), None, True),  # no halt
+        ([], None, False),
     ],
 )
-def test_it_stands_below_a_tenth_of_a_metre_and_a_fifth_of_a_radian_a_second(moved: SE2, stands: bool) -> None:
-    assert seen_standing(frames(3 * TICK_NS, moved), HALT_NS) is stands
-
-
-def test_a_frame_from_before_the_halt_is_none_even_if_it_stood() -> None:
-    assert not seen_standing(frames(-1, SE2(0.0, 0.0, 0.0)), HALT_NS)
-
-
-@pytest.mark.parametrize(("after_ns", "expected"), [(10 * TICK_NS - 1, False), (10 * TICK_NS, True)])
-def test_a_second_after_the_halt_odometry_is_not_asked_any_more(after_ns: int, expected: bool) -> None:
-    assert seen_standing(frames(after_ns, SE2(0.05, 0.0, 0.0)), HALT_NS) is expected
-
-
-def test_one_frame_tells_no_speed() -> None:
-    assert not seen_standing(frames(TICK_NS, SE2(0.0, 0.0, 0.0))[1:], HALT_NS)
-
-
-def test_without_a_halt_any_frame_will_do_but_there_must_be_one() -> None:
-    assert seen_standing(frames(0, SE2(0.1, 0.0, 0.0)), None) and not seen_standing([], None)
+def test_a_frame_is_of_a_standing_robot(seen: list[tuple[int, SE2]], halted_ns: int | None, stands: bool) -> None:
+    assert seen_standing(seen, halted_ns) is stands

@@ -11,7 +11,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.inference.generation_task import GenerationModels
 from edge.reasoning.decoding_rules import BACK, DONE, EITHER_WAY, FREE, MAX_REFUSALS, ONWARD, TurnObservation
-from edge.reasoning.generation_cycle import Mode, ReasoningBudget, ReasoningConfig
+from edge.reasoning.generation_cycle import ReasoningBudget, ReasoningConfig
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.reasoning.path_memory import PathMemory, Way, way_of
 from edge.state.reasoning_text import LEFT, RIGHT, Progress
@@ -161,11 +161,6 @@ def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:
         assert way == way_of(poses)
 
 
-def test_the_way_does_not_depend_on_how_often_generations_run() -> None:
-    often, seldom = threaded(701, 5).prompt.told, threaded(701, 100).prompt.told
-    assert [way for way, _ in often][::20] == [way for way, _ in seldom]
-
-
 def test_the_way_goes_on_while_reasoning_is_paused_for_longer_than_the_ring_is_long() -> None:
     bench = Bench(clock=Clock(), late_anchor=False)
     bench.budget = ReasoningBudget(allowed=False)
@@ -243,16 +238,6 @@ def test_a_text_that_is_not_driven_by_is_not_remembered(bench: Bench) -> None:
     assert not bench.loop.step()
     bench.language.text = FIRST
     assert think_at(bench, 3.0)[1] is None
-
-
-def test_without_reasoning_the_way_is_told_and_no_progress() -> None:
-    bench = Bench(clock=Clock(), mode=Mode.NO_REASONING)
-    bench.language.text = ""
-    assert [think_at(bench, second) for second in (2.0, 3.0, 4.0)] == [
-        (((0.0, 0.0),), None),
-        (((-1.0, 0.0),), None),
-        (((-2.0, 0.0),), None),
-    ]
 
 
 HERE = "Objects: vending machine left 2 m.\nProgress: last leg of 0, passed 0.\nPlan: stop in 2 m." + LINE

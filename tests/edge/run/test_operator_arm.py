@@ -225,10 +225,13 @@ class TestRunner:
         with pytest.raises(RefusedError, match="not standing after 10 s"):
             runner.run()
 
-    def test_a_signal_ends_the_waiting(self) -> None:
-        runner = Runner()
+    @pytest.mark.parametrize(
+        ("in_the_way", "when"), [("", "waiting to be armed"), ("dark", "before the robot was armed")]
+    )
+    def test_a_signal_ends_the_waiting(self, in_the_way: str, when: str) -> None:
+        runner = Runner(in_the_way=in_the_way)
         runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
-        with pytest.raises(StoppedEarlyError, match="waiting to be armed"):
+        with pytest.raises(StoppedEarlyError, match=when):
             runner.run()
         assert runner.now_ms < 5_200
 
@@ -293,9 +296,3 @@ class TestInTheWay:
         runner.at_ms[60_000] = runner.permit
         runner.run()
         assert runner.now_ms >= 60_000 and runner.said == ["waiting for `edge-bridge arm`"]
-
-    def test_a_signal_ends_the_waiting_for_it(self) -> None:
-        runner = Runner(in_the_way="dark")
-        runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
-        with pytest.raises(StoppedEarlyError, match="before the robot was armed"):
-            runner.run()

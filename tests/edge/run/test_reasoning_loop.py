@@ -101,15 +101,6 @@ def test_a_cancelled_generation_begins_again_with_the_newest_frames(bench: Bench
     assert (bench.language.prompts, bench.language.instructions) == ([[9.0]], ["go"])
 
 
-def test_an_instruction_given_between_two_generations_interrupts_neither(bench: Bench) -> None:
-    bench.frame(2.0)
-    bench.loop.step()
-    bench.loop.submit("left")
-    bench.frame(3.0)
-    assert bench.loop.step()
-    assert (bench.cycle.cancelled, bench.language.instructions) == (0, ["go", "left"])
-
-
 def test_a_new_instruction_is_decoded_as_freely_as_the_first(clock: Clock) -> None:
     bench = Bench(clock=clock, decoding=Decoding.FREE)
     bench.loop.submit("left")
@@ -212,18 +203,6 @@ def test_one_slow_prefill_does_not_make_the_next_generation_wait(bench: Bench, c
     assert bench.loop.times.late_anchor_ms.newest == pytest.approx(200.0)
 
 
-def test_when_prefill_takes_far_longer_than_planned_the_spacing_is_kept(bench: Bench, clock: Clock) -> None:
-    def prefill() -> None:
-        for tenth in range(1, 21):
-            bench.frame(100.0 + tenth / 10)
-
-    bench.language.during_feed = prefill
-    for tenth in range(960, 1001):
-        bench.frame(tenth / 10)
-    bench.loop.step()
-    assert bench.language.prompts == [pytest.approx([97.0, 100.5])]
-
-
 def test_a_generation_is_given_up_when_no_frame_was_captured_around_the_planned_instant(
     bench: Bench, clock: Clock
 ) -> None:
@@ -242,12 +221,6 @@ def test_a_generation_is_given_up_when_no_frame_was_captured_around_the_planned_
 
 
 # What a supervisor sees
-
-
-def test_progress_is_seen_while_there_is_nothing_to_do(bench: Bench, clock: Clock) -> None:
-    clock.s += 5.0
-    bench.loop.step()
-    assert bench.loop.last_progress_ns == clock()
 
 
 def test_a_call_that_hangs_makes_no_progress(bench: Bench, clock: Clock) -> None:
