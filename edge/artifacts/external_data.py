@@ -1,4 +1,4 @@
-"""What an ONNX file says about weights outside itself, read from its bytes before any library opens it.
+"""References of an ONNX file to weights outside itself, read from its bytes before any library opens it.
 
 ONNX and ONNX Runtime have each been patched several times for external data that leaves the model's folder (`..`,
 symlinks, hard links, unknown keys: faults page, "Model artifacts"). So none of theirs is asked: this walks the protobuf

@@ -53,7 +53,7 @@ _VALUE: Final = re.compile(r"[A-Za-z0-9_.:,+-]{0,4096}", re.ASCII)
 
 
 def wrong_option(provider: str, options: Mapping[str, str]) -> str | None:
-    """What is wrong with the options of a provider, in words; None if nothing is."""
+    """Return what is wrong with the options of a provider, for a message; None if nothing is."""
     allowed = ALLOWED.get(provider, frozenset())
     for key, value in options.items():
         if key not in allowed:
@@ -103,7 +103,7 @@ class DeviceNode:
     """One node below /dev."""
 
     path: Path
-    """As the machine names it, without the root that it was looked for in."""
+    """Path on the machine, without the root of the search."""
     group: str | None
     """Group that may open it; None if everybody may, or if only root's group may."""
 

@@ -1,4 +1,4 @@
-"""What the program runs on, read from the files in which Linux and Jetson say so; the root can be another folder."""
+"""The device that the program runs on, read from the files of Linux and Jetson; the root can be another folder."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _provider_version(provider: str, root: Path, version_of: Callable[[str], str
         return None
     libraries = [path.name for folder in _LIBRARY_FOLDERS for path in (root / folder).glob(pattern)]
     versions = [name.partition(".so.")[2] for name in libraries]
-    # libnvinfer.so.10 is a link to libnvinfer.so.10.3.0: the longest says most.
+    # libnvinfer.so.10 is a link to libnvinfer.so.10.3.0: the longest name has the whole version.
     return max(versions, key=len, default=None)
 
 

@@ -197,8 +197,8 @@ class LanguageModel:
     ) -> GenerationRun:
         """A generation whose prompt is given piece by piece; the one before it must be over: they share buffers.
 
-        `cancelled` is asked before every call of a graph, `interrupt` can end one under way, and `before_call` is told
-        for how many ns the next call will take the processor.
+        `cancelled` is called before every call of a graph, `interrupt` can end one under way, and `before_call` takes
+        the expected duration of the next call, ns.
         """
         return GenerationRun(self, cancelled, interrupt, before_call)
 

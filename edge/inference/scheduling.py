@@ -27,7 +27,7 @@ SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are fenced in; with fewer, the operating
 system shares the cores out better than a fence would."""
 ROUND_NS = 1_000_000
-"""How often a waiting reasoning thread looks again."""
+"""Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
 """Between a tick's two calls, and after them, the tick is not over yet."""
 
@@ -155,7 +155,7 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
                 f"delay it; allow it with LimitRTPRIO={role.priority} in its service"
             )
     if role.niceness:
-        # A negative value is refused to most users, who have been told about the priority already.
+        # A negative value is refused to most users; the line about the priority covers it.
         with contextlib.suppress(OSError):
             calls.set_niceness(role.niceness)
     return lines
@@ -210,7 +210,7 @@ def freeze_garbage() -> None:
 
 
 class TickActivity:
-    """What the control thread is computing: it writes instants and waits for nobody, anybody may read them."""
+    """What the control thread is computing: it writes instants and never waits, any thread may read them."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -232,7 +232,7 @@ class TickActivity:
         self._busy = False
 
     def hold_ns(self, now_ns: int, needs_ns: int) -> int:
-        """How long a call that takes `needs_ns` has to wait before it is looked at again; 0: it may start.
+        """How long a call that takes `needs_ns` has to wait before the next check; 0: it may start.
 
         It waits for the tick under way, and for the next one if it would not be over by then. A call that is longer
         than the whole gap starts early in one. Ticks that have stopped are not waited for.

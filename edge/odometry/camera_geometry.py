@@ -69,7 +69,7 @@ class FloorProjector:
     def floor_points(self, pixels: Array, attitude: Attitude) -> tuple[Array, Array]:
         """Pixels [n, 2] → points on the floor in the level base frame [n, 2], m, and depression below level [n], rad.
 
-        A pixel at or above the horizon gives a point that means nothing: look at its depression.
+        A pixel at or above the horizon gives a meaningless point: check its depression.
         """
         rays = self._level_rays(pixels, attitude)
         horizontal = np.hypot(rays[:, 0], rays[:, 1])

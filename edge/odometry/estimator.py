@@ -57,7 +57,7 @@ PRIOR_M = 5.0
 HISTORY_NS = 30_000_000_000
 NODE_NS = 15_000_000
 PENDING_NS = 2_000_000_000
-"""How long the pose waits for the camera's word on an interval."""
+"""How long the pose waits for the camera's motion over an interval."""
 FLOOR_M = 0.001
 FLOOR_RAD = math.radians(0.05)
 """What no bookkeeping makes more certain: stamps, interpolation, the sway of the body."""
@@ -84,7 +84,7 @@ class DriftEstimator:
         self._pending: deque[Increment] = deque()
         self._commit: Cursor | None = None
         self._live: Cursor | None = None
-        # Published as a whole: (nodes, newest); nobody ever changes a list that has been published.
+        # Published as a whole: (nodes, newest); a published list never changes.
         self._published: tuple[list[Node], Node] | None = None
         known = self._calibration
         self._model = OdometryModel(

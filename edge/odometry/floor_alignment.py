@@ -34,7 +34,7 @@ SMOOTH_PX = 1.0
 POINTS = 500
 MIN_POINTS = 150
 MIN_GRADIENT = 2.5
-"""Grey levels a pixel: flatter floor says nothing."""
+"""Grey levels a pixel: flatter floor gives no information."""
 RANGE_M = 2.6
 HALF_WIDTH_M = 1.6
 MIN_SHARE = 0.5
@@ -110,7 +110,7 @@ def align_pictures(
 ) -> Solution | None:  # fmt: skip
     """Fit the later smoothed picture to the earlier one where `floor` is set; `start` [6] must be within a few pixels.
 
-    Edges count as much as corners here, each by the direction that it can tell. None when it does not settle.
+    Edges count as much as corners here, each in the direction that it constrains. None when it does not settle.
     """
     pixels = _strong_pixels(key, floor)
     points, _ = projector.floor_points(pixels.astype(np.float64), key_attitude)
@@ -167,10 +167,13 @@ def align_pictures(
         return None
     covariance = CORRELATION * inverse
     # Take the prior out again: a sum of many such answers must not count it many times.
-    told = 1.0 - float(covariance[6, 6]) / TILT_SIGMA_RAD**2
+    information = 1.0 - float(covariance[6, 6]) / TILT_SIGMA_RAD**2
     tilt_rad, tilt_sigma_rad = 0.0, math.inf
-    if told > 0.02:
-        tilt_rad, tilt_sigma_rad = float(q[6]) / told, TILT_SIGMA_RAD * math.sqrt((1 - told) / told)
+    if information > 0.02:
+        tilt_rad, tilt_sigma_rad = (
+            float(q[6]) / information,
+            TILT_SIGMA_RAD * math.sqrt((1 - information) / information),
+        )
     return Solution(q, covariance[:3, :3], inliers, inliers / len(weight), tilt_rad, tilt_sigma_rad)
 
 

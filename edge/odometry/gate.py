@@ -131,7 +131,7 @@ class OdometryGate:
             suspect_dt_s = elapsed_s(self._suspect, report)
             if suspect_dt_s > 0 and not self._jump(self._suspect, report, suspect_dt_s):
                 # It stays where it jumped to: go on from there. The step itself is no motion; the reported velocity
-                # says what was driven meanwhile.
+                # gives what was driven meanwhile.
                 return self._accept(self._suspect, report, suspect_dt_s, findings, bridged=last)
         if jumped:
             again = self._suspect is not None
@@ -187,13 +187,13 @@ class OdometryGate:
         dx_m, dy_m, turn_rad = moved
         window_s = MISMATCH_WINDOW_NS / 1e9
         if dt_s > 0.5 * window_s:
-            # Two readings do not tell the motion over a long gap: the robot may have been stopped in it.
+            # Two readings do not determine the motion over a long gap: the robot may have been stopped in it.
             self._apart.clear()
             self._apart_sums = [0.0] * len(self._apart_sums)
             return (), False
         # A pose that does not change at all is row 9's.
-        told = gyro_radps is not None and any(moved)
-        turned_apart = turn_rad - gyro_radps * dt_s if told and gyro_radps is not None else 0.0
+        has_turn_rates = gyro_radps is not None and any(moved)
+        turned_apart = turn_rad - gyro_radps * dt_s if has_turn_rates and gyro_radps is not None else 0.0
         sums = self._apart_sums
         self._apart.append((dt_s, dx_m - report.vx_mps * dt_s, dy_m - report.vy_mps * dt_s, turned_apart))
         for index, value in enumerate(self._apart[-1]):
@@ -258,7 +258,7 @@ def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:
     received_s = (after.received_ns - before.received_ns) / 1e9
     if before.robot_stamp_ns > 0 and after.robot_stamp_ns > 0:
         robot_s = (after.robot_stamp_ns - before.robot_stamp_ns) / 1e9
-        # A clock that was set does not tell how long it took.
+        # A clock that was set measures no duration.
         return robot_s if 0 < robot_s < received_s + 1.0 else received_s
     return received_s
 

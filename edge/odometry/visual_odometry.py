@@ -39,7 +39,7 @@ MIN_CORNERS = 12
 RENEW_CORNERS = 18
 """With fewer left, an answer is given while it can be."""
 MIN_DEPRESSION_RAD = math.radians(7.0)
-"""Floor nearer to the horizon than this moves too little to tell anything."""
+"""Floor nearer to the horizon than this moves too little to measure."""
 KEYFRAME_DISTANCE_M = 0.25
 KEYFRAME_TURN_RAD = math.radians(8.0)
 KEYFRAME_AGE_NS = 1_000_000_000
@@ -103,7 +103,7 @@ def _reduced(ratio: float) -> int:
 
 
 class VisualOdometry:
-    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to tell."""
+    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to measure."""
 
     def __init__(self, geometry: CameraGeometry) -> None:
         self._geometry = geometry
@@ -115,7 +115,7 @@ class VisualOdometry:
         self._tracked: Array = np.zeros((0, 2))
         self._rng = np.random.default_rng(0)
         self.tilt_rad = 0.0
-        """How much further down than told the camera looks, as learned so far."""
+        """Learned error of the camera's pitch, rad: how much further down it points than its geometry states."""
         self._tilt_variance = TILT_SIGMA_RAD**2
         self.refused = 0
         """Frames on which the floor could not be followed any more."""
@@ -179,7 +179,7 @@ class VisualOdometry:
         return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
 
     def _learn_tilt(self, aligned: Solution) -> None:
-        """What near and far floor agree on best is how the camera really looks down: mounting, attitude and lens."""
+        """Learn the camera's pitch from what near and far floor agree on best: mounting, attitude and lens."""
         gain = self._tilt_variance / (self._tilt_variance + (TILT_CAUTION * aligned.tilt_sigma_rad) ** 2)
         learned = self.tilt_rad + gain * aligned.tilt_rad
         self.tilt_rad = min(max(learned, -MAX_TILT_RAD), MAX_TILT_RAD)

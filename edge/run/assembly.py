@@ -1,4 +1,4 @@
-"""What runs in a run: both loops, power, and what looks on before arming, wired to one robot's inputs."""
+"""The parts of a run: both loops, power and the checks before arming, wired to one robot's inputs."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState, SharedState
 
 IDLE_S = 0.02
-"""Pause between two looks for work, and between two checks of a result that is held back, s."""
+"""Pause between two checks for work, and between two checks of a result that is held back, s."""
 FRAME_POLL_S = 0.002
 """Period at which a generation looks for its newest frame after prefilling the older ones, s."""
 ANCHOR_MARGIN_NS = 1_000_000_000

@@ -1,7 +1,7 @@
 """What the runner knows of the robot: its reports through the drift estimator into the pose history, and its camera.
 
-Reports are taken in the thread that reads them, pictures in the camera's; the control thread only looks at what they
-leave behind.
+Reports are taken in the thread that reads them, pictures in the camera's; the control thread only reads the
+results.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class RobotInputs:
     ) -> None:
         """`commanded`: the velocity in force now; it must not wait.
 
-        `on_death` is told why the thread of the reports or of the pictures has ended, in that thread.
+        `on_death` takes why the thread of the reports or of the pictures has ended, in that thread.
         """
         file = robot.odometry.calibration
         self.estimator = DriftEstimator(_calibration(file))
@@ -107,7 +107,7 @@ class RobotInputs:
 
     @property
     def odometry(self) -> OdometryOutputs | None:
-        """What the drift estimator said last."""
+        """Last outputs of the drift estimator."""
         return self._newest
 
     def offset_covariance(self, anchor_ns: int) -> npt.NDArray[np.float64] | None:

@@ -133,7 +133,7 @@ def _default_bridge() -> Path:
 
 
 def _is_absent(bridge: Path) -> bool:
-    """Whether there is certainly no bridge; one that this user cannot look at counts as present."""
+    """Whether there is certainly no bridge; one that this user cannot see counts as present."""
     try:
         Path(f"{bridge}{OPERATOR_SUFFIX}").lstat()
     except (FileNotFoundError, NotADirectoryError):

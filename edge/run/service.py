@@ -25,7 +25,7 @@ class ServiceReporter:
     Order of use: `starting` before each long step of start-up, `on_wait` while the runner waits for an operator and
     until it drives, `on_tick` from the control thread after every tick, `stopping` once. Ready is said when the control
     thread has been on time for a whole window or the waiting begins, so what systemd counts as started is a runner that
-    drives, or will do so when somebody says it may.
+    drives, or will do so when an operator permits it.
     """
 
     def __init__(
@@ -36,13 +36,13 @@ class ServiceReporter:
         describe: Callable[[], str],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`describe()`: the status line's text, a few words; called in the control thread, so it must not wait."""
+        """`describe()`: the status line's text, short; called in the control thread, so it must not wait."""
         self._notifier = notifier
         self._feeder = WatchdogFeeder(ping_period_ns=notifier.watchdog_period_ns, tick_period_ns=tick_period_ns)
         self._describe = describe
         self._clock = clock
         self._ready = False
-        self._said_ns: int | None = None
+        self._status_ns: int | None = None
         self._fed_ns = 0
         self._waited = ""
 
@@ -77,8 +77,8 @@ class ServiceReporter:
             return
         if ping:
             self._notifier.watchdog()
-        if self._said_ns is None or now_ns - self._said_ns >= STATUS_PERIOD_NS:
-            self._said_ns = now_ns
+        if self._status_ns is None or now_ns - self._status_ns >= STATUS_PERIOD_NS:
+            self._status_ns = now_ns
             self._notifier.status(self._describe())
 
     def stopping(self, text: str) -> None:
@@ -104,5 +104,5 @@ class Descriptor:
 
 
 def operator_lines(prefix: str, descriptor: int = 2) -> LineLog:
-    """Lines to standard error: a pager that is not read or a pipe that broke holds up nobody and ends nothing."""
+    """Lines to standard error: a pager that is not read or a pipe that broke delays and ends nothing."""
     return LineLog(cast(TextIO, Descriptor(descriptor)), prefix, capacity=CAPACITY)

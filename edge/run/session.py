@@ -129,7 +129,7 @@ class RunSession:
             self._print(f"new instruction: {instruction}")
 
     def request_stop(self) -> None:
-        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
+        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread polls it."""
         self._stop_requested = True
 
     def run(self) -> dict[str, Any]:
@@ -289,7 +289,7 @@ class RunSession:
     def _drive(
         self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, channel: InstructionSocket | None
     ) -> Deadline:
-        """Run both threads until the end; this thread only waits and looks on. Returns by when all must have ended."""
+        """Run both threads until the end; this thread only waits and watches. Returns by when all must have ended."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
         epoch_ns = time.monotonic_ns() + self._period_ns // 2
         inputs.camera.align(epoch_ns - round(CAMERA_LEAD * self._period_ns))
@@ -315,7 +315,7 @@ class RunSession:
         ]
         for thread in threads:
             thread.start()
-        self._look_on(loops, inputs, channel)
+        self._watch_run(loops, inputs, channel)
         self._stop.set()
         end = Deadline(END_S)
         reasoning.cancel()
@@ -345,7 +345,7 @@ class RunSession:
 
         return target
 
-    def _look_on(self, loops: Loops, inputs: RobotInputs, channel: InstructionSocket | None) -> None:
+    def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionSocket | None) -> None:
         """Until a thread has ended or a stop is asked for: hand on lines and instructions, watch over reasoning."""
         reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
         while not self._finished.wait(POLL_S):

@@ -94,7 +94,7 @@ class Rig:
             self.reader.hear(state)
 
     def drive(self, seconds: float) -> None:
-        """Ticks, with a report and a glance every 20 ms."""
+        """Ticks, with a report and a poll_urgent_faults every 20 ms."""
         bench = self.bench
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             began_ns = bench.now_ns
@@ -106,7 +106,7 @@ class Rig:
                 bench.now_ns = began_ns + part * REPORT_NS
                 self.report()
                 if not bench.loop.supervision.stop:
-                    bench.loop.glance()
+                    bench.loop.poll_urgent_faults()
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -45,7 +45,7 @@ def until(bench: Bench, name: str, inject: Inject, *, between_ticks: bool = Fals
     for _ in range(400):
         inject(bench)
         if between_ticks:
-            bench.loop.glance()
+            bench.loop.poll_urgent_faults()
             if found(bench, name):
                 return (bench.sink.stamps_ns[-1] - began_ns) / MS + 10
         bench.tick()
