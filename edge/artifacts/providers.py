@@ -20,34 +20,17 @@ from typing import Final
 from edge.core.device import CUDA, OPENVINO, TENSORRT
 
 ALLOWED: Final[Mapping[str, frozenset[str]]] = {
-    TENSORRT: frozenset(
-        {
-            "trt_builder_optimization_level",
-            "trt_context_memory_sharing_enable",
-            "trt_engine_cache_enable",
-            "trt_fp16_enable",
-            "trt_int8_enable",
-            "trt_layer_norm_fp32_fallback",
-            "trt_max_workspace_size",
-            "trt_profile_max_shapes",
-            "trt_profile_min_shapes",
-            "trt_profile_opt_shapes",
-            "trt_timing_cache_enable",
-        }
-    ),
-    CUDA: frozenset(
-        {
-            "arena_extend_strategy",
-            "cudnn_conv_algo_search",
-            "cudnn_conv_use_max_workspace",
-            "do_copy_in_default_stream",
-            "gpu_mem_limit",
-            "prefer_nhwc",
-            "use_tf32",
-        }
-    ),
+    TENSORRT: frozenset({
+        "trt_builder_optimization_level", "trt_context_memory_sharing_enable", "trt_engine_cache_enable",
+        "trt_fp16_enable", "trt_int8_enable", "trt_layer_norm_fp32_fallback", "trt_max_workspace_size",
+        "trt_profile_max_shapes", "trt_profile_min_shapes", "trt_profile_opt_shapes", "trt_timing_cache_enable",
+    }),
+    CUDA: frozenset({
+        "arena_extend_strategy", "cudnn_conv_algo_search", "cudnn_conv_use_max_workspace",
+        "do_copy_in_default_stream", "gpu_mem_limit", "prefer_nhwc", "use_tf32",
+    }),
     OPENVINO: frozenset({"device_type", "num_of_threads", "num_streams", "precision"}),
-}
+}  # fmt: skip
 """Those of the shipped targets, and others of their kind for targets of one's own."""
 _VALUE: Final = re.compile(r"[A-Za-z0-9_.:,+-]{0,4096}", re.ASCII)
 

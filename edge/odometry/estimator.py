@@ -273,13 +273,9 @@ class DriftEstimator:
         if seconds <= 0:
             return np.zeros((3, 3))
         shares = [
-            (
-                increment.dx_m**2 / increment.dt_s,
-                increment.dy_m**2 / increment.dt_s,
-                increment.turn_rad**2 / increment.dt_s,
-            )
-            for increment in inside
-            if increment.dt_s > 0
+            (part.dx_m**2 / part.dt_s, part.dy_m**2 / part.dt_s, part.turn_rad**2 / part.dt_s)
+            for part in inside
+            if part.dt_s > 0
         ]
         mean_squares = np.sum(shares, axis=0) / seconds
         return np.diag(2 * self._stamp_sigma_s**2 * mean_squares)

@@ -80,7 +80,10 @@ def fit_corners(
     for iteration in range(8):
         # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
         if iteration in (0, 2):
-            at, jacobian = _pixels_of(projector, before, attitude, q)
+            at = _project(projector, before, attitude, q)
+            steps = np.diag(_STEPS)[:6, :6]
+            moved = [_project(projector, before, attitude, q + step) - at for step in steps]
+            jacobian = np.stack([change / step.sum() for change, step in zip(moved, steps, strict=True)], axis=-1)
         else:
             at = _project(projector, before, attitude, q)
         r = at - seen
@@ -175,13 +178,6 @@ def align_pictures(
             TILT_SIGMA_RAD * math.sqrt((1 - information) / information),
         )
     return Solution(q, covariance[:3, :3], inliers, inliers / len(weight), tilt_rad, tilt_sigma_rad)
-
-
-def _pixels_of(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> tuple[Array, Array]:
-    """Where floor points of the earlier frame are seen in the later one, [n, 2], and derivatives [n, 2, 6]."""
-    at = _project(projector, points, attitude, q)
-    steps = [(_project(projector, points, attitude, q + step) - at) / step.sum() for step in np.diag(_STEPS)[:6, :6]]
-    return at, np.stack(steps, axis=-1)
 
 
 def _project(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> Array:

@@ -12,9 +12,7 @@ from edge.core.device import (
     TENSORRT,
     DeviceError,
     check_power_mode,
-    current_power_mode,
     l4t_release,
-    power_modes,
     read_device,
 )
 
@@ -70,15 +68,11 @@ def test_what_is_not_a_release_is_none(text: str) -> None:
     assert l4t_release(text) is None
 
 
-def test_power_modes_are_found_by_name() -> None:
-    assert power_modes(CONF) == {"MAXN_SUPER": 0, "25W": 3, "40W": 4}
-    assert current_power_mode("NVPM VERB: Current\nNV Power Mode: 25W\n3\n") == "25W"
-    assert current_power_mode("") is None
-
-
 def test_only_the_mode_that_the_plan_was_made_for_is_accepted() -> None:
     query = "NV Power Mode: 25W\n3\n"
     check_power_mode("25W", conf=CONF, query=query)
+    with pytest.raises(DeviceError, match="power mode is not reported, the plan was made for 25W: sudo nvpmodel -m 3"):
+        check_power_mode("25W", conf=CONF, query="")
     with pytest.raises(DeviceError, match="'20W' is not on this board; it has MAXN_SUPER, 25W, 40W"):
         check_power_mode("20W", conf=CONF, query=query)
     with pytest.raises(DeviceError, match="power mode is 25W, the plan was made for 40W: sudo nvpmodel -m 4"):
