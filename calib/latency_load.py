@@ -120,7 +120,7 @@ def measure(
     """
     # Here: they load every robot's protocol, which no other job of `edge-calib` needs.
     from edge.run.assembly import HISTORY_MARGIN_S
-    from edge.runner import SWITCH_INTERVAL_S
+    from edge.run.command import SWITCH_INTERVAL_S
 
     runtime = artifacts.runtime
     schedule = schedule_for(artifacts)

@@ -31,7 +31,7 @@ from edge.inference.engines import (
     with_engines,
 )
 from edge.inference.graph import GraphError
-from edge.runner import main as run
+from edge.run.command import main as run
 from export.target.file import load_target
 from tests.support.artifact_directory import edit_manifest
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge import runner
 from edge.core.geometry import SE2
 from edge.motion.recovery import ARRIVED
 from edge.reasoning.decoding_rules import FREE, DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory
+from edge.run import command as runner
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, RecoverySwitch, Switches, SwitchOptions
 from firmware_bridge.core.config import ConfigError
