@@ -142,13 +142,14 @@ class Bench:
         decoding: Decoding = Decoding.CONSTRAINED,
         late_anchor: bool = True,
         give_way: object = None,
+        stop: threading.Event | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.language = FakeLanguage()
         self.policy = FakePolicy()
         self.ring = TokenRing(256)
         self.slot = SemanticSlot()
-        self.stop = threading.Event()
+        self.stop = stop or threading.Event()
         self.budget = ReasoningBudget()
         self.said: list[str] = []
         self.records: list[dict[str, object]] = []
