@@ -72,7 +72,7 @@ class StackOptions:
 class Stack:
     """Running stack: a context manager that ends exactly the processes that it started, the runner first."""
 
-    def __init__(self, options: StackOptions, commands: Mapping[str, Sequence[str]] = COMMANDS) -> None:
+    def __init__(self, options: StackOptions) -> None:
         self.options = options
         self.runs = 0
         """Number of started runners; also the number in the newest runner's file names."""
@@ -80,7 +80,6 @@ class Stack:
         self.bridge: Child | None = None
         self.runner: Child | None = None
         self.faults: FaultClient | None = None
-        self._commands = commands
         self._children = Children(options.folder, grace_s=GRACE_S)
         self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
         self._robot_file = _robot_file(options)
@@ -125,7 +124,7 @@ class Stack:
         options = self.options
         x_m, y_m, theta_rad = options.start
         command = [
-            *self._commands["edge-hil"],
+            *COMMANDS["edge-hil"],
             *("--robot", "go2", "--protocol", "unitree", "--interface", "lo", "--scene", options.scene),
             # One argument, because the value may begin with a minus.
             f"--start={x_m!r},{y_m!r},{math.degrees(theta_rad)!r}",
@@ -152,7 +151,7 @@ class Stack:
         socket = self._sockets / "bridge"
         socket.unlink(missing_ok=True)  # left by a killed bridge
         name = f"edge-bridge-{self.runs + 1}"
-        command = [*self._commands["edge-bridge"], *self._link(), "--json", str(self.result(name))]
+        command = [*COMMANDS["edge-bridge"], *self._link(), "--json", str(self.result(name))]
         bridge = self.bridge = self._children.start(name, command, fifo_priority=BRIDGE_PRIORITY)
         self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
 
@@ -162,7 +161,7 @@ class Stack:
         self.runs += 1
         name = f"edge-run-{self.runs}"
         command = [
-            *self._commands["edge-run"],
+            *COMMANDS["edge-run"],
             *self._link(),
             *("--artifacts", str(options.artifacts), "--instruction", instruction, "--mode", options.mode),
             *("--release-delay", options.release_delay),

@@ -14,9 +14,9 @@ from reporting import page
 from reporting.plot_style import delay_histogram
 from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak import figures
+from sim_hil.soak.analysis import Moment, read_moments
 from sim_hil.soak.run import SoakFolder
-from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED
-from sim_hil.soak.verdict.moments import Moment, read_moments
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED
 
 REPORT: Final = "report.html"
 SHOWN_MAPS: Final = 12

@@ -21,13 +21,12 @@ import pytest
 from edge.run.say import say
 from sim_hil.realtime.truth import read_lines
 from sim_hil.scene.scene import Vec3
-from sim_hil.soak import cli
-from sim_hil.soak.drive import leg
-from sim_hil.soak.drive.journey import Journey, SoakTask
-from sim_hil.soak.drive.leg import EVENTS, SAMPLES, Leg
+from sim_hil.soak import cli, leg
+from sim_hil.soak.analysis import ANALYSIS, TRACE, faults_of, read_life, read_trace
+from sim_hil.soak.leg import EVENTS, SAMPLES, Leg
 from sim_hil.soak.run import SoakFolder
-from sim_hil.soak.verdict.analysis import ANALYSIS, TRACE, faults_of, read_life, read_trace
-from sim_hil.soak.verdict.measures import measures
+from sim_hil.soak.tasks import Journey, SoakTask
+from sim_hil.soak.verdict import measures
 from tests.support.processes import need_room_to_record, wait_for
 
 pytestmark = pytest.mark.process

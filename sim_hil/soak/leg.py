@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from math import hypot
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final
+
+import psutil
 
 from edge.run.say import SayError, say
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.stack import COMMANDS, Stack, StackOptions
+from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruthTail
-from sim_hil.soak.drive.injector import Injector
-from sim_hil.soak.drive.journey import Journey, SoakTask
-from sim_hil.soak.drive.json_lines import LineFile
-from sim_hil.soak.drive.processes import ProcessSampler
-from sim_hil.soak.drive.schedule import FaultMenu, FaultSchedule
-from sim_hil.soak.drive.task_run import TaskRun
+from sim_hil.soak.faults import FaultMenu, FaultSchedule, Injector
+from sim_hil.soak.tasks import Journey, SoakTask, TaskRun
 
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
@@ -67,14 +67,13 @@ class Leg:
         *,
         stopped: Callable[[], bool],
         show_status: Callable[[str], None],
-        commands: Mapping[str, Sequence[str]] = COMMANDS,
     ) -> None:
         self._options = options
         self._journey = journey
         self._menu = menu
         self._stopped = stopped
         self._show_status = show_status
-        self._stack = Stack(options.stack, commands)
+        self._stack = Stack(options.stack)
         self._truth = TruthTail(self._stack.trace)
         self._sampler = ProcessSampler()
         self._injector: Injector | None = None
@@ -303,3 +302,63 @@ def _end_of_run(result: Path) -> tuple[str, set[str]]:
     except (OSError, ValueError, KeyError):
         return "", set()
     return (str(faults[0]) if faults else ""), raised
+
+
+class LineFile:
+    """Writer that appends JSON objects to a file. Raises OSError."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", encoding="utf-8")
+
+    def add(self, content: dict[str, Any]) -> None:
+        """Append one object."""
+        self._file.write(json.dumps(content) + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> LineFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+PSS_EVERY: Final = 10
+"""Samples between two readings of PSS, which takes milliseconds because the kernel sums it page by page."""
+
+
+class ProcessSampler:
+    """Sampler of processes by name; ended processes are left out."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, psutil.Process] = {}
+        self._count = 0
+
+    def sample(self, pids: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+        """Return by name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, sometimes pss_bytes."""
+        self._count += 1
+        found: dict[str, dict[str, Any]] = {}
+        for name, pid in pids.items():
+            with suppress(psutil.Error):
+                found[name] = self._one(pid)
+        self._known = {pid: process for pid, process in self._known.items() if pid in pids.values()}
+        return found
+
+    def _one(self, pid: int) -> dict[str, Any]:
+        process = self._known.get(pid)
+        if process is None:
+            process = self._known[pid] = psutil.Process(pid)
+            process.cpu_percent()  # the first call only sets the reference
+        with process.oneshot():
+            values: dict[str, Any] = {
+                "pid": pid,
+                "cpu_percent": process.cpu_percent(),
+                "rss_bytes": process.memory_info().rss,
+                "fds": process.num_fds(),
+                "threads": process.num_threads(),
+            }
+        if self._count % PSS_EVERY == 1:
+            with suppress(psutil.Error):
+                values["pss_bytes"] = process.memory_full_info().pss
+        return values
