@@ -17,7 +17,7 @@ from types import TracebackType
 import firmware_bridge
 from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
-from sim_hil.protocols.fault_client import FaultClient
+from sim_hil.protocols.fault_socket import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
 ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"

@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from edge.safety.faults.table import FAULTS
-from sim_hil.protocols.fault_client import FaultError
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.protocols.unitree.fault_commands import KINDS, FaultCommandError, Value, parse
 from sim_hil.realtime.stack import Stack
 from sim_hil.scene.table import Table

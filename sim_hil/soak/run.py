@@ -14,7 +14,7 @@ import numpy as np
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
 from edge.flightlog.recorder import space_refusal
-from sim_hil.protocols.fault_client import FaultError
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import read_lines

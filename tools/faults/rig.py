@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_bridge.core.config import RobotConfig, load_robot_config
-from sim_hil.protocols.fault_client import FaultClient, FaultError
+from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError, tail
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
 from tools.demo import INSTRUCTION

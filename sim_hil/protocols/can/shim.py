@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
 import numpy as np
 
-from sim_hil.protocols.can.e2e import Frame
+from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
 
 # A frame of 8 bytes with its stuff bits, about 130 bits, on a bus of 500 kbit/s.
@@ -50,21 +50,6 @@ class FaultPlan:
                 raise ValueError(f"CAN fault {name}: expected 0..{high:g}, found {value}")
         if 0.0 < self.bus_off_every_s <= self.bus_off_s:
             raise ValueError(f"CAN fault bus_off_every_s: expected more than bus_off_s, found {self.bus_off_every_s}")
-
-    @staticmethod
-    def parse(text: str) -> FaultPlan:
-        """Parse `drop=0.1,corrupt=0.05`. Raises ValueError with one line."""
-        known = {each.name for each in fields(FaultPlan)}
-        values: dict[str, float] = {}
-        for part in text.split(","):
-            name, equals, number = part.partition("=")
-            if not equals or name not in known:
-                raise ValueError(f"CAN faults: expected NAME=NUMBER of {', '.join(sorted(known))}, found {part!r}")
-            try:
-                values[name] = float(number)
-            except ValueError:
-                raise ValueError(f"CAN faults: {name}: expected a number, found {number!r}") from None
-        return FaultPlan(**values)
 
 
 class FaultShim:

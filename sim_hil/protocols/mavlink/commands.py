@@ -10,9 +10,8 @@ from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import common
 
-from sim_hil.protocols.mavlink.modes import find_mode
 from sim_hil.protocols.mavlink.telemetry import STREAMS, Schedule, Snapshot, autopilot_version
-from sim_hil.protocols.mavlink.vehicle import ACCEPTED, DENIED, Station, Vehicle
+from sim_hil.protocols.mavlink.vehicle import ACCEPTED, DENIED, Station, Vehicle, find_mode
 from sim_hil.protocols.mavlink.wire import Message
 
 FORCE: Final = 21196  # param2 of an arm or disarm command that skips checks (mavlink.io, MAV_CMD 400)

@@ -6,6 +6,7 @@ All messages go to all listeners, as on a shared radio; an acknowledgement conta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import atan2, cos, exp, hypot, sin, tan
 from types import MappingProxyType
 from typing import Final
 
@@ -13,11 +14,9 @@ from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink import commands, parameters, telemetry
 from sim_hil.protocols.mavlink.commands import Command
-from sim_hil.protocols.mavlink.estimator import TiltFilter
-from sim_hil.protocols.mavlink.modes import custom_mode_of
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import SetpointError, Sticks, manual_sticks, override_sticks, read_setpoint
-from sim_hil.protocols.mavlink.vehicle import Base, Health, Station, Vehicle
+from sim_hil.protocols.mavlink.vehicle import Base, Health, Station, Vehicle, custom_mode_of
 from sim_hil.protocols.mavlink.wire import Counts, Message
 from sim_hil.robots.carter.sensors import Sensors
 
@@ -270,3 +269,31 @@ HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
         common.MAVLINK_MSG_ID_PING: MavlinkNode._ping,
     }
 )
+
+
+_TIME_CONSTANT_S: Final = 1.5  # our choice: longer than the base's acceleration phases
+
+
+class TiltFilter:
+    """Complementary filter in the base's axes: x forward, y left, z up."""
+
+    def __init__(self) -> None:
+        self.roll_rad = self.pitch_rad = 0.0
+        self._last_s: float | None = None
+
+    def step(self, time_s: float, gyro_radps: tuple[float, ...], accel_mps2: tuple[float, ...]) -> None:
+        """Add a sensor reading; times must not decrease."""
+        ax, ay, az = accel_mps2
+        roll, pitch = atan2(ay, az), atan2(-ax, hypot(ay, az))
+        if self._last_s is None:
+            self.roll_rad, self.pitch_rad = roll, pitch
+        else:
+            elapsed_s = time_s - self._last_s
+            share = 1 - exp(-elapsed_s / _TIME_CONSTANT_S)
+            wx, wy, wz = gyro_radps
+            turn = wy * sin(self.roll_rad) + wz * cos(self.roll_rad)
+            self.roll_rad += elapsed_s * (wx + tan(max(-1.4, min(1.4, self.pitch_rad))) * turn)  # a base on its side
+            self.pitch_rad += elapsed_s * (wy * cos(self.roll_rad) - wz * sin(self.roll_rad))
+            self.roll_rad += share * (roll - self.roll_rad)
+            self.pitch_rad += share * (pitch - self.pitch_rad)
+        self._last_s = time_s

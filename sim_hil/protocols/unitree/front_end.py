@@ -16,19 +16,15 @@ from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.protocols.unitree.camera_process import CameraProcess
-from sim_hil.protocols.unitree.drifting import DriftingOdometry
-from sim_hil.protocols.unitree.remote import Remote
+from sim_hil.protocols.unitree.odometry import DriftingOdometry, OdometryFrame
 from sim_hil.protocols.unitree.services.avoidance import OBSTACLES_AVOID_VERSION, ObstaclesAvoid, Pilot, RangeFinder
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
-from sim_hil.protocols.unitree.services.leases import Lease
 from sim_hil.protocols.unitree.services.low_level import LOW_COMMAND_TOPIC
-from sim_hil.protocols.unitree.services.service import Answer, LeaseServer, Received, ServiceServer
-from sim_hil.protocols.unitree.services.sport import CommandLog, api_name
-from sim_hil.protocols.unitree.services.sport_service import UNLEASED, SportService
-from sim_hil.protocols.unitree.services.switching import MotionSwitcher, RobotState
-from sim_hil.protocols.unitree.services.vui import VUI_SERVICE, Vui
-from sim_hil.protocols.unitree.state import OdometryFrame, StatePublishers
+from sim_hil.protocols.unitree.services.service import Answer, Lease, LeaseServer, Received, ServiceServer
+from sim_hil.protocols.unitree.services.sport import UNLEASED, RequestLog, SportService, api_name
+from sim_hil.protocols.unitree.services.switching import VUI_SERVICE, MotionSwitcher, RobotState, Vui
+from sim_hil.protocols.unitree.state import Remote, StatePublishers
 from sim_hil.robots.go2.body import Go2, RobotTruth
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.simulation.physics import Simulation
@@ -80,7 +76,7 @@ class UnitreeFrontEnd:
             remote=remote,
             faults=None if self._faults is None else self._faults.states,
         )
-        self._log = CommandLog()
+        self._log = RequestLog()
         self._low_level_active = False
         self._video_frames = 0
         self._video_malformed = 0

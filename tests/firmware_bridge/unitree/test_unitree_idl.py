@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from firmware_bridge.unitree.messages import idl, idl_low
 from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc32_mpeg2, crc_of_words, low_state_crc
 from firmware_bridge.unitree.rpc import make_request
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.odometry import OdometryFrame
+from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from tests.support.robot.fake_go2 import standing
 
 TYPES = [

@@ -13,9 +13,8 @@ from typing import Final
 
 from firmware_bridge.unitree.messages import ids
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
-from sim_hil.protocols.unitree.services.parameters import parse_flag, parse_numbers, parse_text
-from sim_hil.protocols.unitree.services.service import Answer
-from sim_hil.protocols.unitree.services.sport_service import Mover
+from sim_hil.protocols.unitree.services.service import Answer, parse_flag, parse_numbers, parse_text
+from sim_hil.protocols.unitree.services.sport import Mover
 
 ERROR_SWITCH_PARAMETER: Final = 7001
 ERROR_SWITCH_BUSY: Final = 7002
@@ -129,3 +128,29 @@ class RobotState:
         elif not self._switcher.engaged and self._switcher.select(MODES[0]) != ids.OK:
             return ids.OK, json.dumps({"name": name, "status": 0})
         return ids.OK, json.dumps({"name": name, "status": int(self._switcher.engaged)})
+
+
+VUI_SERVICE: Final = "vui"
+# Set request -> key and highest value; the request with the next id reads the value back.
+_SETTINGS: Final = {1001: ("enable", 1), 1003: ("volume", 10), 1005: ("brightness", 10)}
+
+
+class Vui:
+    """Service that stores settings."""
+
+    def __init__(self) -> None:
+        self._values = dict(_SETTINGS.values())
+
+    def handle(self, api_id: int, parameter: str) -> Answer:
+        """Handle one request."""
+        if api_id in _SETTINGS:
+            key, top = _SETTINGS[api_id]
+            value = parse_numbers(parameter, key)
+            if value is None or value[0] not in range(top + 1):
+                return ids.ERROR_PARAMETER, ""
+            self._values[key] = int(value[0])
+            return ids.OK, ""
+        if api_id - 1 in _SETTINGS:
+            key, _ = _SETTINGS[api_id - 1]
+            return ids.OK, json.dumps({key: self._values[key]})
+        return ids.ERROR_NOT_IMPLEMENTED, ""

@@ -16,9 +16,8 @@ from can.interfaces.udp_multicast.utils import pack_message
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, SerialFrames, open_bus
-from sim_hil.protocols.can.e2e import Frame
-from sim_hil.protocols.can.multicast import unpacked
+from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, SerialFrames, open_bus, unpacked
+from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.pty_line import PtyLine
 
 FRAME = Frame(0x123, b"\x01\xaa\xbb\x04")
@@ -173,7 +172,7 @@ import socket, time
 import can
 from can.interfaces.udp_multicast.utils import pack_message
 from sim_hil.protocols.can.buses import BusAddress, BusLink, open_bus
-from sim_hil.protocols.can.e2e import Frame
+from sim_hil.protocols.can.frames import Frame
 GROUP = "239.74.163.2"
 a, b = (BusLink(open_bus(BusAddress("udp_multicast", GROUP))) for _ in range(2))
 def heard(wanted, send):

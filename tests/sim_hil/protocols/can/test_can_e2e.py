@@ -9,8 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.e2e import COUNTER_PERIOD, MAX_AHEAD, Checker, Frame, Verdict, crc8_j1850, frame_crc, protect
-from sim_hil.protocols.can.frames import Decoder, Encoder
+from sim_hil.protocols.can.frames import (
+    COUNTER_PERIOD,
+    MAX_AHEAD,
+    Checker,
+    Decoder,
+    Encoder,
+    Frame,
+    Verdict,
+    crc8_j1850,
+    frame_crc,
+    protect,
+)
 
 MESSAGES = frames.database().messages
 names = st.sampled_from([message.name for message in MESSAGES])

@@ -18,7 +18,7 @@ import pytest
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusAddress, BusLink, open_bus
 from sim_hil.protocols.can.client import CanClient
-from sim_hil.protocols.can.e2e import Frame
+from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.front_end import LinkOptions, open_front_end
 from sim_hil.protocols.front_end import FrontEndError
 from sim_hil.robots.carter.body import Carter

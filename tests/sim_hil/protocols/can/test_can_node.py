@@ -8,8 +8,7 @@ import pytest
 
 from edge.core.geometry import SE2
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.e2e import Frame, Verdict
-from sim_hil.protocols.can.frames import Decoder, Encoder, Received
+from sim_hil.protocols.can.frames import Decoder, Encoder, Frame, Received, Verdict
 from sim_hil.protocols.can.node import BUS_OFF_RECOVERY_S, ERROR_BUS_OFF, ERROR_RESTARTED, CanNode
 from sim_hil.robots.carter.sensors import Sensors
 

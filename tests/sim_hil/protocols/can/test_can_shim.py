@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_hil.protocols.can.e2e import Frame
-from sim_hil.protocols.can.frames import Decoder, Encoder
+from sim_hil.protocols.can.frames import Decoder, Encoder, Frame
 from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
 from sim_hil.protocols.can.shim import BABBLER_ID, FRAME_S, FaultPlan, FaultShim
+from sim_hil.protocols.fault_socket import parse_plan
 
 COUNT = 2000
 TICK_S = 0.002
@@ -124,8 +124,10 @@ def test_a_babbler_that_leaves_gaps_delays_the_others() -> None:
 )
 def test_a_plan_that_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected"):
-        FaultPlan.parse(text)
+        parse_plan(FaultPlan, [text])
 
 
 def test_a_plan_is_read_from_a_line() -> None:
-    assert FaultPlan.parse("drop=0.1,delay=0.2,delay_s=0.03") == FaultPlan(drop=0.1, delay=0.2, delay_s=0.03)
+    assert parse_plan(FaultPlan, ["drop=0.1", "delay=0.2", "delay_s=0.03"]) == FaultPlan(
+        drop=0.1, delay=0.2, delay_s=0.03
+    )

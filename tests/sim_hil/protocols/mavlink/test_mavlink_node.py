@@ -12,10 +12,9 @@ from pymavlink.dialects.v20 import common
 
 from edge.core.geometry import SE2
 from sim_hil.protocols.mavlink import telemetry
-from sim_hil.protocols.mavlink.modes import Mode
 from sim_hil.protocols.mavlink.node import MavlinkNode
 from sim_hil.protocols.mavlink.parameters import NAMES
-from sim_hil.protocols.mavlink.vehicle import Station
+from sim_hil.protocols.mavlink.vehicle import Mode, Station
 from sim_hil.protocols.mavlink.wire import Message, Reader, Writer
 from sim_hil.robots.carter.sensors import Sensors
 from tests.sim_hil.protocols.mavlink.test_mavlink_vehicle import FakeBase

@@ -6,10 +6,9 @@ from math import radians
 
 import pytest
 
-from sim_hil.protocols.mavlink.modes import Mode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
-from sim_hil.protocols.mavlink.vehicle import ACCEPTED, FAILED, REJECTED, Health, Station, Vehicle
+from sim_hil.protocols.mavlink.vehicle import ACCEPTED, FAILED, REJECTED, Health, Mode, Station, Vehicle
 
 FIRST, SECOND = Station(255, ("127.0.0.1", 1)), Station(254, ("127.0.0.1", 2))
 SAME_NUMBER = Station(255, ("127.0.0.1", 3))

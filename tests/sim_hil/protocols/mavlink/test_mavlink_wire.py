@@ -12,8 +12,7 @@ from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink.parameters import NAMES, TABLE, Parameters, decode_value
 from sim_hil.protocols.mavlink.setpoints import SetpointError, override_sticks, read_setpoint
-from sim_hil.protocols.mavlink.signing import TICKS_PER_S, Verifier, signature
-from sim_hil.protocols.mavlink.wire import Reader, Writer
+from sim_hil.protocols.mavlink.wire import TICKS_PER_S, Reader, Verifier, Writer, signature
 
 KEY = bytes(range(32))
 NOW = 10**13

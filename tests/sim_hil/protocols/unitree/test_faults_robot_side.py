@@ -15,11 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
-from sim_hil.protocols.unitree.drifting import DriftingOdometry
 from sim_hil.protocols.unitree.fault_commands import KINDS, FaultCommand, FaultCommandError, parse
 from sim_hil.protocols.unitree.fault_injector import FaultInjector
-from sim_hil.protocols.unitree.remote import Remote
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.odometry import DriftingOdometry, OdometryFrame
+from sim_hil.protocols.unitree.state import LowStateMessage, Remote, sport_mode_state
 from sim_hil.protocols.unitree.state_faults import StateFaults
 from sim_hil.robots.battery import Battery, load_w
 from sim_hil.robots.odometry_noise import LEVELS, NoiseLevel, OdometryNoise

@@ -13,7 +13,7 @@ import pytest
 from firmware_bridge.unitree.messages import ids
 from sim_hil.protocols.unitree.camera_faults import FaultyVideoHub
 from sim_hil.protocols.unitree.fault_commands import CLEAR, FaultCommand, parse
-from sim_hil.protocols.unitree.request_faults import SportFaults
+from sim_hil.protocols.unitree.fault_injector import SportFaults
 from sim_hil.protocols.unitree.services.service import Answer, Received
 from sim_hil.protocols.unitree.video_service import encode_jpeg
 

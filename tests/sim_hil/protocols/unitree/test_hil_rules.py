@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import move_parameter
 from sim_hil.protocols.snapshot import SnapshotReader, SnapshotWriter, TornSnapshotError
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.service import Received
-from sim_hil.protocols.unitree.services.sport import CommandLog, handle_sport, parse_move
-from sim_hil.protocols.unitree.state import OdometryFrame
+from sim_hil.protocols.unitree.services.sport import RequestLog, handle_sport, parse_move
 from sim_hil.robots.go2.sport import SportAction
 
 
@@ -74,10 +74,10 @@ class TestSportRules:
         assert parse_move(move_parameter(vx, vy, wz)) == (vx, vy, wz)
 
 
-class TestCommandLog:
+class TestRequestLog:
     @staticmethod
     def after(*requests: tuple[int, str]) -> dict[str, object]:
-        log = CommandLog()
+        log = RequestLog()
         for api_id, parameter in requests:
             log.note(Received(0, ids.SPORT_SERVICE, api_id, parameter, 0, noreply=True))
         return log.summary()

@@ -11,11 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.protocols.unitree.services.leases import APPLY, RENEW, Lease
-from sim_hil.protocols.unitree.services.parameters import parse_flag, parse_numbers, parse_table, parse_text
 from sim_hil.protocols.unitree.services.postures import SHOWS, STANDING, body_over_feet
-from sim_hil.protocols.unitree.services.switching import BUSY_S
-from sim_hil.protocols.unitree.services.vui import Vui
+from sim_hil.protocols.unitree.services.service import (
+    APPLY,
+    RENEW,
+    Lease,
+    parse_flag,
+    parse_numbers,
+    parse_table,
+    parse_text,
+)
+from sim_hil.protocols.unitree.services.switching import BUSY_S, Vui
 from sim_hil.robots.go2.sport import SportAction
 from tests.support.robot.go2_services import Desk, Stage
 

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from firmware_bridge.unitree.messages.crc import low_state_crc
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame
+from sim_hil.protocols.unitree.odometry import OdometryFrame
+from sim_hil.protocols.unitree.state import LowStateMessage
 from sim_hil.robots.battery import BatteryReading
 from tests.support.robot.fake_go2 import standing
 
