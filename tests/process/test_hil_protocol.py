@@ -23,11 +23,7 @@ from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
 from sim_hil.hil.command import main
-from sim_hil.hil.trace import TraceWriter
-from sim_hil.protocols.snapshot import TornSnapshotError
 from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
-from sim_hil.protocols.unitree.services.service import Received
-from sim_hil.protocols.unitree.video_service import ERROR_NO_IMAGE, VideoHub
 from tests.support.processes import (
     GO2_SIM,
     REPOSITORY,
@@ -40,47 +36,6 @@ from tests.support.processes import (
 )
 
 pytestmark = pytest.mark.process
-
-
-class FakeServer:
-    """A service end with these requests waiting; notes its replies."""
-
-    def __init__(self, *api_ids: int, malformed: int = 0) -> None:
-        self.malformed = malformed
-        self.replies: list[tuple[int, int, bytes]] = []
-        self._waiting = [
-            Received(0, ids.VIDEO_SERVICE, api_id, "", n, noreply=False) for n, api_id in enumerate(api_ids)
-        ]
-
-    def requests(self) -> Iterator[Received]:
-        while self._waiting:
-            yield self._waiting.pop(0)
-
-    def reply(self, request: Received, code: int, data: str = "", binary: bytes = b"") -> None:
-        self.replies.append((request.request_id, code, binary))
-
-
-class TestVideoHub:
-    def test_a_pose_that_cannot_be_read_costs_these_requests_their_picture_and_nothing_else(self) -> None:
-        def render() -> bytes:
-            raise TornSnapshotError("no consistent snapshot")
-
-        server = FakeServer(ids.GET_IMAGE_SAMPLE, ids.GET_IMAGE_SAMPLE)
-        VideoHub(server, render, lambda _event: None).serve()
-        assert server.replies == [(0, ERROR_NO_IMAGE, b""), (1, ERROR_NO_IMAGE, b"")]
-
-    def test_one_render_answers_all_who_wait(self) -> None:
-        renders = []
-        server = FakeServer(ids.GET_IMAGE_SAMPLE, ids.GET_IMAGE_SAMPLE)
-        VideoHub(server, lambda: renders.append(1) or b"jpeg", lambda _event: None).serve()
-        assert server.replies == [(0, 0, b"jpeg"), (1, 0, b"jpeg")] and len(renders) == 1
-
-    def test_the_parent_is_told_once_of_each_malformed_request(self) -> None:
-        told: list[dict[str, object]] = []
-        hub = VideoHub(FakeServer(malformed=2), lambda: b"", told.append)
-        hub.serve()
-        hub.serve()
-        assert told == [{"event": "malformed", "count": 2}]
 
 
 class TestCameraProcess:
@@ -116,16 +71,6 @@ class TestCameraProcess:
         with pytest.raises(CameraProcessError, match="expected an event"):
             camera.wait_ready([])
         camera.close()
-
-
-def test_the_trace_ends_with_the_summary_and_keeps_the_order(tmp_path: Path) -> None:
-    trace = TraceWriter(tmp_path / "t.jsonl")
-    for index in range(100):
-        trace.put(index, "pose", x=float(index))
-    trace.close(100, fell=False)
-    lines = read_trace(tmp_path / "t.jsonl")
-    assert [line["t_ns"] for line in lines] == list(range(101))
-    assert lines[-1] == {"t_ns": 100, "kind": "end", "fell": False, "trace_dropped": 0}
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,7 @@ import math
 import socket
 import stat
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,7 +19,6 @@ from sim_hil.protocols.can.client import CanClient
 from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.front_end import LinkOptions, open_front_end
 from sim_hil.protocols.front_end import FrontEndError
-from sim_hil.robots.carter.body import Carter
 from sim_hil.simulation.physics import Simulation
 from tests.support.robot.front_end_contract import FrontEndContract, Report, Rig, options
 
@@ -139,56 +136,9 @@ def _can(rig: Rig) -> CanClient:
     return client.can
 
 
-def _link(rig: Rig) -> BusLink:
-    client = rig.client
-    assert isinstance(client, ContractClient)
-    return client.link
-
-
 def _counts(rig: Rig) -> dict[str, int]:
     counts: dict[str, int] = rig.front_end.summary()["wire"]["can"]  # type: ignore[index, assignment]
     return counts
-
-
-def test_every_message_of_the_base_comes_at_the_rate_that_the_file_says(virtual: Rig) -> None:
-    seen: Counter[int] = Counter()
-
-    def count() -> None:
-        seen.update(frame.identifier for _, frame in _link(virtual).receive())
-
-    virtual.client.poll = count  # type: ignore[method-assign]
-    virtual.run(0.1)
-    virtual.until(lambda: len(seen) == len(frames.sent_by("Base")), 2.0, "something of everything")
-    before, then = dict(seen), virtual.steps
-    virtual.run(2.0)
-    virtual.until(lambda: virtual.steps - then > 1100, 5.0, "the wire to be empty")
-    passed_s = (virtual.steps - then) * virtual.simulation.dt_s
-    periods = frames.periods_s("Base")
-    for message in frames.sent_by("Base"):
-        expected = passed_s / periods[message.name]
-        assert seen[message.frame_id] - before[message.frame_id] == pytest.approx(expected, rel=0.05, abs=2)
-
-
-def test_an_emergency_stop_is_kept_until_it_is_reset_and_the_base_is_armed_again(virtual: Rig) -> None:
-    virtual.make_ready()
-    virtual.tell(_can(virtual).stop)
-    virtual.until(lambda: _can(virtual).state == frames.STATE_ESTOP, 2.0, "the emergency stop")
-    virtual.tell(_can(virtual).arm)
-    virtual.run(0.3)
-    assert _can(virtual).state == frames.STATE_ESTOP
-    virtual.tell(_can(virtual).reset)
-    virtual.until(lambda: _can(virtual).state == frames.STATE_IDLE, 2.0, "idle")
-    virtual.make_ready()
-
-
-def test_a_controller_that_falls_silent_disarms_the_base(virtual: Rig) -> None:
-    virtual.make_ready()
-    virtual.client.poll = lambda: _can(virtual).poll()  # type: ignore[method-assign]
-    virtual.run(0.4)
-    robot = virtual.simulation.robot
-    assert isinstance(robot, Carter) and robot.ready
-    virtual.run(0.3)
-    assert not robot.ready
 
 
 def test_a_link_with_faults_counts_them_and_still_drives(tmp_path: Path) -> None:
@@ -353,13 +303,3 @@ def test_the_line_of_another_run_is_not_taken_and_a_dead_one_is_replaced(tmp_pat
     path.symlink_to("/dev/pts/no-such-terminal")
     rig = open_rig(f"serial:{path}", BusAddress("serial", str(path)))
     rig.close()
-
-
-def test_the_go2_does_not_speak_can() -> None:
-    asked = replace(options("carter", link="virtual:go2"), robot="go2")
-    simulation = Simulation(asked.scene, people=0, seed=0, robot="go2")
-    try:
-        with pytest.raises(FrontEndError, match="expected the Carter"):
-            open_front_end(simulation, asked)
-    finally:
-        simulation.close()

@@ -17,7 +17,6 @@ from sim_hil.protocols.mavlink.front_end import LinkOptions, MavlinkFrontEnd, op
 from sim_hil.protocols.mavlink.udp import MAX_LEARNED
 from sim_hil.protocols.mavlink.vehicle import Mode
 from sim_hil.protocols.mavlink.wire import now_ticks
-from sim_hil.robots.carter.body import Carter
 from sim_hil.simulation.physics import Simulation
 from tests.support.robot.front_end_contract import FrontEndContract, Report, Rig, options
 
@@ -118,21 +117,6 @@ def test_a_second_station_watches_and_does_not_drive(rig: Rig) -> None:
         rig.until(lambda: not _client(rig).armed, 1.0, "the stop that anybody may ask for")
     finally:
         other.close()
-
-
-@pytest.mark.slow
-def test_a_client_that_dies_stops_it_and_disarms_it(rig: Rig) -> None:
-    rig.make_ready()
-    rig.run(1.0, lambda: rig.client.drive(0.4, 0.0))
-    rig.client.poll = lambda: None  # type: ignore[method-assign]
-    rig.run(0.8)
-    assert rig.speed_mps() < 0.02
-    robot = rig.simulation.robot
-    assert isinstance(robot, Carter)
-    rig.run(4.0)
-    assert robot.ready
-    rig.run(1.0)
-    assert not robot.ready
 
 
 def test_more_addresses_than_it_remembers_are_turned_away(rig: Rig) -> None:

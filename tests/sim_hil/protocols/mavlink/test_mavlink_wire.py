@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink.parameters import NAMES, TABLE, Parameters, decode_value
 from sim_hil.protocols.mavlink.setpoints import SetpointError, override_sticks, read_setpoint
-from sim_hil.protocols.mavlink.wire import TICKS_PER_S, Reader, Verifier, Writer, signature
+from sim_hil.protocols.mavlink.wire import TICKS_PER_S, Reader, Verifier, Writer
 
 KEY = bytes(range(32))
 NOW = 10**13
@@ -98,11 +98,6 @@ def test_a_forged_packet_from_the_future_does_not_make_genuine_ones_old() -> Non
 def test_a_new_stream_may_be_a_minute_behind_and_not_more() -> None:
     assert len(Reader(Verifier(KEY, NOW)).read(signed(1, NOW - 59 * TICKS_PER_S))) == 1
     assert Reader(Verifier(KEY, NOW)).read(signed(1, NOW - 61 * TICKS_PER_S)) == []
-
-
-def test_the_signature_is_the_one_that_pymavlink_makes() -> None:
-    packet = signed(1, NOW)
-    assert signature(KEY, packet[:-6]) == packet[-6:]
 
 
 def test_a_body_velocity_turns_to_the_right_for_a_positive_rate() -> None:

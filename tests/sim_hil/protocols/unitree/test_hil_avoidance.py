@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
-from sim_hil.protocols.unitree.services.avoidance import RANGE_M, STOP_M, RangeFinder, allowed_mps, slowed, towards
+from sim_hil.protocols.unitree.services.avoidance import RANGE_M, STOP_M, RangeFinder, allowed_mps, slowed
 from sim_hil.robots.go2.sport import SportAction
 from sim_hil.scene.scene import Box
 from tests.support.robot.go2_services import Desk, Stage
@@ -144,9 +144,6 @@ class TestAvoidance:
         desk.behaviour.request(SportAction.RECOVERY_STAND)
         desk.run(4.0)
         assert desk.behaviour.ready and desk.behaviour.commanded == (0.0, 0.0, 0.0)
-
-    def test_there_is_no_way_to_where_one_is(self) -> None:
-        assert towards(SE2(1, 2, 3), SE2(1, 2, 3)) is None
 
     def test_the_sport_services_own_moves_are_slowed_once_it_avoids(self, desk: Desk) -> None:
         desk.free_m = 0.2

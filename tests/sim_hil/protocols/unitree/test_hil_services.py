@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.protocols.unitree.services.postures import SHOWS, STANDING, body_over_feet
+from sim_hil.protocols.unitree.services.postures import SHOWS
 from sim_hil.protocols.unitree.services.service import (
     APPLY,
     RENEW,
@@ -22,7 +22,6 @@ from sim_hil.protocols.unitree.services.service import (
     parse_text,
 )
 from sim_hil.protocols.unitree.services.switching import BUSY_S, Vui
-from sim_hil.robots.go2.sport import SportAction
 from tests.support.robot.go2_services import Desk, Stage
 
 S = 1_000_000_000
@@ -94,9 +93,6 @@ def desk() -> Desk:
 
 
 class TestPostures:
-    def test_the_neutral_body_stands_as_the_gait_does(self) -> None:
-        assert body_over_feet() == STANDING and len(STANDING) == 12
-
     @pytest.mark.parametrize(("api_id", "name"), [(1016, "Hello"), (1017, "Stretch"), (1020, "Content"),
                                                   (1022, "Dance1"), (1023, "Dance2")])  # fmt: skip
     def test_a_show_is_played_reported_and_ends_in_a_stand(self, desk: Desk, api_id: int, name: str) -> None:
@@ -278,12 +274,6 @@ class TestSwitching:
     def test_a_report_frequency_is_two_numbers(self, desk: Desk) -> None:
         assert desk.robot_state.handle(1002, '{"interval": 3, "duration": 30}') == (0, "")
         assert desk.robot_state.handle(1002, '{"interval": -1, "duration": 30}') == (3204, "")
-
-
-def test_a_request_of_the_controller_itself_still_reaches_it(desk: Desk) -> None:
-    assert desk.behaviour.request(SportAction.STAND_DOWN) == 0
-    desk.run(2.0)
-    assert desk.behaviour.mode == 5
 
 
 class TestVui:
