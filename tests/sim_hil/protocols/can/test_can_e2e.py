@@ -148,6 +148,5 @@ def test_every_message_has_its_crc_and_counter_where_the_protection_expects_them
         assert 2 <= message.length <= 8 and not message.is_extended_frame
 
 
-def test_whoever_sends_also_has_a_heartbeat_and_stopping_has_the_highest_priority() -> None:
-    assert {"ControllerHeartbeat", "BaseHeartbeat"} <= {message.name for message in MESSAGES}
+def test_the_emergency_stop_has_the_highest_priority() -> None:
     assert min(MESSAGES, key=lambda message: message.frame_id).name == "EstopControl"

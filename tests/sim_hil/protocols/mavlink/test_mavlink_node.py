@@ -17,8 +17,8 @@ from sim_hil.protocols.mavlink.parameters import NAMES
 from sim_hil.protocols.mavlink.vehicle import Mode, Station
 from sim_hil.protocols.mavlink.wire import Message, Reader, Writer
 from sim_hil.robots.carter.sensors import Sensors
-from tests.sim_hil.protocols.mavlink.test_mavlink_vehicle import FakeBase
 from tests.sim_hil.protocols.mavlink.test_mavlink_wire import setpoint
+from tests.support.robot.fake_base import FakeBase
 
 STATION = Station(255, ("127.0.0.1", 1))
 ACCEPTED, DENIED = common.MAV_RESULT_ACCEPTED, common.MAV_RESULT_DENIED

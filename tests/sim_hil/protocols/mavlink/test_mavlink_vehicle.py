@@ -9,32 +9,11 @@ import pytest
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
 from sim_hil.protocols.mavlink.vehicle import ACCEPTED, FAILED, REJECTED, Health, Mode, Station, Vehicle
+from tests.support.robot.fake_base import FakeBase
 
 FIRST, SECOND = Station(255, ("127.0.0.1", 1)), Station(254, ("127.0.0.1", 2))
 SAME_NUMBER = Station(255, ("127.0.0.1", 3))
 AHEAD = Setpoint(local=False, vx_mps=0.5, vy_mps=0.0, yaw_rate_radps=0.0)
-
-
-class FakeBase:
-    def __init__(self) -> None:
-        self.velocity = (0.0, 0.0, 0.0)
-        self.powered = self.stopped = False
-
-    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        self.velocity = (vx_mps, vy_mps, wz_radps)
-
-    def stand(self) -> None:
-        self.powered = True
-
-    def rest(self) -> None:
-        self.powered, self.velocity = False, (0.0, 0.0, 0.0)
-
-    def press_estop(self) -> None:
-        self.stopped = True
-        self.rest()
-
-    def release_estop(self) -> None:
-        self.stopped = False
 
 
 @pytest.fixture
