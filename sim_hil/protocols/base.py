@@ -1,8 +1,14 @@
-"""Parts that front ends share: the interface of a wheeled base, and the summary of the received commands."""
+"""Parts that front ends share: the interface of a wheeled base, the camera, and the summary of received commands."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.protocols.render_process import RenderProcess
 
 Vec3 = tuple[float, float, float]
 
@@ -56,3 +62,19 @@ class CommandLog:
             "last_command": self.last_command,
             "last_command_zero": self.at_zero,
         }
+
+
+class CameraFrontEnd:
+    """Front end whose camera, if it has one, renders in a process of its own."""
+
+    _camera: RenderProcess | None = None
+
+    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
+        """Wait for the camera. Raises CameraProcessError."""
+        self.show(render_state)
+        return self._camera is None or self._camera.wait_ready(stop)
+
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """Pass the state to render to the camera process."""
+        if self._camera is not None:
+            self._camera.show(render_state)

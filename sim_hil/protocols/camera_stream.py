@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
+from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.render_process import RenderProcess
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
 from sim_hil.scene.scene import load_scene
@@ -157,29 +158,15 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class CameraStream(RenderProcess):
-    """Starts the camera process, hands it the pose, counts its pictures. It ends when this object or process does."""
+    """Camera process with an HTTP server; counts its pictures."""
 
-    def __init__(
-        self,
-        scene: str,
-        *,
-        robot: str,
-        people: int,
-        seed: int,
-        size: tuple[int, int],
-        port: int,
-        state_length: int,
-    ) -> None:
-        """Start the process. `scene`: name or file for load_scene; `size`: (width, height), px; `port`: 0 for any free
-        port; `state_length`: length of a render state. Raises OSError if the port is in use.
-        """
+    def __init__(self, options: FrontEndOptions, port: int, state_length: int) -> None:
+        """Start the process; `port`: 0 for any free port. Raises OSError if the port is in use."""
         # The parent opens the socket, so that a port in use is reported at once and a free port is known.
         with listen(port) as listening:
             self.port = int(listening.getsockname()[1])
-            command = [sys.executable, "-m", "sim_hil.protocols.camera_stream", "--scene", scene, "--robot", robot]
-            command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
-            command += ["--listen-fd", str(listening.fileno())]
-            super().__init__(command, state_length, (listening.fileno(),))
+            more = ["--robot", options.robot, "--listen-fd", str(listening.fileno())]
+            super().__init__("sim_hil.protocols.camera_stream", options, more, state_length, (listening.fileno(),))
         self.pictures = 0
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from typing import Final
@@ -10,6 +11,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from sim_hil.processes.child_process import ChildProcess, Message, parse_message
+from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.snapshot import SnapshotWriter
 
 _START_TIMEOUT_S: Final = 60.0
@@ -24,8 +26,21 @@ class CameraProcessError(RuntimeError):
 class RenderProcess:
     """A process that renders the newest pose; it ends when this object or the parent process does."""
 
-    def __init__(self, command: Sequence[str], state_length: int, pass_fds: Sequence[int] = ()) -> None:
-        """`state_length`: numbers in a render state. Raises OSError when the process cannot be started."""
+    def __init__(
+        self,
+        module: str,
+        options: FrontEndOptions,
+        more: Sequence[str],
+        state_length: int,
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        """Start `module` with the options' scene, people, seed and camera size, and the arguments `more`.
+
+        `state_length`: length of a render state. Raises OSError if the process cannot be started.
+        """
+        width, height = options.camera_size or (0, 0)
+        command = [sys.executable, "-m", module, "--scene", options.scene_source, "--people", str(options.people)]
+        command += ["--seed", str(options.seed), "--width", str(width), "--height", str(height), *more]
         self._pose = SnapshotWriter(state_length)
         try:
             pose_fd = self._pose.fd

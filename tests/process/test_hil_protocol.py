@@ -23,8 +23,7 @@ from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
 from sim_hil.hil.command import main
-from sim_hil.protocols.render_process import CameraProcessError
-from sim_hil.protocols.unitree.camera_process import CameraProcess
+from sim_hil.protocols.render_process import CameraProcessError, RenderProcess
 from tests.support.processes import (
     GO2_SIM,
     REPOSITORY,
@@ -35,39 +34,39 @@ from tests.support.processes import (
     running,
     wait_for,
 )
+from tests.support.robot.front_end_contract import options
 
 pytestmark = pytest.mark.process
 
 
-class TestCameraProcess:
+class TestRenderProcess:
     @pytest.fixture
-    def started(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., CameraProcess]:
+    def started(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RenderProcess]:
         """Starts a camera process that says one line and then waits for the end of its input."""
 
-        def start(line: str, then: str = "exec cat") -> CameraProcess:
+        def start(line: str, then: str = "exec cat") -> RenderProcess:
             script = tmp_path / "camera"
             script.write_text(f"#!/bin/sh\nprintf '%b' '{line}'\n{then}\n")
             script.chmod(0o700)
             monkeypatch.setattr(sys, "executable", str(script))
-            dds = DdsConfig(0, "lo", ("127.0.0.1",))
-            return CameraProcess("corridor", people=0, seed=0, size=(64, 48), dds=dds, state_length=19)
+            return RenderProcess("camera", options("go2", camera_size=(64, 48)), [], 19)
 
         return start
 
-    def test_a_stop_request_ends_the_wait_for_it(self, started: Callable[..., CameraProcess]) -> None:
+    def test_a_stop_request_ends_the_wait_for_it(self, started: Callable[..., RenderProcess]) -> None:
         camera = started("")
         assert camera.wait_ready([signal.SIGINT]) is False
         camera.close()
 
     @pytest.mark.slow
-    def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., CameraProcess]) -> None:
+    def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., RenderProcess]) -> None:
         camera = started("", then="exec cat >/dev/null")
         with pytest.raises(CameraProcessError, match="still runs"):
             camera.wait_ready([])
         camera.close()
 
     @pytest.mark.parametrize("line", ["hello", "[1]", '{"event": 1}', "{}", r"\0377", "[" * 4000])
-    def test_a_line_that_is_no_event_is_named(self, started: Callable[..., CameraProcess], line: str) -> None:
+    def test_a_line_that_is_no_event_is_named(self, started: Callable[..., RenderProcess], line: str) -> None:
         camera = started(line + r"\n")
         with pytest.raises(CameraProcessError, match="expected an event"):
             camera.wait_ready([])
@@ -275,7 +274,7 @@ def test_bad_arguments_leave_an_earlier_trace_alone(
     [
         ("Simulation.step", "pybullet.disconnect(args[0].client)"),  # what closing the window does
         ("Simulation.render_state", 'raise pybullet.error("the window was closed")'),
-        ("CameraProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
+        ("RenderProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
         ("ServiceServer.serve", 'raise ValueError("the window was closed")'),
     ],
 )
@@ -287,8 +286,7 @@ import sys
 import pybullet
 from sim_hil.hil import command as hil
 from sim_hil.simulation.physics import Simulation
-from sim_hil.protocols.render_process import CameraProcessError
-from sim_hil.protocols.unitree.camera_process import CameraProcess
+from sim_hil.protocols.render_process import CameraProcessError, RenderProcess
 from sim_hil.protocols.unitree.services.service import ServiceServer
 calls = []
 before = {where}

@@ -9,17 +9,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from firmware_bridge.client_link import check_is_ours
 from firmware_bridge.core.config import ConfigError, runtime_dir
-from sim_hil.protocols.base import CommandLog
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, open_bus
@@ -90,7 +86,7 @@ def _port(text: str) -> int:
     return int(text)
 
 
-class CanFrontEnd:
+class CanFrontEnd(CameraFrontEnd):
     """CAN front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
@@ -115,15 +111,7 @@ class CanFrontEnd:
                 self._faults = PlanFaults(options.faults, link.faults, SWITCHES)
             self._link = BusLink(open_bus(self._bus_to_open(link.address)))
             if options.camera_size is not None:
-                self._camera = CameraStream(
-                    options.scene_source,
-                    robot=options.robot,
-                    people=options.people,
-                    seed=options.seed,
-                    size=options.camera_size,
-                    port=link.camera_port,
-                    state_length=state_length,
-                )
+                self._camera = CameraStream(options, link.camera_port, state_length)
         except BaseException:
             self.close()
             raise
@@ -151,13 +139,6 @@ class CanFrontEnd:
         """Return the addresses of bus and camera."""
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"CAN {self._address}, {camera}"
-
-    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraProcessError."""
-        if self._camera is None:
-            return True
-        self._camera.show(render_state)
-        return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
         """Wait until a frame arrives, at most `left_ns`."""
@@ -241,11 +222,6 @@ class CanFrontEnd:
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
-
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Pass the state to render to the camera process."""
-        if self._camera is not None:
-            self._camera.show(render_state)
 
     def close(self) -> None:
         """End the camera process, close the bus, remove the pty and the fault socket."""

@@ -13,16 +13,13 @@ received or sent).
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
-from sim_hil.protocols.base import CommandLog
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.fault_socket import PlanFaults, parse_plan, plan_fields
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
@@ -97,7 +94,7 @@ def _number(name: str, text: str) -> int:
     return int(text)
 
 
-class MavlinkFrontEnd:
+class MavlinkFrontEnd(CameraFrontEnd):
     """MAVLink front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
@@ -119,15 +116,7 @@ class MavlinkFrontEnd:
             if options.faults is not None:
                 self._faults = PlanFaults(options.faults, link.impairment, SWITCHES)
             if options.camera_size is not None:
-                self._camera = CameraStream(
-                    options.scene_source,
-                    robot=options.robot,
-                    people=options.people,
-                    seed=options.seed,
-                    size=options.camera_size,
-                    port=link.camera_port,
-                    state_length=state_length,
-                )
+                self._camera = CameraStream(options, link.camera_port, state_length)
         except BaseException:
             self.close()
             raise
@@ -141,13 +130,6 @@ class MavlinkFrontEnd:
         """Return the addresses of rover and camera."""
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"MAVLink udp:{self._host}:{self._link.port}, system {self._node.system}, {camera}"
-
-    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraProcessError."""
-        if self._camera is None:
-            return True
-        self._camera.show(render_state)
-        return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
         """Wait until a datagram arrives, at most `left_ns`."""
@@ -215,11 +197,6 @@ class MavlinkFrontEnd:
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
-
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Pass the state to render to the camera process."""
-        if self._camera is not None:
-            self._camera.show(render_state)
 
     def close(self) -> None:
         """End the camera process and close the sockets."""

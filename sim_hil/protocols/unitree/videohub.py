@@ -1,6 +1,6 @@
 """The front camera as a process of its own: answers `videohub` GetImageSample with a JPEG rendered at that moment.
 
-Started by `CameraProcess`; talks to its parent through three pipes' worth of plain things: the pose in shared memory
+Started by the front end; it communicates with its parent through three descriptors: the pose in shared memory
 (`snapshot.py`), events as JSON lines on what was stdout at the start, and an end of file on stdin when the parent has
 gone.
 """

@@ -16,6 +16,7 @@ import pytest
 from sim_hil.protocols.camera_stream import CameraServer, CameraStream, Shutter, listen
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.physics import Simulation
+from tests.support.robot.front_end_contract import options
 
 SIZE = (160, 90)
 
@@ -109,7 +110,7 @@ def state() -> np.ndarray:
 
 
 def _stream(state: np.ndarray, port: int = 0) -> CameraStream:
-    return CameraStream("corridor", robot="carter", people=0, seed=0, size=SIZE, port=port, state_length=len(state))
+    return CameraStream(options("carter", camera_size=SIZE), port, len(state))
 
 
 @pytest.mark.slow

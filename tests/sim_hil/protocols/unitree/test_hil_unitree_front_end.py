@@ -89,7 +89,7 @@ def test_what_was_opened_is_closed_in_reverse_when_a_later_step_fails(
 
     close_bus = front_end.Bus.close
     monkeypatch.setattr(front_end.Bus, "close", lambda bus: (closed.append("bus"), close_bus(bus)))
-    monkeypatch.setattr(front_end, "CameraProcess", Camera)
+    monkeypatch.setattr(front_end, "RenderProcess", Camera)
     monkeypatch.setattr(front_end, "StatePublishers", fails)
     asked = options("go2", domain=dds_domain, camera_size=(64, 48), faults=tmp_path / "faults")
     simulation = Simulation(asked.scene, people=0, seed=0)
