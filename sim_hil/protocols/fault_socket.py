@@ -136,9 +136,6 @@ def _table(data: bytes) -> dict[str, object]:
     return table
 
 
-_POLL_S = 0.01
-
-
 class FaultError(RuntimeError):
     """A fault that could not be injected; one line with its name and the cause."""
 
@@ -195,14 +192,6 @@ class FaultClient:
         self.answers()
         self.ask(fault, on=on, **values)
         return self.effect_ns(fault, timeout_s)
-
-    def wait_for_server(self, timeout_s: float) -> None:
-        """Wait until the server's socket exists. Raises FaultError."""
-        deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-        while not self._server.exists():
-            if time.monotonic_ns() > deadline_ns:
-                raise FaultError(f"no fault socket {self._server.name} within {timeout_s:g} s")
-            time.sleep(_POLL_S)
 
     def close(self) -> None:
         """Close and remove the own socket."""

@@ -13,8 +13,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from math import hypot
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import psutil
 
@@ -98,7 +97,8 @@ class Leg:
             "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
         }
         (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-        with LineFile(folder / EVENTS) as self._events, LineFile(folder / SAMPLES) as self._samples, self._stack:
+        events, samples = (folder / name for name in (EVENTS, SAMPLES))
+        with events.open("a") as self._events, samples.open("a") as self._samples, self._stack:
             self._begin_ns = time.monotonic_ns()
             self._note("leg_begin", scene=self._options.stack.scene, people=self._options.stack.people)
             if self._menu is not None:
@@ -230,17 +230,17 @@ class Leg:
 
     def _begin_task(self, task: SoakTask) -> None:
         self._task = TaskRun(task, time.monotonic_ns())
-        self._note("task_begin", task=task.as_json(), run=self._stack.runs)
+        self._note("task_begin", task=asdict(task), run=self._stack.runs)
 
     def _end_task(self, end: str) -> None:
         if self._task is None:
             return
         outcome = self._task.outcome(end)
         self._task = None
-        self._note("task_end", **outcome.as_json())
+        self._note("task_end", **outcome)
         if end != "cut":
             self.tasks += 1
-            self.reached += outcome.success
+            self.reached += outcome["success"]
 
     def _read_truth(self) -> str | None:
         """Read the new ground truth; return why the task is over, None if it is not."""
@@ -278,7 +278,7 @@ class Leg:
             "pose": None if pose is None else [pose.x_m, pose.y_m, pose.theta_rad],
             "processes": self._sampler.sample(self._stack.processes()),
         }
-        self._samples.add(sample)
+        _append(self._samples, sample)
         self._show_status(
             f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
             f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
@@ -291,7 +291,7 @@ class Leg:
         return self._options.duration_s - (now_ns - begun_ns) / 1e9
 
     def _note(self, kind: str, **fields: Any) -> None:
-        self._events.add({"t_ns": time.monotonic_ns(), "kind": kind, **fields})
+        _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
 
 
 def _end_of_run(result: Path) -> tuple[str, set[str]]:
@@ -304,24 +304,10 @@ def _end_of_run(result: Path) -> tuple[str, set[str]]:
     return (str(faults[0]) if faults else ""), raised
 
 
-class LineFile:
-    """Writer that appends JSON objects to a file. Raises OSError."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("a", encoding="utf-8")
-
-    def add(self, content: dict[str, Any]) -> None:
-        """Append one object."""
-        self._file.write(json.dumps(content) + "\n")
-        self._file.flush()
-
-    def __enter__(self) -> LineFile:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
+def _append(file: TextIO, content: dict[str, Any]) -> None:
+    """Append one JSON line; flushed, so that the file stays complete if the process is killed."""
+    file.write(json.dumps(content) + "\n")
+    file.flush()
 
 
 PSS_EVERY: Final = 10

@@ -23,7 +23,7 @@ from sim_hil.soak.analysis import ANALYSIS, analyse, keep_moments
 from sim_hil.soak.faults import FaultMenu, SoakInputError
 from sim_hil.soak.leg import LEG, SAMPLES, Leg, LegOptions
 from sim_hil.soak.tasks import Journey
-from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, Judgement, judge, measures
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, judge, measures
 
 CONFIG: Final = "config.json"
 LEGS: Final = "legs"
@@ -204,18 +204,13 @@ def _stack_options(
     )
 
 
-def verdict(judgements: Sequence[Judgement]) -> str:
-    """Return FAIL if a line fails, UNDECIDED if a line is undecided or there is none, else PASS."""
-    found = {judgement.verdict for judgement in judgements}
-    return FAIL if FAIL in found else PASS if found == {PASS} else UNDECIDED
-
-
 def soak_result(
     soak: SoakFolder, options: SoakOptions, budget: Sequence[BudgetLine], *, finished: bool
 ) -> dict[str, Any]:
     """Return the result for `--json`."""
     found = measures(soak.legs, soak.samples())
-    judgements = [judge(line, found[line.measure]) for line in budget]
+    judged = [judge(line, found[line.measure]) for line in budget]
+    verdicts = {line["verdict"] for line in judged}
     lives = [life for leg in soak.legs for life in leg["lives"]]
     ends = [end for leg in soak.legs for end in leg["life_ends"] if end["cause"] != "leg"]
     reasons: dict[str, int] = {}
@@ -226,11 +221,11 @@ def soak_result(
     watts = [row[1] for life in lives for row in life["power"]]
     sources = sorted({row[2] for life in lives for row in life["power"]})
     return {
-        "verdict": verdict(judgements),
+        "verdict": FAIL if FAIL in verdicts else PASS if verdicts == {PASS} else UNDECIDED,
         "finished": finished,
         "elapsed_s": round(soak.elapsed_s, 1),
         "asked_s": options.duration_s,
-        "budget": [judgement.as_json() for judgement in judgements],
+        "budget": judged,
         "measures": {name: measure.as_json() for name, measure in found.items()},
         "control": {
             "ticks": sum(life["ticks"] for life in lives),

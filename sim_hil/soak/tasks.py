@@ -38,10 +38,6 @@ class SoakTask:
     shortest_m: float
     timeout_s: float
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the task as JSON values for the event log."""
-        return dict(self.__dict__)
-
 
 class Journey:
     """Random sequence of tasks in one scene. Raises ValueError for a scene without free space or landmarks."""
@@ -99,27 +95,6 @@ def _length_m(path: tuple[Vec2, ...]) -> float:
     return sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path))
 
 
-@dataclass(frozen=True)
-class TaskOutcome:
-    """Outcome of a task; `end`: reached, timeout, stopped (runner ended) or cut (leg ended); `spl` in percent."""
-
-    number: int
-    end: str
-    success: bool
-    ne_m: float
-    spl: float
-    path_m: float
-    shortest_m: float
-    time_s: float
-    collisions: tuple[str, ...]
-    goal: str
-    instruction: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the outcome as JSON values for the event log."""
-        return {**self.__dict__, "collisions": list(self.collisions)}
-
-
 class TaskRun:
     """Tracker of one task's poses from `started_ns` on."""
 
@@ -144,20 +119,23 @@ class TaskRun:
             return "reached"
         return "timeout" if (pose.t_ns - self.started_ns) / 1e9 >= self.task.timeout_s else None
 
-    def outcome(self, end: str) -> TaskOutcome:
-        """Return the outcome with the numbers so far."""
-        reached = end == "reached"
+    def outcome(self, end: str) -> dict[str, Any]:
+        """Return the outcome so far as JSON values.
+
+        `end`: reached, timeout, stopped (the runner ended) or cut (the leg ended); `spl` in percent.
+        """
+        reached, task = end == "reached", self.task
         last_ns = self.started_ns if self._last is None else self._last.t_ns
-        return TaskOutcome(
-            number=self.task.number,
-            end=end,
-            success=reached,
-            ne_m=round(self._ne_m, 3),
-            spl=round(100 * spl(reached, self.task.shortest_m, self._path_m), 2),
-            path_m=round(self._path_m, 3),
-            shortest_m=round(self.task.shortest_m, 3),
-            time_s=round((last_ns - self.started_ns) / 1e9, 3),
-            collisions=tuple(sorted(self._touched)),
-            goal=self.task.goal_label,
-            instruction=self.task.instruction,
-        )
+        return {
+            "number": task.number,
+            "end": end,
+            "success": reached,
+            "ne_m": round(self._ne_m, 3),
+            "spl": round(100 * spl(reached, task.shortest_m, self._path_m), 2),
+            "path_m": round(self._path_m, 3),
+            "shortest_m": round(task.shortest_m, 3),
+            "time_s": round((last_ns - self.started_ns) / 1e9, 3),
+            "collisions": sorted(self._touched),
+            "goal": task.goal_label,
+            "instruction": task.instruction,
+        }

@@ -55,39 +55,24 @@ class BudgetLine:
             raise SoakInputError(f"budget {self.measure!r}: expected a source, found none")
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """Verdict on a budget line; `why` explains an undecided one."""
-
-    line: BudgetLine
-    measure: Measure
-    verdict: str
-    why: str = ""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the judgement as JSON values for the result."""
-        line = {key: value for key, value in self.line.__dict__.items() if value is not None}
-        why = {"why": self.why} if self.why else {}
-        return {**line, "verdict": self.verdict, **why, "found": self.measure.as_json()}
-
-
-def judge(line: BudgetLine, measure: Measure) -> Judgement:
-    """Judge one line.
+def judge(line: BudgetLine, measure: Measure) -> dict[str, Any]:
+    """Judge one line and return the JSON values for the result; `why` explains an undecided line.
 
     A value beyond the limit fails. If its interval includes the limit, it may be noise, so the line is undecided.
     """
     if measure.value is None:
-        return Judgement(line, measure, UNDECIDED, measure.note or "not measured")
-    if line.max is not None:
-        beyond, sure = measure.value > line.max, measure.low is None or measure.low > line.max
+        verdict, why = UNDECIDED, measure.note or "not measured"
     else:
-        assert line.min is not None
-        beyond, sure = measure.value < line.min, measure.high is None or measure.high < line.min
-    if not beyond:
-        return Judgement(line, measure, PASS)
-    if sure:
-        return Judgement(line, measure, FAIL)
-    return Judgement(line, measure, UNDECIDED, "the interval includes the limit: run longer")
+        if line.max is not None:
+            beyond, sure = measure.value > line.max, measure.low is None or measure.low > line.max
+        else:
+            assert line.min is not None
+            beyond, sure = measure.value < line.min, measure.high is None or measure.high < line.min
+        verdict, why = FAIL if beyond else PASS, ""
+        if beyond and not sure:
+            verdict, why = UNDECIDED, "the interval includes the limit: run longer"
+    limits = {key: value for key, value in vars(line).items() if value is not None}
+    return {**limits, "verdict": verdict, **({"why": why} if why else {}), "found": measure.as_json()}
 
 
 def applicable(lines: tuple[BudgetLine, ...], *, faults: bool) -> tuple[BudgetLine, ...]:

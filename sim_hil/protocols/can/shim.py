@@ -7,7 +7,6 @@ duration of a fault depends on the clock.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Final
@@ -69,12 +68,6 @@ class FaultShim:
         self._babbled_until_s: float | None = None  # None: not babbling
         self._off = False
         self._last_take_s = 0.0
-        self._done = dict.fromkeys(("drop", "corrupt", "duplicate", "delay", "bus_off", "babble", "starved"), 0)
-
-    @property
-    def done(self) -> Mapping[str, int]:
-        """Number of occurrences of each fault."""
-        return dict(self._done)
 
     def put(self, frame: Frame, now_s: float) -> None:
         """Send a frame."""
@@ -85,7 +78,6 @@ class FaultShim:
         if self.is_off(now_s):
             return
         if drop < plan.drop:
-            self._done["drop"] += 1
             return
         if corrupt < plan.corrupt and frame.data:
             frame = self._corrupted(frame, bits.tolist())
@@ -93,15 +85,12 @@ class FaultShim:
         if arrives_s is None:
             return
         if delay < plan.delay:
-            self._done["delay"] += 1
             arrives_s += plan.delay_s
         self._queue(frame, arrives_s)
         if duplicate < plan.duplicate:
-            self._done["duplicate"] += 1
             self._queue(frame, arrives_s)
 
     def _corrupted(self, frame: Frame, bits: list[int]) -> Frame:
-        self._done["corrupt"] += 1
         data = bytearray(frame.data)
         for bit in set(bits):
             data[bit // 8] ^= 1 << bit % 8
@@ -114,7 +103,6 @@ class FaultShim:
             return now_s
         share = plan.babble_hz * FRAME_S
         if share >= 1.0:
-            self._done["starved"] += 1
             return None
         self._free_s = max(self._free_s, now_s) + FRAME_S / (1.0 - share)
         return self._free_s
@@ -149,7 +137,6 @@ class FaultShim:
         if off == self._off:
             return []
         self._off = off
-        self._done["bus_off"] += off
         return [Frame(ERROR_BUS_OFF if off else ERROR_RESTARTED, bytes(8), error=True)]
 
     def _babble(self, now_s: float) -> list[Frame]:
@@ -162,5 +149,4 @@ class FaultShim:
         period_s = max(1 / self.plan.babble_hz, FRAME_S)
         count = int((now_s - self._babbled_until_s) / period_s + 1e-9)
         self._babbled_until_s += count * period_s
-        self._done["babble"] += count
         return [Frame(BABBLER_ID, bytes(8))] * count

@@ -125,14 +125,6 @@ def _send(node: CommandTarget, number: int) -> int:
     return int(ACCEPTED)
 
 
-def _capabilities(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
-    return _send(node, common.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-
-
-def _home(node: CommandTarget, station: Station, command: Command, now_s: float) -> int:
-    return _send(node, common.MAVLINK_MSG_ID_HOME_POSITION)
-
-
 HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
     {
         common.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
@@ -141,8 +133,10 @@ HANDLERS: Final[Mapping[int, Handler]] = MappingProxyType(
         common.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
         common.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
         common.MAV_CMD_REQUEST_MESSAGE: _request,
-        common.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
-        common.MAV_CMD_GET_HOME_POSITION: _home,
+        common.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda node, *_: _send(
+            node, common.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        ),
+        common.MAV_CMD_GET_HOME_POSITION: lambda node, *_: _send(node, common.MAVLINK_MSG_ID_HOME_POSITION),
     }
 )
 """Handlers by command number; every other command is acknowledged as unsupported."""

@@ -16,7 +16,7 @@ from cyclonedds.pub import DataWriter
 
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_crc, low_state_values
+from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_values
 from firmware_bridge.unitree.messages.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import BmsState_, LowState_, MotorState_
 from sim_hil.protocols.unitree.odometry import OdometryFrame
@@ -155,12 +155,6 @@ class LowStateMessage:
         battery.current = -round(1000 * reading.current_a)  # mA
         battery.cell_vol = [round(1000 * reading.voltage_v / CELLS)] * CELLS + [0] * 7  # mV
         message.power_v, message.power_a = reading.voltage_v, reading.current_a
-
-    def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
-        """Fill and return the message for this instant, with checksum."""
-        message = self.update(truth, odometry)
-        message.crc = low_state_crc(message)
-        return message
 
     def encode(self) -> bytes:
         """Encode the message with a new checksum; same bytes as `serialize`, but much faster."""

@@ -92,8 +92,9 @@ def test_low_state_layout_is_the_c_struct_less_its_crc() -> None:
 
 
 def test_low_state_crc_depends_on_every_motor_and_survives_the_wire() -> None:
-    message = LowStateMessage().fill(standing(joint_q_rad=np.linspace(-1, 1, 12)), OdometryFrame((0.0, 0.0, 0.0)))
-    received = idl_low.LowState_.deserialize(message.serialize())
+    low = LowStateMessage()
+    low.update(standing(joint_q_rad=np.linspace(-1, 1, 12)), OdometryFrame((0.0, 0.0, 0.0)))
+    received = idl_low.LowState_.deserialize(low.encode())
     assert low_state_crc(received) == received.crc
     seen = {received.crc}
     for motor in received.motor_state:

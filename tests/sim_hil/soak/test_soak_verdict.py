@@ -62,24 +62,24 @@ def test_a_short_life_has_no_slope() -> None:
 
 
 def test_within_the_limit_passes_and_beyond_it_fails() -> None:
-    assert judge(LIMIT, Measure(1.0, "", 5)).verdict == PASS
-    assert judge(LIMIT, Measure(1.1, "", 5)).verdict == FAIL
+    assert judge(LIMIT, Measure(1.0, "", 5))["verdict"] == PASS
+    assert judge(LIMIT, Measure(1.1, "", 5))["verdict"] == FAIL
 
 
 def test_a_lower_limit_is_one_too() -> None:
     line = BudgetLine("x", "here", min=0.98)
-    assert judge(line, Measure(0.99, "", 1)).verdict == PASS
-    assert judge(line, Measure(0.97, "", 1)).verdict == FAIL
+    assert judge(line, Measure(0.99, "", 1))["verdict"] == PASS
+    assert judge(line, Measure(0.97, "", 1))["verdict"] == FAIL
 
 
 def test_growth_whose_interval_reaches_the_limit_is_undecided() -> None:
-    assert judge(LIMIT, Measure(2.0, "", 1, low=0.5, high=3.0)).verdict == UNDECIDED
-    assert judge(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0)).verdict == FAIL
+    assert judge(LIMIT, Measure(2.0, "", 1, low=0.5, high=3.0))["verdict"] == UNDECIDED
+    assert judge(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0))["verdict"] == FAIL
 
 
 def test_what_was_not_measured_is_undecided_and_says_why() -> None:
     found = judge(LIMIT, Measure(None, "", 0, note="too short"))
-    assert (found.verdict, found.why) == (UNDECIDED, "too short")
+    assert (found["verdict"], found["why"]) == (UNDECIDED, "too short")
 
 
 def test_a_budget_line_about_an_unknown_measure_is_refused(tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
         lines = {line.measure: line for line in load_budget(DEFAULT_BUDGET)}
         found = measures([], [leg])
         for name, verdict in (("memory_slope_mib_per_h.edge-run", wanted), ("descriptor_slope_per_h.edge-run", PASS)):
-            assert judge(lines[name], found[name]).verdict == verdict
+            assert judge(lines[name], found[name])["verdict"] == verdict
 
 
 def test_every_process_has_a_life_of_its_own() -> None:

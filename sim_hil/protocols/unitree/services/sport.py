@@ -9,6 +9,7 @@ from typing import Final, Protocol
 
 from firmware_bridge.unitree.messages import ids
 from sim_hil.protocols.base import CommandLog
+from sim_hil.protocols.unitree.services.avoidance import Pilot
 from sim_hil.protocols.unitree.services.behaviour import GAITS, SPEED_SHARE, Go2Behaviour
 from sim_hil.protocols.unitree.services.postures import MODE_POSE, POSE, SHOWS, SIT, Script
 from sim_hil.protocols.unitree.services.service import Answer, Received, parse_flag, parse_numbers, parse_table
@@ -119,25 +120,10 @@ _DONE: Final[Answer] = (ids.OK, "")
 _BAD: Final[Answer] = (ids.ERROR_PARAMETER, "")
 
 
-class Mover(Protocol):
-    """Receiver of velocities."""
-
-    avoids: bool
-    """Whether velocities are reduced before obstacles."""
-
-    def move(self, vx_mps: float, vy_mps: float, wz_radps: float, /, *, avoiding: bool) -> None:
-        """Command a velocity in the body frame for 1 s."""
-        ...
-
-    def stop(self) -> None:
-        """Discard velocity and goal."""
-        ...
-
-
 class SportService:
     """Handler of sport requests. SwitchJoystick is accepted without effect, because the robot has no joystick."""
 
-    def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
+    def __init__(self, behaviour: Go2Behaviour, mover: Pilot) -> None:
         self._behaviour = behaviour
         self._mover = mover
         self._handlers: dict[int, Callable[[str], Answer]] = {

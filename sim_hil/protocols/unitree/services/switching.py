@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.unitree.services.avoidance import Pilot
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
 from sim_hil.protocols.unitree.services.service import Answer, parse_flag, parse_numbers, parse_text
-from sim_hil.protocols.unitree.services.sport import Mover
 
 ERROR_SWITCH_PARAMETER: Final = 7001
 ERROR_SWITCH_BUSY: Final = 7002
@@ -32,7 +32,7 @@ _SERVICE_SWITCH, _REPORT_FREQ, _SERVICE_LIST = 1001, 1002, 1003
 class MotionSwitcher:
     """Service that assigns the joints to one of MODES, or to none, which enables low commands."""
 
-    def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
+    def __init__(self, behaviour: Go2Behaviour, mover: Pilot) -> None:
         """Create the service; `mover` is stopped on release."""
         self._behaviour = behaviour
         self._mover = mover

@@ -77,7 +77,6 @@ def test_a_corrupted_frame_is_never_taken_for_a_good_one() -> None:
         for frame in shim.take(number * TICK_S):
             received = decoder.decode(frame)
             assert received is not None and not received.good
-    assert shim.done["corrupt"] == COUNT
 
 
 def test_while_the_bus_is_off_nothing_passes_and_both_ends_of_it_are_told() -> None:

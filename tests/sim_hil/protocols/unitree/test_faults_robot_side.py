@@ -141,7 +141,7 @@ def test_neighbours_change_places_and_twins_come_twice() -> None:
 def test_a_tipped_robot_reports_it_in_both_states() -> None:
     faults = faults_with("tip-over", pitch_rad=0.8)
     (out,) = faults.deliver(state(), 0)
-    low = LowStateMessage().fill(standing(), AT_ORIGIN)
+    low = LowStateMessage().update(standing(), AT_ORIGIN)
     assert faults.alter_low(low)
     assert out.imu_state.rpy[1] == low.imu_state.rpy[1] == 0.8
     assert out.imu_state.quaternion == pytest.approx([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
