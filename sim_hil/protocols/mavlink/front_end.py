@@ -23,8 +23,7 @@ from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.fault_socket import PlanFaults, parse_plan, plan_fields
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
-from sim_hil.protocols.mavlink.commands import Command
-from sim_hil.protocols.mavlink.node import COMPONENT, MavlinkNode
+from sim_hil.protocols.mavlink.node import COMPONENT, Command, MavlinkNode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.udp import PERFECT, Address, Impairment, UdpLink, parse_address
 from sim_hil.protocols.mavlink.vehicle import Station
