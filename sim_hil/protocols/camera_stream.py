@@ -20,19 +20,14 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
 from sim_hil.protocols.front_end import FrontEndOptions
-from sim_hil.protocols.render_process import RenderProcess
+from sim_hil.protocols.render_process import RenderProcess, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
-JPEG_QUALITY: Final = 85
 RATE_HZ: Final = 15.0
 _BOUNDARY: Final = "frame"
 _IDLE_S: Final = 0.05
@@ -181,13 +176,6 @@ class CameraStream(RenderProcess):
         return events
 
 
-def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise RuntimeError("OpenCV could not encode a camera frame as JPEG")
-    return data.tobytes()
-
-
 def _render_while_parent_lives(
     world: CameraWorld, poses: SnapshotReader, shutter: Shutter, size: tuple[int, int], noise: SensorNoise, pipe: TextIO
 ) -> None:
@@ -206,7 +194,7 @@ def _render_while_parent_lives(
             sys.stderr.write(f"edge-hil camera: image skipped: {error}\n")
             continue
         if state is not None:
-            shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
+            shutter.show(captured_ns, encode_jpeg(noise.add(world.render(state, *size))))
             write_message(pipe, {"event": "picture"})
 
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.render_process import encode_jpeg
 from sim_hil.protocols.snapshot import TornSnapshotError
 from sim_hil.protocols.unitree.camera_faults import FaultyVideoHub
 from sim_hil.protocols.unitree.fault_commands import FaultCommand, parse
 from sim_hil.protocols.unitree.fault_injector import SportFaults
 from sim_hil.protocols.unitree.services.service import Answer, Received
-from sim_hil.protocols.unitree.video_service import VideoHub, encode_jpeg
+from sim_hil.protocols.unitree.video_service import VideoHub
 
 MOVE = '{"x": 0.5, "y": 0, "z": 0}'
 ZERO = '{"x": 0, "y": 0, "z": 0}'
