@@ -228,7 +228,6 @@ def exit_status(command: list[str]) -> int:
         (["--robot", "carter"], "--robot carter --protocol unitree"),
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
-        (["--link", "udp:1"], "--link"),
         (["--camera", "none", "--faults", "f.sock"], "--camera none"),
         (["--people", "100000"], "people"),
         (["--people", "-1"], "--people"),

@@ -146,19 +146,11 @@ def test_a_port_that_is_taken_is_refused_in_one_line(state: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_its_address_is_known_before_it_is_ready(state: np.ndarray) -> None:
-    camera = _stream(state)
-    try:
-        assert camera.port > 0 and str(camera.port) in camera.url
-    finally:
-        camera.close()
-
-
-@pytest.mark.slow
-def test_waiting_for_it_ends_when_the_run_is_stopped(state: np.ndarray) -> None:
+def test_its_address_is_known_before_it_is_ready_and_a_stop_ends_the_wait(state: np.ndarray) -> None:
     before = set(psutil.Process().children())
     camera = _stream(state)
     try:
+        assert camera.port > 0 and str(camera.port) in camera.url
         assert not camera.wait_ready([15])
     finally:
         camera.close()

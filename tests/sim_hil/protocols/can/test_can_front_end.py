@@ -31,14 +31,17 @@ class ContractClient:
     def __init__(self, address: BusAddress) -> None:
         self.link = BusLink(open_bus(address))
         self.can = CanClient(self.link)
-
-    @property
-    def reports(self) -> list[Report]:
-        return _Reports(self.can)
+        self.reports: list[Report] = []
+        self._read_count = 0
 
     def poll(self) -> None:
         self.can.heartbeat()
         self.can.poll()
+        self.reports += [
+            Report(one.stamp_s, one.x_m, one.y_m, one.heading_rad, one.vx_mps)
+            for one in self.can.odometry[self._read_count :]
+        ]
+        self._read_count = len(self.can.odometry)
 
     def get_ready(self) -> None:
         self.can.heartbeat()
@@ -63,20 +66,6 @@ class ContractClient:
 
     def close(self) -> None:
         self.can.close()
-
-
-class _Reports(list):  # type: ignore[type-arg]
-    """What the client has by now; `clear` clears it there."""
-
-    def __init__(self, can: CanClient) -> None:
-        super().__init__(
-            Report(sample.stamp_s, sample.x_m, sample.y_m, sample.heading_rad, sample.vx_mps) for sample in can.odometry
-        )
-        self._can = can
-
-    def clear(self) -> None:
-        self._can.odometry.clear()
-        super().clear()
 
 
 class PatientRig(Rig):
