@@ -123,7 +123,8 @@ def parse_plan(plan: type[P], settings: Sequence[str]) -> P:
             values[name] = float(number)
         except ValueError:
             raise ValueError(f"{name}: expected a number, found {number!r}") from None
-    return plan(**values)
+    parsed: P = plan(**values)
+    return parsed
 
 
 def _table(data: bytes) -> dict[str, object]:

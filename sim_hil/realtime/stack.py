@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
 import firmware_bridge
 from edge.state.switches import SwitchOptions
@@ -21,6 +22,7 @@ from sim_hil.protocols.fault_socket import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
 ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
+ProcessName = Literal["robot", "bridge", "runner"]
 READY_LINE = "edge-hil: ready"
 ARMED_LINE = "armed and driving"
 
@@ -185,27 +187,15 @@ class Stack:
         """Check that robot and bridge still run. Raises StepError."""
         self._children.check_others(self.runner)
 
-    def end_runner(self) -> int | None:
-        """End the runner if it still runs; return its exit code, negative for a signal, None without a runner."""
-        code = self._end(self.runner)
-        self.runner = None
-        return code
+    def end(self, name: ProcessName) -> int | None:
+        """End a process and return its exit code, negative for a signal; None if it was not started.
 
-    def end_bridge(self) -> int | None:
-        """End the bridge; return its exit code as `end_runner` does."""
-        code = self._end(self.bridge)
-        self.bridge = None
-        return code
-
-    def end_robot(self) -> int | None:
-        """End the simulated robot, which completes its trace; return its exit code as `end_runner` does."""
-        code = self._end(self.robot)
-        self.robot = None
-        return code
-
-    def _end(self, child: Child | None) -> int | None:
+        Ending the robot completes its trace.
+        """
+        child: Child | None = getattr(self, name)
         if child is None:
             return None
+        setattr(self, name, None)
         self._children.end(child)
         with suppress(ValueError):
             self._children.forget(child)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import hypot
 from pathlib import Path
@@ -259,16 +259,15 @@ def analyse(folder: Path) -> dict[str, Any]:
         "fell": trace.end.get("fell", False),
         "command_gap_ms": [round(float(gap), 4) for gap in trace.command_gap_ms],
         "command_ns": [int(t) for t in trace.command_ns],
-        "truth": [[int(t), *(round(float(v), 3) for v in pose)] for t, pose in _each(trace, 5)],
+        "truth": [
+            [int(t), *(round(float(v), 3) for v in pose)]
+            for t, pose in zip(trace.pose_ns[::5], trace.pose[::5], strict=True)
+        ],
         "nearest_person": _nearest(trace),
         "contacts": trace.contacts,
     }
     write_whole(folder / ANALYSIS, json.dumps(analysis) + "\n")
     return analysis
-
-
-def _each(trace: TraceData, nth: int) -> Iterator[tuple[int, Array]]:
-    return zip(trace.pose_ns[::nth].tolist(), trace.pose[::nth], strict=True)
 
 
 def _nearest(trace: TraceData) -> list[float] | None:

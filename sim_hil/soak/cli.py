@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +23,7 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
+from reporting.progress_line import Progress
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
@@ -34,7 +34,6 @@ from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 MODES: Final = ("async", "sync", "no-reasoning")
-PLAIN_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
 """Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
 not end the run, so that the growth of the runner can be measured."""
@@ -130,15 +129,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"speed limit {options.speed_mps:g} m/s"
         )
     with stop_signals() as stop:
-        progress, failure = _Progress(), ""
-        try:
-            finished = run_legs(
-                soak, options, menu, stopped=lambda: bool(stop), show_status=progress.status, log=progress.log,
-                keep_logs=args.keep_logs,
-            )  # fmt: skip
-        except (StepError, ValueError) as error:
-            finished, failure = False, str(error)
-        progress.end()
+        status, failure = "starting", ""
+
+        def show_status(line: str) -> None:
+            nonlocal status
+            status = line
+            progress.tick()
+
+        with Progress(lambda _elapsed_s: f"edge-soak: {status}") as progress:
+            try:
+                finished = run_legs(
+                    soak, options, menu, stopped=lambda: bool(stop), show_status=show_status, log=_print,
+                    keep_logs=args.keep_logs,
+                )  # fmt: skip
+            except (StepError, ValueError) as error:
+                finished, failure = False, str(error)
         result = soak_result(soak, options, budget, finished=finished)
         write_result(str(soak.path / "result.json"), result)
         write_result(args.json, result)
@@ -208,31 +213,6 @@ def summary_lines(result: Mapping[str, Any]) -> str:
         f"{sum(leg['stops'] for leg in legs)} stops, {sum(leg['faults'] for leg in legs)} faults"
     )
     return "\n".join(rows) + "\n"
-
-
-class _Progress:
-    """Status line on stderr: redrawn on a terminal, otherwise printed every PLAIN_S seconds."""
-
-    def __init__(self) -> None:
-        self._printed_ns = 0
-        self._terminal = sys.stderr.isatty()
-
-    def status(self, line: str) -> None:
-        now_ns = time.monotonic_ns()
-        if self._terminal:
-            sys.stderr.write(f"\r\x1b[Kedge-soak: {line}")
-            sys.stderr.flush()
-        elif now_ns - self._printed_ns >= PLAIN_S * 1e9:
-            self._printed_ns = now_ns
-            _print(line)
-
-    def log(self, line: str) -> None:
-        self.end()
-        _print(line)
-
-    def end(self) -> None:
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
 
 
 def _print(line: str) -> None:

@@ -111,10 +111,10 @@ class Leg:
                 why = "stopped"
             self._end_task("cut")
             if self._stack.runner is not None:
-                code = self._stack.end_runner()
+                code = self._stack.end("runner")
                 self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
-            self._stack.end_bridge()
-            self._stack.end_robot()
+            self._stack.end("bridge")
+            self._stack.end("robot")
             self._note("leg_end", why=why)
         return why
 
@@ -193,8 +193,8 @@ class Leg:
         self._end_task("stopped")
         bridge = self._stack.bridge
         bridge_died = bridge is not None and not bridge.running
-        code = self._stack.end_runner()  # takes a little longer if the bridge was killed
-        self._stack.end_bridge()
+        code = self._stack.end("runner")  # takes a little longer if the bridge was killed
+        self._stack.end("bridge")
         cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
         if explained == CONTACT and not raised & CONTACT_STOPS:
             explained = ""

@@ -52,12 +52,6 @@ def test_a_result_is_written_whole_and_nothing_else_is_left(tmp_path: Path) -> N
     assert [p.name for p in target.parent.iterdir()] == ["result.json"]
 
 
-def test_a_dash_writes_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
-    check_result_target("-")
-    write_result("-", {"a": 1})
-    assert json.loads(capsys.readouterr().out) == {"a": 1}
-
-
 @pytest.mark.parametrize("bad", ["", ".", "/", "/dev/null/result.json"])
 def test_a_place_that_no_file_can_be_written_to_is_refused_beforehand(bad: str) -> None:
     with pytest.raises(OSError, match="--json"):

@@ -13,13 +13,13 @@ from typing import Final
 
 from pymavlink.dialects.v20 import common
 
+from sim_hil.protocols.base import Base
 from sim_hil.protocols.mavlink import parameters, telemetry
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import SetpointError, Sticks, manual_sticks, override_sticks, read_setpoint
 from sim_hil.protocols.mavlink.vehicle import (
     ACCEPTED,
     DENIED,
-    Base,
     Health,
     Station,
     Vehicle,

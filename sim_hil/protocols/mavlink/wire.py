@@ -1,4 +1,4 @@
-"""MAVLink packets in datagrams: encoding, decoding, and counts of invalid input. Pure.
+"""MAVLink packets in datagrams: encoding, decoding, signatures, and counts of invalid input. Pure.
 
 The dialect is pymavlink's `common`, version 2; packets of version 1 are accepted and answered in version 2.
 """
@@ -23,6 +23,11 @@ _V1_HEADER: Final = 6
 _V2_HEADER: Final = 10
 _CRC: Final = 2
 _SIGNED_FLAG: Final = 0x01
+KEY_BYTES: Final = 32
+BLOCK_BYTES: Final = 13  # link id, timestamp 48 bits, signature 48 bits
+TICKS_PER_S: Final = 100_000  # unit of the timestamp: 10 us since 1 January 2015
+EPOCH_UNIX_S: Final = 1_420_070_400
+_NEW_STREAM_BEHIND: Final = 60 * TICKS_PER_S
 # Messages of other dialects are valid, so they are counted separately.
 _UNKNOWN: Final = common.MAVLink_unknown
 
@@ -116,14 +121,6 @@ def now_ticks() -> int:
     return (time.time_ns() - EPOCH_UNIX_S * 1_000_000_000) * TICKS_PER_S // 1_000_000_000
 
 
-KEY_BYTES: Final = 32
-BLOCK_BYTES: Final = 13  # link id, timestamp 48 bits, signature 48 bits
-TICKS_PER_S: Final = 100_000  # unit of the timestamp: 10 us since 1 January 2015
-EPOCH_UNIX_S: Final = 1_420_070_400
-_NEW_STREAM_BEHIND: Final = 60 * TICKS_PER_S
-_SIGNED_FLAG: Final = 0x01
-
-
 def read_key(path: Path) -> bytes:
     """Read the secret key, 64 hexadecimal digits in a file. Raises ValueError or OSError."""
     text = path.read_text(encoding="ascii").strip()
@@ -142,7 +139,11 @@ def signature(key: bytes, packet: bytes) -> bytes:
 
 
 class Verifier:
-    """Verifier of signed packets of all streams; a stream is (link id, system, component)."""
+    """Verifier of signed packets of all streams; a stream is (link id, system, component).
+
+    A timestamp is stored only after the signature is verified (mavlink.io, "Message Signing"): pymavlink's own check
+    stores it first, so that a forged packet from the future makes genuine packets look old.
+    """
 
     def __init__(self, key: bytes, now_ticks: int) -> None:
         """Create a verifier; `now_ticks`: current time as a timestamp, for checking new streams."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import socket
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,7 @@ import pytest
 from sim_hil.hil import command as hil
 from sim_hil.hil import display
 from sim_hil.hil.display import DisplayError, check_display
-from sim_hil.protocols.can.buses import INTERFACES
 from sim_hil.protocols.can.front_end import LinkOptions as CanLink
-from sim_hil.protocols.can.shim import FaultPlan
-from sim_hil.protocols.mavlink.front_end import DEFAULT_LINK
 from sim_hil.protocols.mavlink.front_end import LinkOptions as MavlinkLink
 
 SPOKEN = {"unitree": "go2", "mavlink": "carter", "can": "carter"}
@@ -95,10 +91,3 @@ def test_every_address_in_the_help_is_one_that_its_protocol_takes() -> None:
     assert {protocol for protocol, _ in examples} == {"can", "mavlink"}
     for protocol, link in examples:
         {"can": CanLink, "mavlink": MavlinkLink}[protocol].parse(link)
-
-
-def test_the_help_names_the_forms_and_defaults_of_addresses() -> None:
-    assert f"default    {DEFAULT_LINK}\n" in hil.EPILOG
-    # "virtual" stays inside one process: nobody could reach the robot there.
-    settings = ("camera=", "to=", "system=", "key=", *(each.name for each in fields(FaultPlan)))
-    assert all(name in hil.EPILOG for name in (*settings, *INTERFACES) if name != "virtual")

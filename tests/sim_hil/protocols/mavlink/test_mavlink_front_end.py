@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from sim_hil.protocols.front_end import FrontEndError
-from sim_hil.protocols.mavlink.client import MavlinkClient
 from sim_hil.protocols.mavlink.front_end import LinkOptions, MavlinkFrontEnd, open_front_end
 from sim_hil.protocols.mavlink.udp import MAX_LEARNED
 from sim_hil.protocols.mavlink.vehicle import Mode
 from sim_hil.protocols.mavlink.wire import now_ticks
 from sim_hil.simulation.physics import Simulation
 from tests.support.robot.front_end_contract import FrontEndContract, Report, Rig, options
+from tests.support.robot.mavlink_client import MavlinkClient
 
 
 class ContractClient:
