@@ -1,4 +1,4 @@
-"""Analysis of a leg's files: timing and power from the flight logs, commands and ground truth from the trace.
+"""Analysis of a leg's files: timing, power and worst moments from the flight logs, ground truth from the trace.
 
 All stamps are monotonic ns of one machine, so the runner's ticks and the ground truth share one time axis. The analysis
 also works for a killed leg; incomplete lines are ignored.

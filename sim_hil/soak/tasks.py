@@ -1,4 +1,4 @@
-"""Tasks of a soak: from the robot's current pose to a landmark of the scene, with an instruction. Seeded."""
+"""Tasks of a soak: drawn from the robot's pose to a landmark of the scene, and tracked by ground truth. Seeded."""
 
 from __future__ import annotations
 

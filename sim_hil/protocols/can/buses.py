@@ -1,7 +1,8 @@
 """Non-blocking access to a CAN bus of python-can: one thread receives and one sends.
 
 Interfaces: "serial" (a serial line or a pty), "socketcan" (a real bus), "virtual" (inside one process) and
-"udp_multicast" (several processes of one machine, on its loopback interface only).
+"udp_multicast" (several processes of one machine, on its loopback interface only; python-can's own bus listens on every
+interface and ends at the first datagram that is not a frame).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""End-to-end protection of CAN frames: a CRC-8 and a counter in every frame. Pure functions and state.
+"""CAN frames of the base as described by the DBC file, with end-to-end protection: a CRC-8 and a counter. Pure.
 
 Similar to AUTOSAR E2E profile 1. The CRC covers the identifier, so a frame received under another identifier is
 invalid. Byte 0 contains the CRC, the low half of byte 1 the counter.

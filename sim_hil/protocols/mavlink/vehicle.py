@@ -1,4 +1,9 @@
-"""The rover's three modes, with PX4's numbers (px4_custom_mode.h)."""
+"""State machine of the rover: control by one station, modes, arming, failsafes. Pure: no clock, no network.
+
+All times are the robot's own clock, s. One station is in control: the first that sends a request related to motion. It
+stays in control until it disarms the base or falls silent. Every station may receive reports and stop the base. The
+modes have PX4's numbers (px4_custom_mode.h).
+"""
 
 from __future__ import annotations
 

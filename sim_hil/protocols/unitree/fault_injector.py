@@ -1,4 +1,4 @@
-"""Faults of the sport service: requests that are executed late, not answered, or lost."""
+"""Fault socket of the Unitree front end, and the faults of the sport service: requests executed late or lost."""
 
 from __future__ import annotations
 

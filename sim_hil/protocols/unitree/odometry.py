@@ -1,4 +1,4 @@
-"""Odometry frame of a Go2 with slipping legs: the reported pose drifts from the true one."""
+"""Odometry frame of a Go2: exact, or drifting from the true pose as with slipping legs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lease of a service: while a client has it, requests of other clients are denied. Pure."""
+"""Robot's side of a Unitree request/response service over two DDS topics: server, lease, parsers of parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ ERROR_EXISTS: Final = 3207
 
 
 class Lease:
-    """Lease with at most one holder; ids are times in microseconds, as in the maker's server."""
+    """Lease of a service: while a client has it, requests of other clients are denied.
+
+    Ids are times in microseconds, as in the maker's server.
+    """
 
     def __init__(self, term_us: int = TERM_US) -> None:
         self._term_us = term_us

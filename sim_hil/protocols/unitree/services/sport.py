@@ -1,4 +1,8 @@
-"""Actions and velocities of the sport service, names of all requests, and a summary of received commands."""
+"""Sport service of the simulated Go2: handlers of all requests, their names, and a summary of received commands.
+
+Acrobatics (flips, jumps, hand stand, upright walk) are answered with 3203, not implemented, as by the real robot in a
+mode without them.
+"""
 
 from __future__ import annotations
 

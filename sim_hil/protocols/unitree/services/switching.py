@@ -1,4 +1,4 @@
-"""Services motion_switcher (sport controller or low level) and robot_state, which switch other services. Pure.
+"""Services motion_switcher (sport controller or low level), robot_state (switches services) and vui (settings). Pure.
 
 Error codes: the maker's motion_switcher_error.hpp (7001 parameter, 7002 busy, 7004 name) and robot_state_error.hpp. The
 client turns status 5 of a ServiceSwitch into 5202, service is protected.
