@@ -67,7 +67,7 @@ class Leg:
         stopped: Callable[[], bool],
         show_status: Callable[[str], None],
     ) -> None:
-        self._options = options
+        self.options = options
         self._journey = journey
         self._menu = menu
         self._stopped = stopped
@@ -90,19 +90,19 @@ class Leg:
 
         Raises StepError, OSError or FaultError.
         """
-        folder = self._options.stack.folder
-        stack = asdict(self._options.stack)
+        folder = self.options.stack.folder
+        stack = asdict(self.options.stack)
         about = {
-            **asdict(self._options),
+            **asdict(self.options),
             "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
         }
         (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
         events, samples = (folder / name for name in (EVENTS, SAMPLES))
         with events.open("a") as self._events, samples.open("a") as self._samples, self._stack:
             self._begin_ns = time.monotonic_ns()
-            self._note("leg_begin", scene=self._options.stack.scene, people=self._options.stack.people)
+            self._note("leg_begin", scene=self.options.stack.scene, people=self.options.stack.people)
             if self._menu is not None:
-                schedule = FaultSchedule(self._menu, self._options.seed, self._options.number)
+                schedule = FaultSchedule(self._menu, self.options.seed, self.options.number)
                 self._injector = Injector(self._stack, schedule, self._note)
             try:
                 self._stack.start_robot(self._wait)
@@ -161,7 +161,7 @@ class Leg:
             now_ns = time.monotonic_ns()
             if self._injector is not None:
                 self._injector.step(now_ns)
-            if self._left_s(now_ns) <= 0:
+            if self.left_s(now_ns) <= 0:
                 return "duration"
             if end is not None:
                 self._end_task(end)
@@ -280,15 +280,15 @@ class Leg:
         }
         _append(self._samples, sample)
         self._show_status(
-            f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
+            f"leg {self.options.number}, {max(0.0, self.left_s(now_ns)):.0f} s left · "
             f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
             + (f" · {sample['fault']}" if sample["fault"] else "")
         )
 
-    def _left_s(self, now_ns: int) -> float:
+    def left_s(self, now_ns: int) -> float:
         """Return the remaining time, s; a leg's time begins when its first runner drives."""
         begun_ns = now_ns if self._driven_ns is None else self._driven_ns
-        return self._options.duration_s - (now_ns - begun_ns) / 1e9
+        return self.options.duration_s - (now_ns - begun_ns) / 1e9
 
     def _note(self, kind: str, **fields: Any) -> None:
         _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
