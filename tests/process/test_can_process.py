@@ -44,7 +44,7 @@ def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> N
         hil.wait(30)
     assert hil.returncode == 0
     wire = json.loads(result.read_text(encoding="utf-8"))
-    # On a busy machine the run may begin late or stutter, never drive further than it was told.
+    # On a busy machine the run may begin late or stutter, but never drives further than commanded.
     assert 0.2 < driven["moved_m"] < 0.9 and abs(driven["end_speed_mps"]) < 0.02
     assert driven["base_counted"]["CrcErrors"] == 0
     assert wire["path_m"] == pytest.approx(driven["moved_m"], abs=0.1)

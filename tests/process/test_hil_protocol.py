@@ -42,7 +42,7 @@ pytestmark = pytest.mark.process
 class TestRenderProcess:
     @pytest.fixture
     def started(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RenderProcess]:
-        """Starts a camera process that says one line and then waits for the end of its input."""
+        """Starts a camera process that writes one line and then waits for the end of its input."""
 
         def start(line: str, then: str = "exec cat") -> RenderProcess:
             script = tmp_path / "camera"
@@ -116,7 +116,7 @@ class TestRealProcess:
                 client.call(api_id, "{}", timeout_s=20)
             assert error.value.code == code
 
-    def test_it_stands_up_and_walks_as_told(self, bus: Bus, reader: Go2Reader) -> None:
+    def test_it_stands_up_and_walks_as_commanded(self, bus: Bus, reader: Go2Reader) -> None:
         client = RpcClient(bus, ids.SPORT_SERVICE)
         client.call(ids.STAND_UP, timeout_s=20)
         wait_for(lambda: reader.state().mode == ids.MODE_JOINT_LOCK, 20, "standing")
@@ -149,7 +149,7 @@ class TestRealProcess:
         assert pictures[0].shape == (180, 320, 3)
         assert float(np.abs(pictures[0].astype(int) - pictures[1]).mean()) > 5
 
-    def test_the_trace_has_what_was_on_the_wire(self, hil: tuple[Running, Path]) -> None:
+    def test_the_trace_contains_the_requests_on_the_wire(self, hil: tuple[Running, Path]) -> None:
         def names() -> list[str]:
             return [line["name"] for line in read_trace(hil[1] / "t.jsonl") if line["kind"] == "wire"]
 
@@ -189,7 +189,7 @@ def _alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_dead_camera_process_ends_the_robot_and_says_so(dds_domain: int, tmp_path: Path) -> None:
+def test_a_dead_camera_process_ends_the_robot_with_an_error(dds_domain: int, tmp_path: Path) -> None:
     with running("sim_hil.hil.command", *hil_arguments(dds_domain), folder=tmp_path) as started:
         os.kill(_camera_pid(started.pid), signal.SIGKILL)
         assert started.process.wait(20) == 1
@@ -311,7 +311,7 @@ sys.exit(hil.main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_a_signal_is_heard_while_the_camera_still_starts(dds_domain: int, tmp_path: Path) -> None:
+def test_a_signal_ends_it_while_the_camera_still_starts(dds_domain: int, tmp_path: Path) -> None:
     arguments = map(str, hil_arguments(dds_domain, "--json", tmp_path / "r.json"))
     with subprocess.Popen(
         [sys.executable, "-m", "sim_hil.hil.command", *arguments], cwd=REPOSITORY, stderr=subprocess.PIPE, text=True
@@ -322,9 +322,9 @@ def test_a_signal_is_heard_while_the_camera_still_starts(dds_domain: int, tmp_pa
             hil.children()[0].suspend()  # a camera that never gets ready
             time.sleep(0.2)
             process.terminate()
-            _, said = process.communicate(timeout=20)
+            _, error = process.communicate(timeout=20)
         finally:
             process.kill()
-    assert process.returncode == 0, said
-    assert "ready" not in said
+    assert process.returncode == 0, error
+    assert "ready" not in error
     assert json.loads((tmp_path / "r.json").read_text())["duration_s"] == 0.0

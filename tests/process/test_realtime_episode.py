@@ -24,7 +24,7 @@ ALONE = {"jobs": 1, "cluster": False, "video": "none"}
 S = 1_000_000_000
 
 
-def test_artifacts_on_one_stack_at_a_time_are_what_it_takes() -> None:
+def test_artifacts_on_one_stack_at_a_time_are_accepted() -> None:
     check_realtime(GOOD, jobs=1, cluster=False, video="none")
 
 
@@ -42,7 +42,7 @@ def test_conditions_that_need_virtual_time_are_refused(conditions: Conditions, n
 
 
 @pytest.mark.parametrize("jobs, cluster, video", [(2, False, "none"), (1, True, "none"), (1, False, "all")])
-def test_what_would_disturb_the_clock_is_refused(jobs: int, cluster: bool, video: str) -> None:
+def test_options_that_disturb_the_clock_are_refused(jobs: int, cluster: bool, video: str) -> None:
     with pytest.raises(ConditionsError, match="--clock realtime"):
         check_realtime(GOOD, jobs=jobs, cluster=cluster, video=video)
 

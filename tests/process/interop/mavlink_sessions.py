@@ -1,4 +1,4 @@
-"""Runs `edge-hil --protocol mavlink` beside somebody else's client and collects what both saw."""
+"""Runs `edge-hil --protocol mavlink` with another project's client and collects the results of both."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class TestServices:
         assert session["avoid_moved_m"] > 0.4
         assert session["avoid_increment_m"] == pytest.approx(0.5, abs=0.15)
 
-    def test_a_lease_denies_everybody_else_until_its_holder_has_gone(self, session: dict) -> None:
+    def test_a_lease_denies_all_other_clients_until_its_holder_ends(self, session: dict) -> None:
         assert session["lease_holder"] == [0, 0, 0]
         assert session["lease_others"] == 3205
         assert session["lease_question"] == [0, False]

@@ -61,7 +61,7 @@ def studio() -> Iterator[Studio]:
     studio.close()
 
 
-def test_a_picture_is_made_after_it_was_asked_for_and_says_when(studio: Studio) -> None:
+def test_an_image_is_rendered_after_its_request_and_has_a_stamp(studio: Studio) -> None:
     time.sleep(0.05)
     assert studio.made == 0, "nobody looks"
     response = studio.get("/frame.jpg")
@@ -83,7 +83,7 @@ def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
     stream.close()
 
 
-def test_whoever_leaves_is_forgotten(studio: Studio) -> None:
+def test_a_disconnected_client_is_removed(studio: Studio) -> None:
     stream = studio.get("/stream.mjpg")
     stream.readline()
     stream.close()

@@ -50,7 +50,7 @@ def test_a_display_of_this_machine_is_reached_by_its_socket(tmp_path: Path, name
         check_display(name, str(tmp_path))
 
 
-def test_a_display_whose_server_has_died_is_not_taken_for_one(tmp_path: Path) -> None:
+def test_a_socket_without_a_server_is_no_display(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "X7"))
     assert (tmp_path / "X7").exists()

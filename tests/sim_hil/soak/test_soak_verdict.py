@@ -39,7 +39,7 @@ def test_a_steady_growth_is_found_per_hour() -> None:
     assert found is not None and found.per_h == pytest.approx(12.0, abs=1e-6)
 
 
-def test_what_does_not_grow_has_an_interval_around_zero() -> None:
+def test_a_constant_value_has_an_interval_around_zero() -> None:
     found = slope(*grown(0.0, noise=0.5))
     assert found is not None and found.low <= 0.0 <= found.high
 
@@ -77,7 +77,7 @@ def test_growth_whose_interval_reaches_the_limit_is_undecided() -> None:
     assert judge(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0))["verdict"] == FAIL
 
 
-def test_what_was_not_measured_is_undecided_and_says_why() -> None:
+def test_an_unmeasured_line_is_undecided_with_a_reason() -> None:
     found = judge(LIMIT, Measure(None, "", 0, note="too short"))
     assert (found["verdict"], found["why"]) == (UNDECIDED, "too short")
 

@@ -1,4 +1,4 @@
-"""Counter and CRC of the base's frames: what is right passes, whatever is wrong is told from it."""
+"""Counter and CRC of the base's frames: valid frames pass, invalid ones get their verdict."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_crc_of_the_standard_text_is_the_published_one() -> None:
 
 
 @given(messages_with_values())
-def test_what_is_encoded_is_what_is_decoded(message: tuple[str, dict[str, float]]) -> None:
+def test_decoding_is_the_inverse_of_encoding(message: tuple[str, dict[str, float]]) -> None:
     name, values = message
     node = frames.database().get_message_by_name(name).senders[0]
     encoder, decoder = Encoder(), Decoder(node)
@@ -86,7 +86,7 @@ def test_a_frame_of_another_length_is_wrong() -> None:
     assert Checker(6).check(Frame(272, data)) is Verdict.WRONG_LENGTH
 
 
-def test_a_repeated_frame_is_told_from_a_new_one() -> None:
+def test_a_repeated_frame_is_distinguished_from_a_new_one() -> None:
     checker = Checker(6)
     assert [checker.check(velocity(n)) for n in (0, 1, 1, 1, 2)] == [
         Verdict.FIRST, Verdict.GOOD, Verdict.REPEATED, Verdict.REPEATED, Verdict.GOOD,
@@ -103,7 +103,7 @@ def test_lost_frames_are_counted_by_the_gap_in_the_counter(start: int, lost: int
 
 
 @given(st.integers(0, COUNTER_PERIOD - 1), st.integers(1, COUNTER_PERIOD - MAX_AHEAD - 1))
-def test_an_old_frame_that_comes_late_is_not_obeyed_and_the_stream_goes_on(start: int, back: int) -> None:
+def test_a_late_old_frame_is_not_obeyed_and_the_stream_continues(start: int, back: int) -> None:
     checker = Checker(6)
     for step in range(3):
         checker.check(velocity((start + step) % COUNTER_PERIOD))

@@ -189,7 +189,7 @@ def test_the_red_button_stops_it_and_a_reset_needs_it_released(ask: tuple[Rig, C
     rig.until(lambda: _can(rig).state == frames.STATE_IDLE, 2.0, "idle")
 
 
-def test_a_bus_that_is_switched_off_stops_the_base_and_comes_back(ask: tuple[Rig, Callable[..., object]]) -> None:
+def test_bus_off_stops_the_base_until_the_bus_is_on_again(ask: tuple[Rig, Callable[..., object]]) -> None:
     rig, switch = ask
     rig.make_ready()
     rig.run(0.5, lambda: rig.tell(lambda: rig.client.drive(0.4, 0.0)))
@@ -207,7 +207,7 @@ def test_a_bus_that_is_switched_off_stops_the_base_and_comes_back(ask: tuple[Rig
     [{}, {"fault": "drip"}, {"fault": "drop"}, {"fault": "drop", "value": 2}, {"fault": "drop", "value": "x"},
      {"fault": "button", "on": 1}, {"fault": "drop", "value": 0.1, "colour": "red"}, {"fault": "button", "value": 1}],
 )  # fmt: skip
-def test_a_fault_that_there_is_not_is_answered_with_what_there_is(
+def test_an_invalid_fault_request_is_answered_with_an_error(
     ask: tuple[Rig, Callable[..., dict[str, object]]], command: dict[str, object]
 ) -> None:
     assert "expected" in str(ask[1](**command)["error"])
@@ -236,7 +236,7 @@ def test_a_fault_is_switched_on_and_off_and_all_are_cleared(ask: tuple[Rig, Call
         "virtual:x,drop=2",
     ],
 )
-def test_a_link_that_makes_no_sense_is_refused_in_one_line(link: str) -> None:
+def test_an_invalid_link_is_refused_in_one_line(link: str) -> None:
     with pytest.raises(FrontEndError) as caught:
         LinkOptions.parse(link)
     assert "\n" not in str(caught.value) and "expected" in str(caught.value)
@@ -252,7 +252,7 @@ def test_without_a_link_the_line_is_in_a_folder_of_this_user_alone(
 
 
 @pytest.mark.parametrize("kind", ["open", "link", "file"])
-def test_a_folder_that_somebody_else_may_have_made_is_refused_in_one_line(
+def test_a_folder_that_another_user_could_have_made_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -269,7 +269,7 @@ def test_a_folder_that_somebody_else_may_have_made_is_refused_in_one_line(
         LinkOptions.parse(None)
 
 
-def test_a_bus_that_is_not_there_is_refused_in_one_line() -> None:
+def test_an_absent_bus_is_refused_in_one_line() -> None:
     asked = options("carter", link="socketcan:no-such-bus")
     simulation = Simulation(asked.scene, people=0, seed=0, robot="carter")
     try:

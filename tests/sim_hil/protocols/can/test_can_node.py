@@ -31,23 +31,23 @@ class Bench:
         self.decoder = Decoder("Base")
         self.tick = 0
         self.sensors = REST
-        self.said: list[Received] = []
+        self.reports: list[Received] = []
         self.sent: list[Frame] = []
 
     @property
     def now_s(self) -> float:
         return self.tick * TICK_S
 
-    def say(self, name: str, times: int = 1, **signals: float) -> list[Received | None]:
+    def send(self, name: str, times: int = 1, **signals: float) -> list[Received | None]:
         return [self.node.receive(self.encoder.encode(name, **signals), self.now_s) for _ in range(times)]
 
     def drive(self, vx: float, wz: float = 0.0, times: int = 1) -> None:
-        self.say("VelocityCommand", times, Vx=vx, Wz=wz)
+        self.send("VelocityCommand", times, Vx=vx, Wz=wz)
 
     def run(self, seconds: float, *, alive: bool = True, vx: float | None = None) -> None:
         for _ in range(round(seconds / TICK_S)):
             if alive and self.tick % 50 == 0:
-                self.say("ControllerHeartbeat")
+                self.send("ControllerHeartbeat")
             if vx is not None and self.tick % 10 == 0:
                 self.drive(vx)
             self.tick += 1
@@ -56,16 +56,16 @@ class Bench:
                 self.sent.append(frame)
                 received = self.decoder.decode(frame)
                 assert received is not None
-                self.said.append(received)
+                self.reports.append(received)
 
     def armed(self) -> Bench:
-        self.say("ControllerHeartbeat", 2)
-        self.say("ModeCommand", 3, Request=frames.MODE_ARM)
+        self.send("ControllerHeartbeat", 2)
+        self.send("ModeCommand", 3, Request=frames.MODE_ARM)
         assert self.node.state == frames.STATE_ARMED
         return self
 
     def last(self, name: str) -> dict[str, float]:
-        return next(dict(received.signals) for received in reversed(self.said) if received.name == name)
+        return next(dict(received.signals) for received in reversed(self.reports) if received.name == name)
 
     def stopped_after_s(self, limit_s: float = 2.0) -> float:
         """How long the base goes on obeying its last velocity from now."""
@@ -88,20 +88,20 @@ def test_it_starts_idle_and_obeys_no_velocity(bench: Bench) -> None:
 
 
 def test_it_is_not_armed_without_the_controllers_heartbeat(bench: Bench) -> None:
-    bench.say("ModeCommand", 3, Request=frames.MODE_ARM)
+    bench.send("ModeCommand", 3, Request=frames.MODE_ARM)
     assert bench.node.state == frames.STATE_IDLE
 
 
 def test_it_is_not_armed_with_an_empty_battery(bench: Bench) -> None:
     bench.sensors = replace(REST, charge_percent=8.0)
     bench.run(0.2)
-    bench.say("ModeCommand", 3, Request=frames.MODE_ARM)
+    bench.send("ModeCommand", 3, Request=frames.MODE_ARM)
     bench.run(0.1)
     assert bench.node.state == frames.STATE_IDLE
     assert bench.last("Faults")["BatteryLow"] == 1
 
 
-def test_100_ms_without_a_velocity_stop_it_and_it_says_so(bench: Bench) -> None:
+def test_100_ms_without_a_velocity_stop_it_and_raise_a_fault_bit(bench: Bench) -> None:
     bench.armed()
     bench.run(0.2, vx=0.5)
     bench.drive(0.5)
@@ -158,9 +158,9 @@ def test_half_a_second_without_a_heartbeat_disarms_it(bench: Bench) -> None:
 
 def test_an_emergency_stop_over_the_bus_is_latched(bench: Bench) -> None:
     bench.armed().drive(0.5, times=2)
-    bench.say("EstopControl", 1, Request=frames.ESTOP_STOP)
+    bench.send("EstopControl", 1, Request=frames.ESTOP_STOP)
     assert bench.base.stopped and bench.node.state == frames.STATE_ESTOP
-    bench.say("ModeCommand", 3, Request=frames.MODE_ARM)
+    bench.send("ModeCommand", 3, Request=frames.MODE_ARM)
     bench.run(0.2, vx=0.5)
     assert bench.base.stopped and not bench.base.powered
     assert bench.last("EstopState") == pytest.approx(
@@ -187,8 +187,8 @@ def test_a_stop_frame_with_a_wrong_crc_does_not_stop(bench: Bench) -> None:
 
 def test_a_reset_makes_it_idle_and_no_more(bench: Bench) -> None:
     bench.armed()
-    bench.say("EstopControl", 3, Request=frames.ESTOP_STOP)
-    bench.say("EstopControl", 3, Request=frames.ESTOP_RESET)
+    bench.send("EstopControl", 3, Request=frames.ESTOP_STOP)
+    bench.send("EstopControl", 3, Request=frames.ESTOP_RESET)
     assert bench.node.state == frames.STATE_IDLE
     assert not bench.base.stopped and not bench.base.powered
 
@@ -198,18 +198,18 @@ def test_while_the_button_is_held_a_reset_is_refused(bench: Bench) -> None:
     bench.node.button = True
     bench.run(0.02)
     assert bench.base.stopped
-    bench.say("EstopControl", 3, Request=frames.ESTOP_RESET)
+    bench.send("EstopControl", 3, Request=frames.ESTOP_RESET)
     assert bench.node.state == frames.STATE_ESTOP
     bench.run(0.1)
     assert (bench.last("EstopState")["Button"], bench.last("EstopState")["Source"]) == (1, frames.SOURCE_BUTTON)
     bench.node.button = False
-    bench.say("EstopControl", 3, Request=frames.ESTOP_RESET)
+    bench.send("EstopControl", 3, Request=frames.ESTOP_RESET)
     assert bench.node.state == frames.STATE_IDLE
 
 
-def test_a_bumper_that_is_hit_is_told_within_10_ms(bench: Bench) -> None:
+def test_a_bumper_contact_is_reported_within_10_ms(bench: Bench) -> None:
     bench.run(0.3)
-    bench.said.clear()
+    bench.reports.clear()
     bench.sensors = replace(REST, bumpers=(True, False, False, False))
     bench.run(0.01)
     assert bench.last("Faults")["BumperFront"] == 1
@@ -227,18 +227,18 @@ def test_bus_off_disarms_and_silences_it_until_it_has_recovered(bench: Bench) ->
     assert not bench.node.bus_off and len(bench.sent) > sent
     assert bench.last("Faults")["BusOffs"] == 1
     bench.run(0.3, vx=0.5)
-    assert bench.node.state == frames.STATE_IDLE, "whoever drives arms it again"
+    assert bench.node.state == frames.STATE_IDLE, "a controller has to arm it again"
     bench.armed()
 
 
-def test_it_comes_back_at_once_when_the_controller_of_the_bus_says_that_it_has_restarted(bench: Bench) -> None:
+def test_it_rejoins_the_bus_at_once_after_a_restart_error_frame(bench: Bench) -> None:
     bench.node.receive(Frame(ERROR_BUS_OFF, bytes(8), error=True), bench.now_s)
     bench.node.receive(Frame(ERROR_RESTARTED, bytes(8), error=True), bench.now_s)
     bench.run(TICK_S)
     assert bench.sent
 
 
-def test_other_error_frames_and_other_peoples_frames_change_nothing(bench: Bench) -> None:
+def test_other_error_frames_and_unknown_frames_change_nothing(bench: Bench) -> None:
     bench.armed().drive(0.5, times=2)
     bench.node.receive(Frame(0x004, bytes(8), error=True), bench.now_s)
     bench.node.receive(Frame(0x123, b"hello"), bench.now_s)
@@ -248,19 +248,19 @@ def test_other_error_frames_and_other_peoples_frames_change_nothing(bench: Bench
 
 def test_disarming_takes_the_drives_power(bench: Bench) -> None:
     bench.armed()
-    bench.say("ModeCommand", 3, Request=frames.MODE_DISARM)
+    bench.send("ModeCommand", 3, Request=frames.MODE_DISARM)
     assert not bench.base.powered and bench.node.state == frames.STATE_IDLE
 
 
 def test_every_message_is_sent_in_its_cycle_time(bench: Bench) -> None:
     bench.run(2.0)
     for name, period_s in frames.periods_s("Base").items():
-        sent = sum(received.name == name for received in bench.said)
+        sent = sum(received.name == name for received in bench.reports)
         # The reports of changes come on top: the first heartbeat is one.
         assert sent == pytest.approx(2.0 / period_s, abs=3), name
 
 
-def test_it_reports_what_it_measures(bench: Bench) -> None:
+def test_it_reports_its_sensor_readings(bench: Bench) -> None:
     bench.sensors = Sensors(
         T_odom_base=SE2(1.5, -0.25, 3.5), v_mps=0.5, w_radps=-0.25, wheel_radps=(3.0, -4.0), wheel_nm=(1.25, -2.5),
         wheel_counts=(-1, 70_000), gyro_radps=(0.01, -0.02, 0.3), accel_mps2=(0.5, -0.1, 9.8), charge_percent=62.5,
@@ -287,7 +287,7 @@ def test_it_reports_what_it_measures(bench: Bench) -> None:
 def test_the_two_frames_of_an_odometry_sample_have_the_same_counter(bench: Bench) -> None:
     bench.run(0.5)
     counters = {
-        name: [received.signals["Counter"] for received in bench.said if received.name == name]
+        name: [received.signals["Counter"] for received in bench.reports if received.name == name]
         for name in ("OdometryPosition", "OdometryMotion")
     }
     assert counters["OdometryPosition"] == counters["OdometryMotion"]

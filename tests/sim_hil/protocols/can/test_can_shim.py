@@ -51,7 +51,7 @@ def test_another_fault_does_not_move_the_dice_of_the_first() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
-def test_frames_are_dropped_as_often_as_asked(share: float) -> None:
+def test_frames_are_dropped_at_the_given_share(share: float) -> None:
     assert len(passed(FaultPlan(drop=share))) == pytest.approx(COUNT * (1 - share), rel=0.1)
 
 
@@ -73,7 +73,7 @@ def test_a_corrupted_frame_is_never_taken_for_a_good_one() -> None:
             assert received is not None and not received.good
 
 
-def test_while_the_bus_is_off_nothing_passes_and_both_ends_of_it_are_told() -> None:
+def test_no_frame_passes_a_bus_that_is_off_and_error_frames_mark_both_ends() -> None:
     plan = FaultPlan(bus_off_every_s=1.0, bus_off_s=0.25)
     arrived = passed(plan)
     errors = [frame.identifier for frame in arrived if frame.error]
@@ -90,7 +90,7 @@ def test_a_babbling_idiot_fills_the_bus_and_starves_the_others() -> None:
     assert len(babble) == pytest.approx((COUNT * TICK_S + 10.5 - 2.0) / FRAME_S, rel=0.01)
 
 
-def test_a_babbler_that_is_switched_on_late_says_nothing_of_the_time_before() -> None:
+def test_a_babbler_sends_no_frames_for_the_time_before_it_was_switched_on() -> None:
     shim = FaultShim(FaultPlan(), 0, 0)
     shim.take(600.0)
     shim.plan = FaultPlan(babble_hz=1000.0)

@@ -114,7 +114,7 @@ def test_a_second_station_watches_and_does_not_drive(rig: Rig) -> None:
         assert "ODOMETRY" in other.latest and _wire(rig)["not_in_control"] > 0
         assert math.dist(before, rig.place()) < 0.02
         rig.tell(other.emergency_stop)
-        rig.until(lambda: not _client(rig).armed, 1.0, "the stop that anybody may ask for")
+        rig.until(lambda: not _client(rig).armed, 1.0, "the stop that every station may request")
     finally:
         other.close()
 
@@ -167,7 +167,7 @@ def test_a_wrong_link_is_refused_in_one_line(link: str) -> None:
         LinkOptions.parse(link)
 
 
-def test_it_listens_on_the_loopback_unless_told_otherwise() -> None:
+def test_it_listens_on_the_loopback_by_default() -> None:
     assert LinkOptions.parse(None).bind[0] == "127.0.0.1"
 
 

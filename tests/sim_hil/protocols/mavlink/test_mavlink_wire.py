@@ -131,13 +131,13 @@ def test_a_number_that_is_not_finite_is_refused(field: str, value: float) -> Non
 
 
 @given(st.integers(0, 65535), st.integers(0, 65535))
-def test_sticks_stay_within_their_range_whatever_the_channels_say(steering: int, throttle: int) -> None:
+def test_sticks_stay_within_their_range_for_all_channel_values(steering: int, throttle: int) -> None:
     sticks = override_sticks(common.MAVLink_rc_channels_override_message(1, 1, steering, 0, throttle, 0, 0, 0, 0, 0))
     assert sticks is None or (-1 <= sticks.ahead <= 1 and -1 <= sticks.right <= 1)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_parameter_comes_back_as_it_is(name: str) -> None:
+def test_decoding_a_parameter_is_the_inverse_of_encoding(name: str) -> None:
     message = Parameters().message(name)
     assert decode_value(message.param_value, message.param_type) == pytest.approx(TABLE[name].default)
     assert message.param_count == len(NAMES) and NAMES[message.param_index] == message.param_id == name

@@ -239,7 +239,7 @@ def test_a_slow_camera_answers_when_its_delay_is_over(camera: Camera) -> None:
     assert len(camera.server.answers) == 1
 
 
-def test_a_camera_at_half_rate_makes_whoever_asks_too_soon_wait(camera: Camera) -> None:
+def test_a_camera_at_half_rate_delays_early_requests(camera: Camera) -> None:
     camera.tell(command("camera-half-rate", rate_hz=10).line())
     assert len(camera.ask()) == 1 and camera.ask() == []
     time.sleep(0.11)
@@ -274,7 +274,7 @@ def test_clear_makes_everything_well(camera: Camera) -> None:
     assert len(camera.ask()) == 1
 
 
-def test_the_camera_ends_with_whoever_commands_its_faults(camera: Camera) -> None:
+def test_the_camera_ends_with_its_parent(camera: Camera) -> None:
     assert camera.tell(command("camera-stop").line())
     camera.close()
     assert not camera.hub.listen()

@@ -44,12 +44,12 @@ class TestAvoidance:
         turned = Box((3.0 * c, 3.0 * s, 1.0), (c, s), (0.2, 4.0, 2.0))
         assert RangeFinder([turned]).free_m(0.0, 0.0, turn, self.nobody) == pytest.approx(2.9, abs=1e-6)
 
-    def test_what_is_beside_the_robot_is_in_its_way_and_what_is_further_out_is_not(self) -> None:
+    def test_only_obstacles_within_the_robots_width_count(self) -> None:
         finder = RangeFinder([Box((2.0, 0.3, 0.5), (1.0, 0.0), (0.2, 0.1, 1.0))])
         assert finder.free_m(0.0, 0.0, 0.0, self.nobody) == pytest.approx(1.9)
         assert finder.free_m(0.0, -0.1, 0.0, self.nobody) == RANGE_M
 
-    def test_a_lamp_above_and_a_stripe_on_the_floor_stop_nobody(self) -> None:
+    def test_a_lamp_above_and_a_stripe_on_the_floor_do_not_count(self) -> None:
         boxes = [Box((1.0, 0.0, z), (1.0, 0.0), (0.5, 4.0, 0.02)) for z in (0.01, 2.5)]
         assert RangeFinder(boxes).free_m(0.0, 0.0, 0.0, self.nobody) == RANGE_M
 
@@ -93,7 +93,7 @@ class TestAvoidance:
         desk.run(0.4)
         assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
 
-    def test_its_moves_are_ignored_until_the_api_is_said_to_command(self, desk: Desk) -> None:
+    def test_its_moves_are_ignored_until_the_api_takes_command(self, desk: Desk) -> None:
         desk.avoid.handle(1003, '{"x": 0.4, "y": 0, "yaw": 0, "mode": 0}')
         assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
 

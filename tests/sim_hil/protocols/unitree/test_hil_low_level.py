@@ -64,7 +64,7 @@ def test_a_command_that_was_changed_on_the_way_is_ignored(joint: int, field: str
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_no_number_is_ignored_whatever_its_checksum(value: float) -> None:
+def test_a_command_with_a_non_finite_number_is_ignored(value: float) -> None:
     low = command()
     low.motor_cmd[3].tau = value
     low.crc = low_command_crc(low)

@@ -41,7 +41,7 @@ class TestLease:
         assert not lease.denies(given_id, S + 1)
         assert lease.denies(0, S + 1) and lease.denies(given_id + 1, S + 1)
 
-    def test_a_second_one_is_told_that_it_exists(self) -> None:
+    def test_a_second_application_is_refused(self) -> None:
         lease = Lease()
         self.apply(lease, S)
         assert self.apply(lease, S + S // 2) == (3207, "")
@@ -154,7 +154,7 @@ class TestPostures:
         assert stage.behaviour.mode == 1
 
     @pytest.mark.parametrize("api_id", [1009, 1016, 1028])
-    def test_what_needs_a_stand_is_refused_on_the_floor(self, desk: Desk, api_id: int) -> None:
+    def test_postures_are_refused_while_lying(self, desk: Desk, api_id: int) -> None:
         desk.ask(1005)
         desk.run(2.0)
         assert desk.ask(api_id, data=True) == (4202, "")
@@ -168,7 +168,9 @@ class TestPostures:
         [(1007, {"x": 1}), (1008, {"x": 1, "y": 0}), (1015, {"data": 3}), (1027, {"data": "on"}), (1028, {}),
          (2048, {}), (2049, {}), (2054, {"data": 2})],
     )  # fmt: skip
-    def test_a_wrong_parameter_is_said_to_be_one(self, desk: Desk, api_id: int, parameter: dict[str, object]) -> None:
+    def test_an_invalid_parameter_has_its_error_code(
+        self, desk: Desk, api_id: int, parameter: dict[str, object]
+    ) -> None:
         assert desk.ask(api_id, **parameter) == (3204, "")
 
     def test_damp_ends_a_show_at_once(self, desk: Desk) -> None:
@@ -199,7 +201,7 @@ class TestGaits:
         assert self.top_speed(desk) == pytest.approx(0.8)
 
     @pytest.mark.parametrize("told", [True, False])
-    def test_a_fallen_robot_gets_up_by_itself_only_when_it_was_told_to(self, desk: Desk, told: bool) -> None:
+    def test_a_fallen_robot_stands_up_by_itself_only_with_auto_recovery(self, desk: Desk, told: bool) -> None:
         assert desk.ask(2054, data=told) == (0, "") and json.loads(desk.ask(2055)[1]) == {"data": told}
         desk.measured = desk.measured._replace(up=0.1)
         desk.run(0.1)
@@ -261,13 +263,13 @@ class TestVui:
     @pytest.mark.parametrize(
         ("api_id", "key", "value"), [(1001, "enable", 0), (1003, "volume", 3), (1005, "brightness", 7)]
     )
-    def test_what_is_set_is_read_back(self, api_id: int, key: str, value: int) -> None:
+    def test_a_setting_is_read_back(self, api_id: int, key: str, value: int) -> None:
         vui = Vui()
         assert vui.handle(api_id, json.dumps({key: value})) == (0, "")
         code, data = vui.handle(api_id + 1, "{}")
         assert (code, json.loads(data)) == (0, {key: value})
 
     @pytest.mark.parametrize("parameter", ["", '{"volume": 11}', '{"volume": 1.5}', '{"volume": -1}'])
-    def test_what_no_knob_has_is_a_parameter_error(self, parameter: str) -> None:
+    def test_an_invalid_setting_is_a_parameter_error(self, parameter: str) -> None:
         assert Vui().handle(1003, parameter) == (3204, "")
         assert Vui().handle(9999, parameter) == (3203, "")

@@ -73,7 +73,7 @@ class TestUnitree(FrontEndContract):
         rig.close()
 
 
-def test_what_was_opened_is_closed_in_reverse_when_a_later_step_fails(
+def test_opened_resources_are_closed_in_reverse_if_a_later_step_fails(
     dds_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed: list[str] = []
