@@ -1,13 +1,60 @@
-"""Odometry frame of a Go2 with slipping legs: the reported pose drifts from the true one."""
+"""Odometry frame of a Go2: exact, or drifting from the true pose as with slipping legs."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from edge.core.geometry import SE2
-from sim_hil.protocols.unitree.state import OdometryFrame, turned_quaternion
 from sim_hil.robots.go2.body import RobotTruth
 from sim_hil.robots.odometry_noise import OdometryNoise
+
+
+class OdometryFrame:
+    """Frame in which a Go2 reports its pose: position and heading at switch-on."""
+
+    def __init__(self, start: tuple[float, float, float]) -> None:
+        """Create the frame; `start`: T_world_odom as (x_m, y_m, theta_rad)."""
+        self._x_m, self._y_m, self._theta_rad = start
+        self._cos, self._sin = math.cos(start[2]), math.sin(start[2])
+
+    def rotate(self, vector: Any) -> list[float]:
+        """Rotate a world vector [3] into the odometry frame."""
+        x, y, z = (float(v) for v in vector)
+        return [self._cos * x + self._sin * y, self._cos * y - self._sin * x, z]
+
+    def position(self, position_m: Any) -> list[float]:
+        """Transform a world position [3], m, into the odometry frame."""
+        x, y, z = (float(v) for v in position_m)
+        return self.rotate((x - self._x_m, y - self._y_m, z))
+
+    def rpy(self, rpy_rad: Any) -> list[float]:
+        """Transform roll, pitch and yaw [3], rad, into the odometry frame; yaw in (-pi, pi]."""
+        roll, pitch, yaw = (float(v) for v in rpy_rad)
+        turned = yaw - self._theta_rad
+        return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
+
+    def quaternion(self, wxyz: Any) -> list[float]:
+        """Transform an orientation (w, x, y, z) into the odometry frame."""
+        return turned_quaternion([float(v) for v in wxyz], -self._theta_rad)
+
+    def velocity(self, vector: object) -> list[float]:
+        """Return a world velocity [3] as the robot reports it, m/s, in the odometry frame."""
+        return self.rotate(vector)
+
+    def yaw_speed(self, wz_radps: float) -> float:
+        """Return a yaw rate as the robot reports it, rad/s."""
+        return wz_radps
+
+    def update(self, truth: RobotTruth) -> None:
+        """Advance to a new instant, before its messages are made; exact odometry does nothing."""
+
+
+def turned_quaternion(wxyz: list[float], yaw_rad: float) -> list[float]:
+    """Rotate an orientation (w, x, y, z) by a yaw angle about the frame's z axis."""
+    w, x, y, z = wxyz
+    c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
 
 
 class DriftingOdometry(OdometryFrame):

@@ -11,8 +11,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import common
 
-from sim_hil.protocols.mavlink.modes import Mode, custom_mode_of
 from sim_hil.protocols.mavlink.udp import Address
+from sim_hil.protocols.mavlink.vehicle import Mode, custom_mode_of
 from sim_hil.protocols.mavlink.wire import Message, Reader, Writer
 
 VELOCITY_AND_YAW_RATE: Final = 1 | 2 | 4 | 64 | 128 | 256 | 1024

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from math import hypot
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
+
+import psutil
 
 from edge.run.say import SayError, say
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.stack import COMMANDS, Stack, StackOptions
+from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruthTail
-from sim_hil.soak.drive.injector import Injector
-from sim_hil.soak.drive.journey import Journey, SoakTask
-from sim_hil.soak.drive.json_lines import LineFile
-from sim_hil.soak.drive.processes import ProcessSampler
-from sim_hil.soak.drive.schedule import FaultMenu, FaultSchedule
-from sim_hil.soak.drive.task_run import TaskRun
+from sim_hil.soak.faults import FaultMenu, FaultSchedule, Injector
+from sim_hil.soak.tasks import Journey, SoakTask, TaskRun
 
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
@@ -67,14 +66,13 @@ class Leg:
         *,
         stopped: Callable[[], bool],
         show_status: Callable[[str], None],
-        commands: Mapping[str, Sequence[str]] = COMMANDS,
     ) -> None:
-        self._options = options
+        self.options = options
         self._journey = journey
         self._menu = menu
         self._stopped = stopped
         self._show_status = show_status
-        self._stack = Stack(options.stack, commands)
+        self._stack = Stack(options.stack)
         self._truth = TruthTail(self._stack.trace)
         self._sampler = ProcessSampler()
         self._injector: Injector | None = None
@@ -92,18 +90,19 @@ class Leg:
 
         Raises StepError, OSError or FaultError.
         """
-        folder = self._options.stack.folder
-        stack = asdict(self._options.stack)
+        folder = self.options.stack.folder
+        stack = asdict(self.options.stack)
         about = {
-            **asdict(self._options),
+            **asdict(self.options),
             "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
         }
         (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-        with LineFile(folder / EVENTS) as self._events, LineFile(folder / SAMPLES) as self._samples, self._stack:
+        events, samples = (folder / name for name in (EVENTS, SAMPLES))
+        with events.open("a") as self._events, samples.open("a") as self._samples, self._stack:
             self._begin_ns = time.monotonic_ns()
-            self._note("leg_begin", scene=self._options.stack.scene, people=self._options.stack.people)
+            self._note("leg_begin", scene=self.options.stack.scene, people=self.options.stack.people)
             if self._menu is not None:
-                schedule = FaultSchedule(self._menu, self._options.seed, self._options.number)
+                schedule = FaultSchedule(self._menu, self.options.seed, self.options.number)
                 self._injector = Injector(self._stack, schedule, self._note)
             try:
                 self._stack.start_robot(self._wait)
@@ -112,10 +111,10 @@ class Leg:
                 why = "stopped"
             self._end_task("cut")
             if self._stack.runner is not None:
-                code = self._stack.end_runner()
+                code = self._stack.end("runner")
                 self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
-            self._stack.end_bridge()
-            self._stack.end_robot()
+            self._stack.end("bridge")
+            self._stack.end("robot")
             self._note("leg_end", why=why)
         return why
 
@@ -162,7 +161,7 @@ class Leg:
             now_ns = time.monotonic_ns()
             if self._injector is not None:
                 self._injector.step(now_ns)
-            if self._left_s(now_ns) <= 0:
+            if self.left_s(now_ns) <= 0:
                 return "duration"
             if end is not None:
                 self._end_task(end)
@@ -194,8 +193,8 @@ class Leg:
         self._end_task("stopped")
         bridge = self._stack.bridge
         bridge_died = bridge is not None and not bridge.running
-        code = self._stack.end_runner()  # takes a little longer if the bridge was killed
-        self._stack.end_bridge()
+        code = self._stack.end("runner")  # takes a little longer if the bridge was killed
+        self._stack.end("bridge")
         cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
         if explained == CONTACT and not raised & CONTACT_STOPS:
             explained = ""
@@ -231,17 +230,17 @@ class Leg:
 
     def _begin_task(self, task: SoakTask) -> None:
         self._task = TaskRun(task, time.monotonic_ns())
-        self._note("task_begin", task=task.as_json(), run=self._stack.runs)
+        self._note("task_begin", task=asdict(task), run=self._stack.runs)
 
     def _end_task(self, end: str) -> None:
         if self._task is None:
             return
         outcome = self._task.outcome(end)
         self._task = None
-        self._note("task_end", **outcome.as_json())
+        self._note("task_end", **outcome)
         if end != "cut":
             self.tasks += 1
-            self.reached += outcome.success
+            self.reached += outcome["success"]
 
     def _read_truth(self) -> str | None:
         """Read the new ground truth; return why the task is over, None if it is not."""
@@ -279,20 +278,20 @@ class Leg:
             "pose": None if pose is None else [pose.x_m, pose.y_m, pose.theta_rad],
             "processes": self._sampler.sample(self._stack.processes()),
         }
-        self._samples.add(sample)
+        _append(self._samples, sample)
         self._show_status(
-            f"leg {self._options.number}, {max(0.0, self._left_s(now_ns)):.0f} s left · "
+            f"leg {self.options.number}, {max(0.0, self.left_s(now_ns)):.0f} s left · "
             f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
             + (f" · {sample['fault']}" if sample["fault"] else "")
         )
 
-    def _left_s(self, now_ns: int) -> float:
+    def left_s(self, now_ns: int) -> float:
         """Return the remaining time, s; a leg's time begins when its first runner drives."""
         begun_ns = now_ns if self._driven_ns is None else self._driven_ns
-        return self._options.duration_s - (now_ns - begun_ns) / 1e9
+        return self.options.duration_s - (now_ns - begun_ns) / 1e9
 
     def _note(self, kind: str, **fields: Any) -> None:
-        self._events.add({"t_ns": time.monotonic_ns(), "kind": kind, **fields})
+        _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
 
 
 def _end_of_run(result: Path) -> tuple[str, set[str]]:
@@ -303,3 +302,49 @@ def _end_of_run(result: Path) -> tuple[str, set[str]]:
     except (OSError, ValueError, KeyError):
         return "", set()
     return (str(faults[0]) if faults else ""), raised
+
+
+def _append(file: TextIO, content: dict[str, Any]) -> None:
+    """Append one JSON line; flushed, so that the file stays complete if the process is killed."""
+    file.write(json.dumps(content) + "\n")
+    file.flush()
+
+
+PSS_EVERY: Final = 10
+"""Samples between two readings of PSS, which takes milliseconds because the kernel sums it page by page."""
+
+
+class ProcessSampler:
+    """Sampler of processes by name; ended processes are left out."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, psutil.Process] = {}
+        self._count = 0
+
+    def sample(self, pids: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+        """Return by name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, sometimes pss_bytes."""
+        self._count += 1
+        found: dict[str, dict[str, Any]] = {}
+        for name, pid in pids.items():
+            with suppress(psutil.Error):
+                found[name] = self._one(pid)
+        self._known = {pid: process for pid, process in self._known.items() if pid in pids.values()}
+        return found
+
+    def _one(self, pid: int) -> dict[str, Any]:
+        process = self._known.get(pid)
+        if process is None:
+            process = self._known[pid] = psutil.Process(pid)
+            process.cpu_percent()  # the first call only sets the reference
+        with process.oneshot():
+            values: dict[str, Any] = {
+                "pid": pid,
+                "cpu_percent": process.cpu_percent(),
+                "rss_bytes": process.memory_info().rss,
+                "fds": process.num_fds(),
+                "threads": process.num_threads(),
+            }
+        if self._count % PSS_EVERY == 1:
+            with suppress(psutil.Error):
+                values["pss_bytes"] = process.memory_full_info().pss
+        return values

@@ -1,4 +1,4 @@
-"""Tasks of a soak: from the robot's current pose to a landmark of the scene, with an instruction. Seeded."""
+"""Tasks of a soak: drawn from the robot's pose to a landmark of the scene, and tracked by ground truth. Seeded."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from sim_hil.benchmark.env.metrics import spl
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError
 from sim_hil.benchmark.language.tasks import goal_before, goals, make_task, sample_task
 from sim_hil.benchmark.suite.robots import footprint_m
+from sim_hil.realtime.truth import TruePose
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, SceneObject, Vec2, Vec3
 
@@ -35,10 +37,6 @@ class SoakTask:
     goal_label: str
     shortest_m: float
     timeout_s: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the task as JSON values for the event log."""
-        return dict(self.__dict__)
 
 
 class Journey:
@@ -95,3 +93,49 @@ class Journey:
 
 def _length_m(path: tuple[Vec2, ...]) -> float:
     return sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path))
+
+
+class TaskRun:
+    """Tracker of one task's poses from `started_ns` on."""
+
+    def __init__(self, task: SoakTask, started_ns: int) -> None:
+        self.task = task
+        self.started_ns = started_ns
+        self._last: TruePose | None = None
+        self._ne_m = hypot(task.goal_xy[0] - task.start[0], task.goal_xy[1] - task.start[1])
+        self._path_m = 0.0
+        self._touched: set[str] = set()
+
+    def add(self, pose: TruePose) -> str | None:
+        """Add a pose; return "reached" or "timeout" if it ends the task, else None."""
+        if pose.t_ns < self.started_ns:
+            return None
+        if self._last is not None:
+            self._path_m += hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m)
+        self._last = pose
+        self._touched.update(pose.touching)
+        self._ne_m = hypot(self.task.goal_xy[0] - pose.x_m, self.task.goal_xy[1] - pose.y_m)
+        if self._ne_m < THRESHOLD_M:
+            return "reached"
+        return "timeout" if (pose.t_ns - self.started_ns) / 1e9 >= self.task.timeout_s else None
+
+    def outcome(self, end: str) -> dict[str, Any]:
+        """Return the outcome so far as JSON values.
+
+        `end`: reached, timeout, stopped (the runner ended) or cut (the leg ended); `spl` in percent.
+        """
+        reached, task = end == "reached", self.task
+        last_ns = self.started_ns if self._last is None else self._last.t_ns
+        return {
+            "number": task.number,
+            "end": end,
+            "success": reached,
+            "ne_m": round(self._ne_m, 3),
+            "spl": round(100 * spl(reached, task.shortest_m, self._path_m), 2),
+            "path_m": round(self._path_m, 3),
+            "shortest_m": round(task.shortest_m, 3),
+            "time_s": round((last_ns - self.started_ns) / 1e9, 3),
+            "collisions": sorted(self._touched),
+            "goal": task.goal_label,
+            "instruction": task.instruction,
+        }
