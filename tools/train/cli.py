@@ -32,6 +32,7 @@ from edge.core.cli import (
 from edge.inference.latency_profile import load_profile
 from reporting.build_progress import duration, peak_rss_bytes
 from sim_hil.benchmark.runs import RunsError
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.config.variants import VARIANTS
 from tools.train.pipeline import budget, chain
@@ -71,10 +72,6 @@ evaluate (episodes in layouts that no stage has used)
 exit codes: 0 done, 1 an export, a drive or an episode failed, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
-
-
-class UsageError(ValueError):
-    """Arguments that are missing or contradict each other; one line."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -165,28 +162,28 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     steps = steps_of(args.command, recipe) if args.command != "card" else []
     if args.drives is not None:
         if args.command == "card":
-            raise UsageError("--drives belongs to stages, not to card")
+            raise TrainError("--drives belongs to stages, not to card")
         steps = [step for step in steps if step.stage != "collect" or not args.dry_run]
     if args.dry_run:
         plan = budget.budget_of(recipe, steps, args.device)
         sys.stderr.write("\n".join(budget.lines_of(recipe, steps, plan, args.device)) + "\n")
         return {"command": args.command, "recipe": recipe.name, "budget": budget.as_json(plan)}
     if args.out is None:
-        raise UsageError("--out is missing: expected the folder of the run, e.g. --out out/run")
+        raise TrainError("--out is missing: expected the folder of the run, e.g. --out out/run")
     if args.command == "card":
         run_dir = RunDir(args.out)
         shipped = None if args.ship is None else str(ship(run_dir, recipe, args.ship, args.scores))
         return {"command": "card", "card": str(write_card(run_dir, recipe, args.scores)), "shipped": shipped}
     if args.scores or args.ship:
-        raise UsageError("--scores and --ship belong to card")
+        raise TrainError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
-        raise UsageError("--from and --checkpoint: expected one of them, both name the initial weights")
+        raise TrainError("--from and --checkpoint: expected one of them, both name the initial weights")
     if args.base is not None and args.drives is not None:
-        raise UsageError("--from and --drives: expected one of them, both name the drives")
+        raise TrainError("--from and --drives: expected one of them, both name the drives")
     if args.after is not None and args.drives is not None:
-        raise UsageError("--after and --drives: expected one of them, --after continues without earlier drives")
+        raise TrainError("--after and --drives: expected one of them, --after continues without earlier drives")
     if args.after is not None and not args.checkpoint:
-        raise UsageError("--after: expected --checkpoint with it, the weights that the step wrote")
+        raise TrainError("--after: expected --checkpoint with it, the weights that the step wrote")
     before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
@@ -206,11 +203,11 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
     found = next((path for path in there if path.is_file()), None)
     if args.preset is not None and args.preset not in recipe_names():
-        raise UsageError(f"--preset {args.preset}: expected one of {', '.join(recipe_names())}; a file is a --recipe")
+        raise TrainError(f"--preset {args.preset}: expected one of {', '.join(recipe_names())}; a file is a --recipe")
     if args.recipe is not None and args.recipe.suffix != ".toml":
-        raise UsageError(f"--recipe {args.recipe}: expected a file that ends in .toml")
+        raise TrainError(f"--recipe {args.recipe}: expected a file that ends in .toml")
     if args.command == "card" and found is None:
-        raise UsageError("card: expected --out to be the folder of a run")
+        raise TrainError("card: expected --out to be the folder of a run")
     return load_recipe(str(args.preset or args.recipe or found or "nano"), settings)
 
 
@@ -230,9 +227,9 @@ def _check_device(device: str) -> None:
 
     kind, _, number = device.partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()) or (kind == "cpu" and number):
-        raise UsageError(f"--device {device}: expected cpu, cuda or cuda:N")
+        raise TrainError(f"--device {device}: expected cpu, cuda or cuda:N")
     if kind == "cuda" and not torch.cuda.is_available():
-        raise UsageError(f"--device {device}: not found on this machine, or torch was built without CUDA")
+        raise TrainError(f"--device {device}: not found on this machine, or torch was built without CUDA")
 
 
 @contextmanager
@@ -258,7 +255,7 @@ def _train(
 ) -> dict[str, Any]:
     if ranks.world > 1 and not any(step.stage in chain.DISTRIBUTED for step in steps):
         shared = ", ".join((*chain.DISTRIBUTED, "dagger", "all"))
-        raise UsageError(f"{args.command}: runs in one process; torchrun is for {shared}")
+        raise TrainError(f"{args.command}: runs in one process; torchrun is for {shared}")
     run_dir = RunDir(args.out)
     with ranks.by_first() as here:
         if here:

@@ -16,11 +16,11 @@ from unittest.mock import patch
 import torch
 
 from tools.train import cli
+from tools.train.config.errors import TrainError
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step
 from tools.train.run.distributed import leave
 from tools.train.run.job import StageJob
-from tools.train.run.run_dir import RunDirError
 
 
 def main() -> int:
@@ -32,7 +32,7 @@ def main() -> int:
         with (out / f"{here}.txt").open("a", encoding="utf-8") as file:
             file.write(f"{name} {job.ranks.rank}/{job.ranks.world} {torch.get_num_threads()}\n")
         if name == how:
-            raise RunDirError(f"{name} has failed")
+            raise TrainError(f"{name} has failed")
         if how == "stop" and name == "encoder" and here == "1":
             job.stop.ask()
         job.ranks.barrier()

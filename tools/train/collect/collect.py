@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from tools.train.collect.collection import CollectError, Collection, fill, job_count, result_of
-from tools.train.config.collect import CollectConfig
+from tools.train.collect.collection import Collection, fill, job_count, result_of
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.run.job import StageJob
@@ -15,14 +15,14 @@ PREFIX = "e"
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """Return (description, number, key of the throughput of all processes together) of this stage's work."""
-    return [("drives of the expert", recipe.collect.episodes if recipe.collect is not None else 0, "drive")]
+    return [("drives of the expert", recipe.collect.episodes, "drive")]
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Record the recipe's drives into `collect/`, or continue an interrupted recording. Raises CollectError."""
-    config = job.recipe.collect if job.recipe.collect is not None else CollectConfig()
+    """Record the recipe's drives into `collect/`, or continue an interrupted recording. Raises TrainError."""
+    config = job.recipe.collect
     if job.ranks.world > 1:
-        raise CollectError("collect starts its own processes (collect.jobs): run it without torchrun")
+        raise TrainError("collect starts its own processes (collect.jobs): run it without torchrun")
     collection = Collection(PREFIX, config.episodes, job.seed, 0, config)
     with DatasetWriter(job.run_dir.stage("collect")) as writer:
         fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)

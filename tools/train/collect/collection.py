@@ -28,10 +28,6 @@ _MOST_DROPPED: Final = 0.5
 """Share of unusable drives above which the recording fails: the cause lies outside single drives."""
 
 
-class CollectError(Exception):
-    """A collection that cannot start; one line."""
-
-
 class CollectFailedError(StageFailedError):
     """A collection that cannot continue; one line."""
 

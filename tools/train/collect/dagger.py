@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.artifacts.manifest import load_artifacts
-from tools.train.collect.collection import CollectError, Collection, fill, job_count, result_of
+from tools.train.collect.collection import Collection, fill, job_count, result_of
 from tools.train.collect.dagger_driver import PolicyOptions
-from tools.train.config.collect import CollectConfig
+from tools.train.config.errors import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import POLICY_DRIVER
 from tools.train.run.job import StageJob
@@ -27,13 +27,13 @@ _EXPERT_TURNS: Final = 1_000
 def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, Any]:
     """Record round `round_number` (1, 2, …) into `collect/`, or continue an interrupted recording.
 
-    Raises ArtifactError for artifacts that cannot drive, CollectError.
+    Raises ArtifactError for artifacts that cannot drive, TrainError.
     """
     if round_number < 1:
         raise ValueError(f"dagger: rounds count from 1, found {round_number}")
     if job.ranks.world > 1:
-        raise CollectError("dagger starts its own processes (collect.jobs): run it without torchrun")
-    config, numbers = job.recipe.collect if job.recipe.collect is not None else CollectConfig(), job.recipe.dagger
+        raise TrainError("dagger starts its own processes (collect.jobs): run it without torchrun")
+    config, numbers = job.recipe.collect, job.recipe.dagger
     sha256 = load_artifacts(artifacts).manifest_sha256
     beta, mean_s = BETA / 2 ** (round_number - 1), numbers.latency_mean_s
     policy = PolicyOptions(str(artifacts.absolute()), sha256, beta, mean_s)
@@ -42,9 +42,7 @@ def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, An
     expert = Collection(beside, numbers.expert_episodes, job.seed, _EXPERT_TURNS + round_number, config)
     with DatasetWriter(job.run_dir.stage("collect")) as writer:
         if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"{POLICY_DRIVER}{sha256[:12]}"}):
-            raise CollectError(
-                f"dagger round {round_number}: started with {others[0]}; continue with the same artifacts"
-            )
+            raise TrainError(f"dagger round {round_number}: started with {others[0]}; continue with the same artifacts")
         for collection in (expert, driven) if expert.count else (driven,):
             fill(writer, collection, job_count(config.jobs), update=job.progress.update, stopped=job.should_stop)
         result: dict[str, Any] = {**result_of(writer, prefix), "beta": beta, "policy": sha256}

@@ -43,7 +43,7 @@ def build_tours(
 ) -> Dataset:  # fmt: skip
     """Record missing tours in the first rank's processes and return all; every rank must call this function.
 
-    Tours in a layout that the data set holds out are left out. Raises CollectError, DriveError, OSError, and
+    Tours in a layout that the data set holds out are left out. Raises TrainError, OSError, and
     KeyboardInterrupt if `stopped`.
     """
     folder = dataset.folder / FOLDER / _key(config, collect, seed)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Final
 from zlib import crc32
@@ -50,18 +49,18 @@ class RecipeError(ValueError):
 
 @dataclass(frozen=True)
 class Recipe:
-    """Configuration of one training run. A stage's table is None if the caller does not run that stage."""
+    """Configuration of one training run."""
 
     name: str
     seed: int
     model: TicVlaConfig
-    collect: CollectConfig | None = None
-    encoder: EncoderConfig | None = None
-    sft: SftConfig | None = None
-    imitate: ImitateConfig | None = None
-    rl: RlConfig | None = None
-    evaluate: EvaluateConfig | None = None
-    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    sft: SftConfig = field(default_factory=SftConfig)
+    imitate: ImitateConfig = field(default_factory=ImitateConfig)
+    rl: RlConfig = field(default_factory=RlConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    dagger: DaggerConfig = field(default_factory=DaggerConfig)
 
     def __post_init__(self) -> None:
         if not self.name or not 0 <= self.seed < 2**31:
@@ -69,10 +68,8 @@ class Recipe:
 
     def to_tables(self) -> dict[str, Any]:
         """Return every value of the run, defaults included, as plain tables."""
-        stages = {name: plain(getattr(self, name)) for name in STAGES if getattr(self, name) is not None}
-        dagger = plain(self.dagger)
-        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed}
-        return {**head, "model": self.model.to_dict(), **stages, "dagger": dagger}
+        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed, "model": self.model.to_dict()}
+        return head | {name: plain(getattr(self, name)) for name in (*STAGES, "dagger")}
 
     def to_toml(self) -> str:
         """Return the tables as TOML; `load_recipe` reads it."""
@@ -140,7 +137,7 @@ def filled(default: object, table: object) -> object:
     whole = {**plain(default), **table}
     for name, value in table.items():
         own = getattr(default, str(name), None)
-        if dataclasses.is_dataclass(own):
+        if is_dataclass(own):
             whole[name] = filled(own, value)
     return whole
 
@@ -201,4 +198,4 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
 
 def _fields_of(kind: object) -> dict[str, Any]:
     """Return the types of a dataclass's fields; empty for other types."""
-    return field_types(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}
+    return field_types(kind) if isinstance(kind, type) and is_dataclass(kind) else {}

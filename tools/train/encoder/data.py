@@ -25,6 +25,7 @@ from export.core.typed import build, plain
 from sim_hil.benchmark.suite.episode import ROBOTS
 from sim_hil.benchmark.workers.worker_pool import Told, Workers
 from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
+from tools.train.config.errors import TrainError
 from tools.train.config.scenes import CORRIDOR, OUTDOORS
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder.labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
@@ -41,10 +42,6 @@ _POLL_S: Final = 0.5
 _CORRIDOR_MOST: Final = 12  # most people in the corridor
 _LEAST_HELD: Final = 32  # fewest images of a held-out scene, because a scene takes seconds to build
 _EMPTY_SHARE: Final = 0.12  # share of indoor scenes without people
-
-
-class FramesError(ValueError):
-    """Training images that cannot be rendered or read; one line."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ def path_of(folder: Path, name: str) -> Path:
 def fill(
     folder: Path, shards: Sequence[Shard], jobs: int, progress: StageProgress, should_stop: Callable[[], bool]
 ) -> None:
-    """Render missing shards. Raises FramesError, OSError, KeyboardInterrupt if `should_stop`."""
+    """Render missing shards. Raises TrainError, OSError, KeyboardInterrupt if `should_stop`."""
     logs = folder / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     for partial in folder.glob("*.partial"):
@@ -187,16 +184,16 @@ def _note(told: Told, taken: dict[str, int]) -> None:
     if told.message is not None:
         taken[told.key] = int(told.message["frames"])
     elif told.why:
-        raise FramesError(f"pictures of {told.key}: their process {told.why}; go on with --resume")
+        raise TrainError(f"pictures of {told.key}: their process {told.why}; go on with --resume")
 
 
 def frames_sha256(folder: Path, shards: Sequence[Shard]) -> str:
-    """Hash all shards; it does not depend on the order of rendering. Raises FramesError for a missing shard."""
+    """Hash all shards; it does not depend on the order of rendering. Raises TrainError for a missing shard."""
     lines = []
     for shard in shards:
         there = made(folder, shard)
         if there is None:
-            raise FramesError(f"{path_of(folder, shard.name)}: missing, or of another configuration")
+            raise TrainError(f"{path_of(folder, shard.name)}: missing, or of another configuration")
         lines.append(f"{there.name} {there.sha256}\n")
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -205,7 +202,7 @@ class FrameSet:
     """Images of some shards as one sequence; labels are in memory, images are read on access."""
 
     def __init__(self, folder: Path, shards: Sequence[Shard]) -> None:
-        """Open all shards. Raises FramesError for a missing one."""
+        """Open all shards. Raises TrainError for a missing one."""
         self._files: list[Any] = []
         self._ends: list[NDArray[np.int64]] = []
         parts: dict[str, list[NDArray[np.generic]]] = {}
@@ -216,10 +213,10 @@ class FrameSet:
                 labels = {name: file.get_tensor(name) for name in label_shapes(shard.side)}
                 ends = file.get_tensor("jpeg_end")
             except (OSError, SafetensorError) as error:
-                raise FramesError(f"{path}: not readable ({error}); delete it and continue with --resume") from error
+                raise TrainError(f"{path}: not readable ({error}); delete it and continue with --resume") from error
             for name, (kind, shape) in label_shapes(shard.side).items():
                 if labels[name].shape != (shard.frames, *shape) or labels[name].dtype != kind:
-                    raise FramesError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
+                    raise TrainError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
                 parts.setdefault(name, []).append(labels[name])
             self._files.append(file.get_slice("jpeg"))
             self._ends.append(ends)

@@ -7,12 +7,11 @@ DAgger round imitation continues from its weights on all drives.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any, Final
 
+import numpy as np
 import torch
 
 from export.checkpoint import tokenizer_for
@@ -35,11 +34,13 @@ from tools.train.imitate.mirror_drives import (
 )
 from tools.train.imitate.mirror_drives import STATES as MIRRORED_STATES
 from tools.train.imitate.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
-from tools.train.imitate.steps import ImitateError, Training
 from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy, TrainablePolicy
 from tools.train.run.job import StageJob
+from tools.train.run.loop import Ahead, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
+from tools.train.run.optim import Optimiser, autocast
 from tools.train.run.own_drives import drives_after
+from tools.train.samples.action_batch import Group, collate
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.kv_build import SEEN_PARTS, build_kv_cache, parts_sha256
@@ -54,13 +55,12 @@ STAGE: Final = "imitate"
 STATES: Final = "kv"
 """Folder of the semantic states, in the data set."""
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
-_START: Final = 0x1A14
+_DRAWS, _HELD, _NOISE, _START = 0x1A11, 0x1A12, 0x1A13, 0x1A14
 
 
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """Return (description, number, key of the throughput) of this stage's work, from the planned number of drives."""
-    config = recipe.imitate or ImitateConfig()
-    seconds = round(PLANNED_DRIVE_S * recipe.collect.episodes) if recipe.collect is not None else 0
+    config, seconds = recipe.imitate, round(PLANNED_DRIVE_S * recipe.collect.episodes)
     states = [("semantic states", seconds * config.states.draws, "kv")] if config.policy == TIC_VLA else []
     return [*states, ("samples learned", config.samples, "imitate")]
 
@@ -68,9 +68,9 @@ def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
 def run(job: StageJob) -> dict[str, Any]:
     """Train on the run's drives and write the network with its new action expert, or the point-goal network.
 
-    Raises ImitateError, SampleError, LatencyError, DriveError, TokenCacheError, KvCacheError, NetworkFileError.
+    Raises TrainError, SampleError, LatencyError.
     """
-    config = _config(job)
+    config = job.recipe.imitate
     dataset = drives_after(job, STAGE)
     network, share = _start(job, config)
     tokens = _encoded(job, TokenCache(dataset, network.vision), dataset.ids)
@@ -116,7 +116,7 @@ def _states(
     own: bool = False,
 ) -> KvCache:
     """Build the semantic states of drives with the true text, or (`own`) with text that the language model decodes."""
-    config = _config(job).states
+    config = job.recipe.imitate.states
     job.progress.say("semantic states")
     return build_kv_cache(
         dataset.folder / folder,
@@ -139,7 +139,7 @@ def _point_goal(
     student: PointGoalNet = build_point_goal(network.config, job.generator(_START)).to(job.device)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, network.config.kv_dim)
     mirror = None if seconds is None else Mirror(MirrorTokens(seconds), states)
-    policy = PointGoalNetPolicy(student, _config(job).loss)
+    policy = PointGoalNetPolicy(student, job.recipe.imitate.loss)
     result = fit(job, policy, dataset, tokens, states, of=parts_sha256(network, ("vision",)), mirror=mirror)
     if job.ranks.first:
         path = job.run_dir.stage(STAGE) / POINT_GOAL_FILE
@@ -171,12 +171,12 @@ def fit(
     mirror: Mirror | None = None,
     own: States | None = None,
 ) -> dict[str, Any]:
-    """Train a policy in place and return its errors against the expert. Raises ImitateError, SampleError.
+    """Train a policy in place and return its errors against the expert. Raises TrainError, SampleError.
 
     `of`: hash of what tokens and states were computed with; `share` of the recipe's samples; `mirror`: mirrored
     training drives; `own`: states of the held-out drives with text that the language model decoded.
     """
-    config = _config(job)
+    config = job.recipe.imitate
     delays = Delays.of(config.delays) if config.inject_delay and policy.uses_semantics else Delays.none()
     scenes = Scenes() if config.loss.walls else None
     drives = _frames(job, dataset, dataset.train, config.sample, scenes)
@@ -190,8 +190,23 @@ def fit(
     policy.begin(data.drives)
     total = max(1, round(config.samples * share) // config.batch)
     job.ranks.copy_parameters(policy.module.parameters())
-    training = Training(STAGE, job, config, policy, data, held, total, _key(config, dataset, policy, of, total))
-    numbers = training.run()
+    optimiser = Optimiser(policy.module.parameters(), config.optim, total, job.ranks)
+    shapes = {name: list(tensor.shape) for name, tensor in policy.module.state_dict().items()}
+    content = {"config": asdict(config), "dataset": dataset.sha256, "of": of, "total": total, "pupil": shapes}
+    loop = TrainingLoop(job, STAGE, {"pupil": policy.module}, optimiser, content, config.checkpoint_steps)
+    with Ahead(lambda step: _share(job, data, step)) as ahead:
+
+        def evaluate_loss(step: int) -> dict[str, float]:
+            if held is None or (step % config.held_steps and step != total):
+                return {}
+            ahead.rest()
+            return {"held_loss": _held_loss(job, policy, held)}
+
+        numbers = loop.run(
+            ahead.steps(optimiser.step_count, total),
+            lambda groups: _losses(job, policy, groups, optimiser.step_count),
+            evaluate_loss,
+        )
     result: dict[str, Any] = {
         "steps": total,
         "drives": len(dataset.train),
@@ -210,6 +225,35 @@ def fit(
             )  # fmt: skip
             draw_errors(result[name], job.run_dir.curves / f"{STAGE}_{name}.png")
     return result
+
+
+def _share(job: StageJob, data: Samples, step: int) -> list[Group]:
+    """Draw this rank's share of a step's groups, each from its own generator."""
+    own = range(job.recipe.imitate.batch // data.group)[job.ranks.rank :: job.ranks.world]
+    return [data.draw(np.random.default_rng((job.seed, _DRAWS, step, number))) for number in own]
+
+
+def _losses(job: StageJob, policy: TrainablePolicy, groups: Sequence[Group], step: int) -> torch.Tensor:
+    generator = job.generator(_NOISE, step, job.ranks.rank)
+    batch = collate(groups, torch.device(job.device))
+    with autocast(job.device, job.recipe.imitate.optim.bf16):
+        return policy.errors(batch, generator)
+
+
+def _held_loss(job: StageJob, policy: TrainablePolicy, held: Samples) -> float:
+    """Compute the loss over the fixed held-out samples, distributed over the ranks."""
+    config, ranks = job.recipe.imitate, job.ranks
+    count, each = -(-config.held_samples // held.group), config.batch // held.group
+    total, seen = 0.0, 0
+    for start in range(ranks.rank * each, count, ranks.world * each):
+        numbers = range(start, min(start + each, count))
+        groups = [held.draw(np.random.default_rng((job.seed, _HELD, number))) for number in numbers]
+        with torch.no_grad():
+            errors = _losses(job, policy, groups, start)
+        total += float(errors.sum())
+        seen += len(errors)
+    whole = ranks.sum(seen)
+    return ranks.sum(total) / whole if whole else float("nan")
 
 
 def _frames(
@@ -235,7 +279,7 @@ def _samples(
     *,
     held: bool = False,
 ) -> Samples:
-    config, model = _config(job).sample, job.recipe.model
+    config, model = job.recipe.imitate.sample, job.recipe.model
     if not policy.uses_semantics:
         # Such a policy works with any semantic interface.
         model = replace(model, action=replace(model.action, semantic_interface="kv"))
@@ -251,21 +295,3 @@ def _held_out(
         return _samples(job, drives, tokens, states, delays, policy, held=True)
     except SampleError:
         return None
-
-
-def _config(job: StageJob) -> ImitateConfig:
-    if job.recipe.imitate is None:
-        raise ImitateError("the recipe has no table [imitate]")
-    return job.recipe.imitate
-
-
-def _key(config: ImitateConfig, dataset: Dataset, policy: TrainablePolicy, of: str, total: int) -> str:
-    """Hash what a checkpoint depends on; only an equal hash can be resumed."""
-    made = {
-        "config": asdict(config),
-        "dataset": dataset.sha256,
-        "of": of,
-        "total": total,
-        "pupil": {name: list(tensor.shape) for name, tensor in policy.module.state_dict().items()},
-    }
-    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()

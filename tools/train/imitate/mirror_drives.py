@@ -70,7 +70,7 @@ class MirroredDrives(Dataset):
         return MirroredDrives(dataset.folder, dataset.entries)
 
     def load(self, drive_id: str, *, pictures: bool = False) -> Drive:
-        """Load one drive, always without images. Raises DriveError."""
+        """Load one drive, always without images. Raises TrainError."""
         return mirrored_drive(super().load(drive_id, pictures=False))
 
 

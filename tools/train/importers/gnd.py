@@ -16,7 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from tools.train.importers.recording import ImportedError, Recording, read_json, read_words
+from tools.train.config.errors import TrainError
+from tools.train.importers.recording import Recording, read_json, read_words
 
 KIND: Final = "gnd"
 TABLE: Final = "recording.json"
@@ -29,20 +30,20 @@ def is_recording(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read one recording. Raises ImportedError."""
+    """Read one recording. Raises TrainError."""
     path = folder / TABLE
     content = read_json(path)
     try:
         if set(content) != {"frames", "poses"}:
-            raise ImportedError(f"{path}: expected the keys frames and poses, found {sorted(content)}")
+            raise TrainError(f"{path}: expected the keys frames and poses, found {sorted(content)}")
         frames = sorted((_number(each["stamp_s"]), _below(folder, each["file"])) for each in content["frames"])
         poses = sorted(_pose(path, each) for each in content["poses"])
     except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, ImportedError):
+        if isinstance(error, TrainError):
             raise
-        raise ImportedError(f"{path}: a frame or pose lacks or misshapes a key ({error!r})") from error
+        raise TrainError(f"{path}: a frame or pose lacks or misshapes a key ({error!r})") from error
     if not frames or not poses:
-        raise ImportedError(f"{path}: expected frames and poses")
+        raise TrainError(f"{path}: expected frames and poses")
     first_s = min(frames[0][0], poses[0][0])
     return Recording(
         name=folder.name,
@@ -60,10 +61,10 @@ def _number(value: object) -> float:
 
 
 def _below(folder: Path, name: str) -> Path:
-    """Return the path of a file inside the recording's folder. Raises ImportedError for one outside."""
+    """Return the path of a file inside the recording's folder. Raises TrainError for one outside."""
     plain = PurePosixPath(name)
     if plain.is_absolute() or ".." in plain.parts:
-        raise ImportedError(f"{folder / TABLE}: {name!r} is not a path below the recording")
+        raise TrainError(f"{folder / TABLE}: {name!r} is not a path below the recording")
     return folder / plain
 
 
@@ -71,6 +72,6 @@ def _pose(path: Path, table: Mapping[str, Any]) -> tuple[float, float, float, fl
     x, y, _ = (_number(value) for value in table["position_m"])
     qx, qy, qz, qw = (_number(value) for value in table["quaternion_xyzw"])
     if abs(qx * qx + qy * qy + qz * qz + qw * qw - 1.0) > _UNIT:
-        raise ImportedError(f"{path}: expected quaternions of length 1, found {[qx, qy, qz, qw]}")
+        raise TrainError(f"{path}: expected quaternions of length 1, found {[qx, qy, qz, qw]}")
     heading = atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     return (_number(table["stamp_s"]), x, y, heading)

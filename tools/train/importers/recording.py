@@ -13,16 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.jpeg import MAX_BYTES, jpeg_refusal
+from tools.train.config.errors import TrainError
 from tools.train.scenes.trace_sentences import aspects_of_json
 
 TEXTS: Final = "texts.json"
 MAX_TABLE_BYTES: Final = 200_000_000
 _TRACE_KEYS: Final = frozenset(("situation", "objects", "motion", "progress", "plan"))
 _JPEG = (".jpg", ".jpeg")
-
-
-class ImportedError(ValueError):
-    """A recording that cannot be read; one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
@@ -49,43 +46,43 @@ class Recording:
     def __post_init__(self) -> None:
         what = f"recording {self.name}"
         if self.stamps_s.shape != (len(self.pictures),) or self.poses.ndim != 2 or self.poses.shape[1] != 4:
-            raise ImportedError(f"{what}: expected a stamp a picture and poses [n, 4]")
+            raise TrainError(f"{what}: expected a stamp a picture and poses [n, 4]")
         if len(self.pictures) < 2 or len(self.poses) < 2:
-            raise ImportedError(f"{what}: expected two pictures and two poses or more")
+            raise TrainError(f"{what}: expected two pictures and two poses or more")
         if not (np.isfinite(self.stamps_s).all() and np.isfinite(self.poses).all()):
-            raise ImportedError(f"{what}: a stamp or pose is not finite")
+            raise TrainError(f"{what}: a stamp or pose is not finite")
         if np.any(np.diff(self.stamps_s) <= 0) or np.any(np.diff(self.poses[:, 0]) <= 0):
-            raise ImportedError(f"{what}: expected increasing stamps of pictures and of poses")
+            raise TrainError(f"{what}: expected increasing stamps of pictures and of poses")
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Read a JPEG or PNG as uint8 RGB [height, width, 3]. Raises ImportedError."""
+    """Read a JPEG or PNG as uint8 RGB [height, width, 3]. Raises TrainError."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise ImportedError(f"{path}: expected at most {MAX_BYTES} bytes")
+            raise TrainError(f"{path}: expected at most {MAX_BYTES} bytes")
         data = path.read_bytes()
     except OSError as error:
-        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+        raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
     if path.suffix.lower() in _JPEG and (why := jpeg_refusal(data)) is not None:
-        raise ImportedError(f"{path}: {why}")
+        raise TrainError(f"{path}: {why}")
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise ImportedError(f"{path}: expected a JPEG or PNG image")
+        raise TrainError(f"{path}: expected a JPEG or PNG image")
     return np.asarray(picture[..., ::-1], np.uint8)
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises ImportedError."""
+    """Read a JSON file. Raises TrainError."""
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
-            raise ImportedError(f"{path}: more than {MAX_TABLE_BYTES} bytes")
+            raise TrainError(f"{path}: more than {MAX_TABLE_BYTES} bytes")
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+        raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        if isinstance(error, ImportedError):
+        if isinstance(error, TrainError):
             raise
-        raise ImportedError(f"{path}: not JSON ({error})") from error
+        raise TrainError(f"{path}: not JSON ({error})") from error
 
 
 def read_words(folder: Path) -> dict[int, Texts]:
@@ -99,27 +96,27 @@ def read_words(folder: Path) -> dict[int, Texts]:
         return {}
     content = read_json(path)
     if not isinstance(content, Mapping):
-        raise ImportedError(f"{path}: expected a table by number of the episode")
+        raise TrainError(f"{path}: expected a table by number of the episode")
     return {_number(path, key): _words(f"{path}: {key}", value) for key, value in content.items()}
 
 
 def _number(path: Path, key: str) -> int:
     if not (key.isascii() and key.isdigit()):
-        raise ImportedError(f"{path}: expected the number of an episode, found {key!r}")
+        raise TrainError(f"{path}: expected the number of an episode, found {key!r}")
     return int(key)
 
 
 def _words(where: str, value: object) -> Texts:
     if not isinstance(value, Mapping) or not {"wordings"} <= set(value) <= {"wordings", "traces"}:
-        raise ImportedError(f"{where}: expected wordings and traces")
+        raise TrainError(f"{where}: expected wordings and traces")
     wordings, traces = value["wordings"], value.get("traces", [])
     if not isinstance(wordings, list) or not all(isinstance(text, str) and text.strip() for text in wordings):
-        raise ImportedError(f"{where}: expected wordings to be a list of texts")
+        raise TrainError(f"{where}: expected wordings to be a list of texts")
     if not isinstance(traces, list) or not all(isinstance(t, Mapping) and set(t) == _TRACE_KEYS for t in traces):
-        raise ImportedError(f"{where}: expected each trace to have {', '.join(sorted(_TRACE_KEYS))}")
+        raise TrainError(f"{where}: expected each trace to have {', '.join(sorted(_TRACE_KEYS))}")
     for trace in traces:
         try:
             aspects_of_json(trace)
         except (ValueError, KeyError, TypeError) as error:
-            raise ImportedError(f"{where}: {error}") from error
+            raise TrainError(f"{where}: {error}") from error
     return Texts(tuple(wordings), tuple(dict(trace) for trace in traces))

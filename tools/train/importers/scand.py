@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from tools.train.importers.recording import ImportedError, Recording, read_words
+from tools.train.config.errors import TrainError
+from tools.train.importers.recording import Recording, read_words
 
 KIND: Final = "scand"
 PICTURES, POSES = "image", "odometry.csv"
@@ -27,11 +28,11 @@ def is_recording(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Read one recording. Raises ImportedError."""
+    """Read one recording. Raises TrainError."""
     pictures = sorted((_stamp(path), path) for path in (folder / PICTURES).iterdir() if path.suffix in _SUFFIXES)
     rows = _rows(folder / POSES)
     if not pictures or not rows:
-        raise ImportedError(f"{folder}: expected pictures in {PICTURES}/ and rows in {POSES}")
+        raise TrainError(f"{folder}: expected pictures in {PICTURES}/ and rows in {POSES}")
     # Subtract whole nanoseconds first: floats cannot represent them exactly.
     first_ns = min(pictures[0][0], rows[0][0])
     return Recording(
@@ -45,7 +46,7 @@ def read(folder: Path) -> Recording:
 
 def _stamp(path: Path) -> int:
     if not (path.stem.isascii() and path.stem.isdigit()):
-        raise ImportedError(f"{path}: expected a name in whole nanoseconds, such as 1636492800123456789.jpg")
+        raise TrainError(f"{path}: expected a name in whole nanoseconds, such as 1636492800123456789.jpg")
     return int(path.stem)
 
 
@@ -54,14 +55,14 @@ def _rows(path: Path) -> list[tuple[int, float, float, float]]:
         with path.open(encoding="utf-8", newline="") as file:
             table = csv.DictReader(file)
             if missing := [name for name in _COLUMNS if name not in (table.fieldnames or ())]:
-                raise ImportedError(f"{path}: column {missing[0]} is missing; expected {', '.join(_COLUMNS)}")
+                raise TrainError(f"{path}: column {missing[0]} is missing; expected {', '.join(_COLUMNS)}")
             rows = [
                 (int(row["stamp_ns"]), float(row["x_m"]), float(row["y_m"]), float(row["theta_rad"])) for row in table
             ]
     except OSError as error:
-        raise ImportedError(f"{path}: cannot be read ({error.strerror})") from error
+        raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, csv.Error) as error:
-        if isinstance(error, ImportedError):
+        if isinstance(error, TrainError):
             raise
-        raise ImportedError(f"{path}: a row is not of numbers ({error})") from error
+        raise TrainError(f"{path}: a row is not of numbers ({error})") from error
     return sorted(rows)

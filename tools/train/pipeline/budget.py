@@ -79,8 +79,7 @@ def _work(recipe: Recipe, step: Step) -> Work:
         )
         return [*expert, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
     if step.stage == "evaluate":
-        count = recipe.evaluate.episodes if recipe.evaluate is not None else 0
-        return [("episodes", count, "policy-drive")]
+        return [("episodes", recipe.evaluate.episodes, "policy-drive")]
     work = BUDGETS[step.stage](recipe)
     return _after_round(recipe, step.stage, work) if step.round else work
 
@@ -89,13 +88,13 @@ def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]
     """Return the work of a stage that continues after a DAgger round: caching new drives and training for a share."""
     dagger = recipe.dagger
     drives = dagger.episodes + dagger.expert_episodes
-    more = drives / recipe.collect.episodes if recipe.collect is not None else 1.0
+    more = drives / recipe.collect.episodes
     config = recipe.imitate if stage == "imitate" else recipe.sft
-    share = (config.go_on_share or 1.0) if config is not None else 1.0
+    share = config.go_on_share or 1.0
     # The length of an SFT epoch grows with the number of drives; imitation has a fixed number of samples.
     shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
-    tours_share = recipe.sft.tours_again if recipe.sft is not None else 1.0
-    tours = {"tour": 0.0, "encode": 0.0, "sft": share * tours_share}  # no new tours; a share is trained on again
+    # No new tours; a share of them is trained on again.
+    tours = {"tour": 0.0, "encode": 0.0, "sft": share * recipe.sft.tours_again}
     counts = (
         (what, round(count * (tours if what.startswith(OF_TOURS) else shares).get(key, share)), key)
         for what, count, key in work

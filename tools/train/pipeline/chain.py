@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from tools.train.collect import collect
 from tools.train.collect.dagger import run_round
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder import encoder
@@ -18,7 +19,7 @@ from tools.train.rl import rl
 from tools.train.run.exported import export_artifacts
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import ORDER, START, stage_weights, weights_before
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.run_dir import RunDir
 from tools.train.sft import sft
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
@@ -82,29 +83,27 @@ def is_done(run_dir: RunDir, step: Step) -> bool:
 
 
 def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
-    """Raise RunDirError if a step would overwrite existing files."""
+    """Raise TrainError if a step would overwrite existing files."""
     where = step.name if step.stage == "dagger" else step.stage
     if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
-        raise RunDirError(f"{run_dir.out}: its drives belong to another run (--from); set dagger.rounds=0")
+        raise TrainError(f"{run_dir.out}: its drives belong to another run (--from); set dagger.rounds=0")
     again = step.stage in GO_ON and step.round > run_dir.retired(step.stage)
     if run_dir.begun(where) and not resume and not again:
-        raise RunDirError(
-            f"{run_dir.out / where}: already started; continue with --resume, or delete it to start again"
-        )
+        raise TrainError(f"{run_dir.out / where}: already started; continue with --resume, or delete it to start again")
 
 
 def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]:
     """Return the steps up to `name`; `wanted` are the steps to run after them.
 
-    Raises RunDirError if the recipe has no such step, the step leaves no policy, or a later step needs earlier drives.
+    Raises TrainError if the recipe has no such step, the step leaves no policy, or a later step needs earlier drives.
     """
     steps = steps_of("all", recipe)
     policies = [step.name for step in steps if step.stage in ("imitate", "rl")]
     if name not in policies:
-        raise RunDirError(f"--after {name}: expected one of {', '.join(policies)}")
+        raise TrainError(f"--after {name}: expected one of {', '.join(policies)}")
     before = steps[: [step.name for step in steps].index(name) + 1]
     if not recipe.dagger.newest_only and any(step.stage == "dagger" and step not in before for step in wanted):
-        raise RunDirError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
+        raise TrainError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
     return before
 
 
@@ -151,7 +150,7 @@ def module_run(stage: str) -> StageRun:
 def _round(job: StageJob, step: Step) -> dict[str, Any]:
     weights = weights_before(job.run_dir.out, "rl")
     if weights is None or weights.parent.name != "imitate":
-        raise RunDirError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
+        raise TrainError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
     folder = job.run_dir.stage(step.name)
     artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
     return run_round(job, artifacts, step.round)

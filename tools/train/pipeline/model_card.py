@@ -16,6 +16,7 @@ from edge.core.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
 from reporting.build_progress import duration
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.pipeline.chain import ADOPTED, GO_ON
@@ -50,17 +51,13 @@ LIMITS: Final = """\
 """
 
 
-class CardError(ValueError):
-    """No weights to describe, or an unreadable score file; one line."""
-
-
 def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> Path:
     """Write the card beside the run's weights and return its path. `scores`: result files of edge-bench.
 
-    Raises CardError, OSError.
+    Raises TrainError, OSError.
     """
     if not run_dir.model_path.is_file():
-        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+        raise TrainError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     path = run_dir.out / CARD
     write_whole(path, card(run_dir, recipe, run_dir.model_path, [score(each) for each in scores]))
     return path
@@ -69,10 +66,10 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
 def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
     """Write the run's weights for publication, with card and recipe: float16, without the value network.
 
-    Returns the weights' path. Raises CardError, NetworkFileError, OSError.
+    Returns the weights' path. Raises TrainError, OSError.
     """
     if not run_dir.model_path.is_file():
-        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+        raise TrainError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     with safe_open(str(run_dir.model_path), framework="pt") as file:
         about = file.metadata()
     model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
@@ -123,12 +120,12 @@ def _licence(begun_with_weights: bool, before: str | None) -> str:
 
 
 def score(path: Path) -> dict[str, Any]:
-    """Read conditions and summary of a benchmark's result file. Raises CardError."""
+    """Read conditions and summary of a benchmark's result file. Raises TrainError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CardError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
+        raise TrainError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
 
 
 def parameters(weights: Path) -> dict[str, int]:

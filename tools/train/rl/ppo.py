@@ -193,7 +193,7 @@ class TailLearner(Learner):
         return tail_parameters(self.network.action)
 
     def load_policy(self, tensors: Mapping[str, Tensor]) -> None:
-        """Replace the tail's weights. Raises ActionTailError for those of another network."""
+        """Replace the tail's weights. Raises TrainError for those of another network."""
         load_tail(self.network.action, tensors)
 
     def take(self, rollout: Rollout) -> None:

@@ -26,6 +26,7 @@ from export.model.network import initialise
 from export.model.weights import weights_sha256
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import LOG_STD_RANGE, RlConfig
 from tools.train.config.scenes import TASKS_PER_SCENE
@@ -56,18 +57,12 @@ STEPS_PER_EPISODE: Final = 300
 def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
     """Return (description, number of samples, key of the throughput table) of this stage's work."""
     config = recipe.rl
-    if config is None:
-        return []
     evaluations = 1 + -(-config.iterations // config.evaluate_every)
     episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes + 2 * config.final_episodes
     return [("steps driven and learned from", episodes * STEPS_PER_EPISODE, "ppo")]
 
 
 Drive = Callable[..., Rollout]
-
-
-class RlError(ValueError):
-    """No policy to improve, or a checkpoint of another run; one line."""
 
 
 @dataclass(frozen=True)
@@ -154,14 +149,14 @@ class State:
         checkpoint.save(self._path, tensors, meta)
 
     def load(self) -> None:
-        """Resume from the checkpoint if requested and present. Raises RlError for another run's checkpoint."""
+        """Resume from the checkpoint if requested and present. Raises TrainError for another run's checkpoint."""
         if not (self._job.resume and self._path.exists()):
             self._job.run_dir.rewind(STAGE, -1)
             shutil.rmtree(self._path.parent / ROLLOUTS, ignore_errors=True)
             return
         tensors, meta = checkpoint.load(self._path)
         if meta["key"] != self._key:
-            raise RlError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
+            raise TrainError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
         learner, optimiser = self._learner, self.optimiser
         learner.load_policy(checkpoint.under("policy", tensors))
         self._kept = {name: checkpoint.under(name, tensors) for name in ("start", "best")}
@@ -179,18 +174,18 @@ def _score(content: Mapping[str, float] | None) -> Score | None:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Improve the newest weights of the run. Raises RlError, ActionTailError, RolloutFailedError, KeyboardInterrupt."""
+    """Improve the newest weights of the run. Raises TrainError, RolloutFailedError, KeyboardInterrupt."""
     if job.ranks.world > 1:
-        raise RlError(
+        raise TrainError(
             "torchrun: reinforcement learning starts its own processes (rl.jobs); run edge-train rl without torchrun"
         )
-    config = job.recipe.rl or RlConfig()
+    config = job.recipe.rl
     before = weights_before(job.run_dir.out, STAGE)
     if before is None:
-        raise RlError(f"{job.run_dir.out}: no policy to improve; run imitate first")
+        raise TrainError(f"{job.run_dir.out}: no policy to improve; run imitate first")
     imitated = before.parent.name == "imitate" or (before.parent.name == START and is_trained(before))
     if config.policy == "action" and not imitated:
-        raise RlError(f"{before}: the action expert is untrained; run imitate first")
+        raise TrainError(f"{before}: the action expert is untrained; run imitate first")
     network = read_network(before, job.recipe.model, job.recipe.seed)
     initialise(network, job.seed, ("value",))
     network.to(job.device)
@@ -222,7 +217,7 @@ def improve(
 
     The policy ends as the best one, or as the first one if the best is not ahead on the final scenarios.
     """
-    config = job.recipe.rl or RlConfig()
+    config = job.recipe.rl
     state = State(job, learner, config)
     orders = _Orders(job, config, before, artifacts)
     state.load()

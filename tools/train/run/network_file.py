@@ -16,6 +16,7 @@ from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
+from tools.train.config.errors import TrainError
 from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
 
@@ -30,10 +31,6 @@ ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
 FILE: Final = "model.safetensors"
 SHARED: Final = ("vision", "language")
 """Parts that ablations of the action expert share."""
-
-
-class NetworkFileError(ValueError):
-    """Weights that a stage cannot start with; one line: what, expected, found."""
 
 
 def stage_weights(out: Path, stage: str) -> Path:
@@ -95,18 +92,18 @@ def card_of(weights: Path) -> str | None:
 
 
 def is_trained(weights: Path) -> bool:
-    """Return whether the whole network in a file was trained. Raises NetworkFileError."""
+    """Return whether the whole network in a file was trained. Raises TrainError."""
     try:
         with safe_open(str(weights), framework="pt") as file:
             return (file.metadata() or {}).get("trained") == "true"
     except (OSError, SafetensorError) as error:
-        raise NetworkFileError(f"{weights}: not weights of edge-train ({error})") from error
+        raise TrainError(f"{weights}: not weights of edge-train ({error})") from error
 
 
 def start_network(job: StageJob, stage: str) -> TicVla:
     """Load the network of the previous stage, or initialise one from the recipe's seed; on the CPU.
 
-    Raises NetworkFileError for weights of another network.
+    Raises TrainError for weights of another network.
     """
     path = weights_before(job.run_dir.out, stage)
     if path is None:
@@ -119,7 +116,7 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
 
     The action expert's inputs do not count as configuration: ablations of them start with the same weights.
 
-    Raises NetworkFileError if encoder or language model differ.
+    Raises TrainError if encoder or language model differ.
     """
     model = build(config, seed)
     try:
@@ -128,16 +125,16 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
             theirs, ours = (replace(of, action=_with_all_inputs(of.action)) for of in (found, config))
             same = [part for part in PARTS if getattr(theirs, part) == getattr(ours, part)]
             if other := sorted(set(SHARED) - set(same)):
-                raise NetworkFileError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
+                raise TrainError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
     except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError) as error:
-        if isinstance(error, NetworkFileError):
+        if isinstance(error, TrainError):
             raise
-        raise NetworkFileError(f"{path}: not weights of edge-train ({error})") from error
+        raise TrainError(f"{path}: not weights of edge-train ({error})") from error
     wanted = {name for name in model.state_dict() if name.split(".")[0] in same}
     if set(tensors) != wanted:
         odd = sorted(set(tensors) ^ wanted)
-        raise NetworkFileError(f"{path}: expected the tensors of {', '.join(same)}; {odd[0]} is missing or unknown")
+        raise TrainError(f"{path}: expected the tensors of {', '.join(same)}; {odd[0]} is missing or unknown")
     model.load_state_dict(tensors, strict=False)
     return model
 

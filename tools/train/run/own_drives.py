@@ -7,10 +7,11 @@ import shutil
 from pathlib import Path
 from typing import Any, Final
 
+from tools.train.config.errors import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset
 from tools.train.run.job import StageJob
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.run_dir import RunDir
 
 _PARTIAL: Final = "collect.partial"
 IMPORTED: Final = "imported"
@@ -25,7 +26,7 @@ def prefixes_of(round_number: int) -> tuple[str, str]:
 def drives_after(job: StageJob, stage: str) -> Dataset:
     """Return the drives that a stage trains on: all, or those of the newest round (`dagger.newest_only`).
 
-    Raises DriveError.
+    Raises TrainError.
     """
     dataset, rounds = Dataset.open(job.run_dir.stage("collect")), job.run_dir.retired(stage)
     if rounds and job.recipe.dagger.newest_only:
@@ -36,15 +37,15 @@ def drives_after(job: StageJob, stage: str) -> Dataset:
 def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
     """Import the data set in `folder` as the result of the run's stage `collect`; files are hard-linked if possible.
 
-    An interrupted call leaves no drives. Returns the stage's result. Raises DriveError for a damaged data set,
-    RunDirError if the run has other drives.
+    An interrupted call leaves no drives. Returns the stage's result. Raises TrainError for a damaged data set,
+    TrainError if the run has other drives.
     """
     dataset = Dataset.open(folder)
     done = run_dir.result("collect")
     if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
         return done
     if run_dir.begun("collect"):
-        raise RunDirError(f"--drives {folder}: {run_dir.out} has other drives; name another --out")
+        raise TrainError(f"--drives {folder}: {run_dir.out} has other drives; name another --out")
     Dataset.open(folder, verify=True)
     partial = run_dir.out / _PARTIAL
     shutil.rmtree(partial, ignore_errors=True)

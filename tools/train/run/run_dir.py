@@ -14,6 +14,7 @@ from typing import Any, Final
 from edge.core.cli import write_whole
 from export import model
 from sim_hil.benchmark.workers.code_version import code_sha256
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
 from tools.train.run.optim import computes_bf16
 
@@ -25,10 +26,6 @@ PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "t
 """Packages whose versions affect a run's result."""
 
 
-class RunDirError(ValueError):
-    """A folder that is not the requested run; one line: what, expected, found."""
-
-
 class RunDir:
     """`out/{recipe.toml,versions.json,timings.json,collect/,…,model.safetensors,curves/*.png,log.jsonl}`."""
 
@@ -37,18 +34,18 @@ class RunDir:
 
     @staticmethod
     def open(out: Path, recipe: Recipe) -> RunDir:
-        """Create the folder or reopen the run in it. Raises RunDirError if it contains another run.
+        """Create the folder or reopen the run in it. Raises TrainError if it contains another run.
 
         The configuration of a stage that has not started may still be changed.
         """
         run_dir = RunDir(out)
         if run_dir.recipe_path.exists():
             if changed := run_dir._changed(recipe):
-                raise RunDirError(
+                raise TrainError(
                     f"{out}: was started with another recipe ({changed}); name another --out, or restore the values"
                 )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise RunDirError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
+            raise TrainError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
         out.mkdir(parents=True, exist_ok=True)
         run_dir._note_versions()
         write_whole(run_dir.recipe_path, recipe.to_toml())
@@ -85,18 +82,18 @@ class RunDir:
         return folder.is_dir() and any(folder.iterdir())
 
     def borrow(self, other: RunDir, stages: Sequence[str], recipe: Recipe) -> None:
-        """Link finished stages of another run. Raises RunDirError if this recipe would give other results."""
+        """Link finished stages of another run. Raises TrainError if this recipe would give other results."""
         if not other.recipe_path.exists():
-            raise RunDirError(f"--from {other.out}: not a run folder of edge-train")
+            raise TrainError(f"--from {other.out}: not a run folder of edge-train")
         found, asked = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
         for stage in stages:
             if other.result(stage) is None:
-                raise RunDirError(f"--from {other.out}: stage {stage} has not finished")
+                raise TrainError(f"--from {other.out}: stage {stage} has not finished")
             if difference := _difference(stage, found[stage], asked[stage]):
-                raise RunDirError(f"--from {other.out}: was trained with another recipe ({difference})")
+                raise TrainError(f"--from {other.out}: was trained with another recipe ({difference})")
         for part in SHARED_PARTS:
             if difference := _difference(f"model.{part}", found["model"][part], asked["model"][part]):
-                raise RunDirError(f"--from {other.out}: its {part} differs ({difference})")
+                raise TrainError(f"--from {other.out}: its {part} differs ({difference})")
         for stage in stages:
             link = self.out / stage
             if not link.exists():

@@ -15,6 +15,7 @@ import torch
 from tokenizers import Tokenizer
 
 from export.model.network import TicVla
+from tools.train.config.errors import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import POLICY_DRIVER, Dataset
@@ -22,7 +23,7 @@ from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts, anchors_of, draw
 from tools.train.samples.greedy import decode
-from tools.train.samples.kv_cache import FORMAT, KvCache, KvCacheError, Made, begin, write_states
+from tools.train.samples.kv_cache import FORMAT, KvCache, Made, begin, write_states
 from tools.train.samples.language_batch import FrameTokens, Row, collate, frames_of, run
 
 SEEN_PARTS: Final = ("vision", "language")
@@ -71,7 +72,7 @@ def build_kv_cache(
 ) -> KvCache:
     """Compute the missing states of all drives (or `ids`) and open the cache, a folder under `folder`.
 
-    The network runs on the device of its weights; ranks share the drives. Raises KvCacheError for values beyond
+    The network runs on the device of its weights; ranks share the drives. Raises TrainError for values beyond
     float16, OSError.
     """
     key = cache_key(network, tokenizer, config, seed)
@@ -162,7 +163,7 @@ def _batch(
         half = state.to(torch.float16).cpu().numpy()
         if not np.isfinite(half).all():
             where = f"drive {each.anchor.drive_id}, frame {each.anchor.k}"
-            raise KvCacheError(f"{where}: keys or values exceed float16; train the language model again")
+            raise TrainError(f"{where}: keys or values exceed float16; train the language model again")
         text = (WAYPOINTS_START if each.drawn.waypoints_only else "") + prompts.text(ids)
         made.append(Made(each.anchor.k, each.number, half, len(each.prompt), each.own, text))
     return made

@@ -19,15 +19,12 @@ import numpy as np
 
 from edge.core.cli import write_whole
 from edge.state.reasoning_text import Waypoints, parse_waypoints
+from tools.train.config.errors import TrainError
 from tools.train.samples.language_batch import Halves
 
 FORMAT: Final = 1
 INDEX: Final = "kv.json"
 _MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descriptors
-
-
-class KvCacheError(ValueError):
-    """A cache that cannot be used; one line: what, expected, found, what to do."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +71,20 @@ class KvCache:
     """Read access to a cache; arrays are mapped from the files, not copied."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder that `build_kv_cache` wrote. Raises KvCacheError."""
+        """Open a folder that `build_kv_cache` wrote. Raises TrainError."""
         self.folder = folder
         try:
             content = json.loads((folder / INDEX).read_text(encoding="utf-8"))
             if content["format"] != FORMAT:
-                raise KvCacheError(f"{folder}: expected a cache of format {FORMAT}; delete it and build it again")
+                raise TrainError(f"{folder}: expected a cache of format {FORMAT}; delete it and build it again")
             self.key: str = content["key"]
             self.kv_dim: int = content["kv_dim"]
             self.draws: int = content["draws"]
             """Number of states of each anchor, with different wordings and previous progress."""
         except (OSError, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, KvCacheError):
+            if isinstance(error, TrainError):
                 raise
-            raise KvCacheError(f"{folder}: no cache of keys and values ({error!r}); build it first") from error
+            raise TrainError(f"{folder}: no cache of keys and values ({error!r}); build it first") from error
         self._indices: dict[str, dict[tuple[int, int], _Place]] = {}
         self._maps: OrderedDict[str, Halves] = OrderedDict()
 
@@ -95,18 +92,18 @@ class KvCache:
         """Return whether the cache contains a drive with this hash of its file."""
         try:
             return bool(_read(self.folder, drive_id)["drive_sha256"] == sha256) and _npy(self.folder, drive_id).exists()
-        except KvCacheError:
+        except TrainError:
             return False
 
     def anchors(self, drive_id: str) -> tuple[int, ...]:
-        """Return the frames of a drive that have a state, ascending. Raises KvCacheError for a missing drive."""
+        """Return the frames of a drive that have a state, ascending. Raises TrainError for a missing drive."""
         return tuple(sorted({k for k, _ in self._index(drive_id)}))
 
     def at(self, drive_id: str, k: int, draw: int = 0) -> CachedState:
-        """Return state number `draw` of the generation whose newest frame is k. Raises KvCacheError if missing."""
+        """Return state number `draw` of the generation whose newest frame is k. Raises TrainError if missing."""
         place = self._index(drive_id).get((k, draw))
         if place is None:
-            raise KvCacheError(f"drive {drive_id}: no state of frame {k}, draw {draw}")
+            raise TrainError(f"drive {drive_id}: no state of frame {k}, draw {draw}")
         rows = self._map(drive_id)[place.start : place.start + place.tokens]
         return CachedState(rows, place.prompt_tokens, place.text, place.own)
 
@@ -122,9 +119,9 @@ class KvCache:
             try:
                 rows: Halves = np.load(path, mmap_mode="r", allow_pickle=False)
             except (OSError, ValueError) as error:
-                raise KvCacheError(f"{path}: not readable ({error}); delete it and build it again") from error
+                raise TrainError(f"{path}: not readable ({error}); delete it and build it again") from error
             if rows.dtype != np.float16 or rows.shape != (wanted, self.kv_dim):
-                raise KvCacheError(f"{path}: expected f16 {(wanted, self.kv_dim)}, found {rows.dtype} {rows.shape}")
+                raise TrainError(f"{path}: expected f16 {(wanted, self.kv_dim)}, found {rows.dtype} {rows.shape}")
             self._maps[drive_id] = rows
             if len(self._maps) > _MAX_OPEN:
                 self._maps.popitem(last=False)
@@ -149,7 +146,7 @@ def _read(folder: Path, drive_id: str) -> Mapping[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {"drive_sha256": content["drive_sha256"], "states": content["states"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise KvCacheError(f"{path}: no states of this drive ({error!r}); build the cache for it") from error
+        raise TrainError(f"{path}: no states of this drive ({error!r}); build the cache for it") from error
 
 
 def write_states(folder: Path, drive_id: str, sha256: str, states: Sequence[Made], kv_dim: int) -> None:

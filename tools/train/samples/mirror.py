@@ -79,7 +79,7 @@ class Seconds:
         return -(-len(self.drive) // TRACE_EVERY)
 
     def frame(self, k: int) -> NDArray[np.uint8]:
-        """Decode the image of second k as uint8 RGB [128, 128, 3]. Raises DriveError, IndexError."""
+        """Decode the image of second k as uint8 RGB [128, 128, 3]. Raises TrainError, IndexError."""
         picture = self.drive.frame(k * TRACE_EVERY)
         return np.ascontiguousarray(picture[:, ::-1]) if self.mirrored else picture
 
@@ -99,7 +99,7 @@ class SecondsDataset(Dataset):
         return SecondsDataset(dataset.folder, entries, mirrored)
 
     def load(self, drive_id: str, *, pictures: bool = True) -> Seconds:  # type: ignore[override]  # all that a token cache asks of a drive
-        """Load one drive. Raises DriveError."""
+        """Load one drive. Raises TrainError."""
         return Seconds(super().load(drive_id, pictures=pictures), self.mirrored)
 
 

@@ -19,10 +19,11 @@ from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.policies.select import robot_config
 from tests.support.train.train_fake_worker import BEGUN
 from tools.train.collect import collect, collection
-from tools.train.collect.collection import CollectError, CollectFailedError, Collection, fill, job_count
+from tools.train.collect.collection import CollectFailedError, Collection, fill, job_count
 from tools.train.collect.dagger_driver import PolicyOptions
 from tools.train.collect.worker import Draw, Order, messages
 from tools.train.config.collect import CollectConfig
+from tools.train.config.errors import TrainError
 from tools.train.config.evaluate import EvaluateConfig
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset, Drive
@@ -250,7 +251,7 @@ def test_its_budget_is_its_drives() -> None:
 
 
 def test_under_torchrun_it_refuses(tmp_path: Path) -> None:
-    with pytest.raises(CollectError, match="without torchrun"):
+    with pytest.raises(TrainError, match="without torchrun"):
         collect.run(_job(tmp_path, ranks=Ranks(0, 2)))
 
 

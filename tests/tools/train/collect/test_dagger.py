@@ -22,12 +22,13 @@ from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tests.support.train.training_drives import dataset, drive
 from tools.train.collect import dagger
-from tools.train.collect.collection import CollectError, Collection
+from tools.train.collect.collection import Collection
 from tools.train.collect.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
 from tools.train.collect.record import CameraSettings, DrivePlan, record
 from tools.train.collect.steering import Velocity
 from tools.train.config.collect import CollectConfig, DaggerConfig
-from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
+from tools.train.config.errors import TrainError
+from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY
 from tools.train.run import own_drives
 from tools.train.run.distributed import Ranks
 from tools.train.run.job import QuietProgress
@@ -159,7 +160,7 @@ def test_a_round_that_was_begun_with_other_artifacts_is_not_gone_on_with(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
     dataset(tmp_path / "collect", drive("d1-00000", frames=20, driver="policy:0123456789ab"))
-    with pytest.raises(CollectError, match="the same artifacts"):
+    with pytest.raises(TrainError, match="the same artifacts"):
         dagger.run_round(_job(tmp_path), artifacts.directory, 1)
     assert not filled
 
@@ -200,12 +201,12 @@ def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
     job.recipe.dagger = DaggerConfig(newest_only=True)
     job.run_dir.finish("sft-0", {})
     dataset(tmp_path / "collect", drive("e0", frames=20))
-    with pytest.raises(DriveError, match="d1- or n1-"):
+    with pytest.raises(TrainError, match="d1- or n1-"):
         own_drives.drives_after(job, "sft")
 
 
 def test_under_torchrun_it_refuses(tmp_path: Path, artifacts: Artifacts) -> None:
-    with pytest.raises(CollectError, match="without torchrun"):
+    with pytest.raises(TrainError, match="without torchrun"):
         dagger.run_round(_job(tmp_path, Ranks(0, 2)), artifacts.directory, 1)
 
 

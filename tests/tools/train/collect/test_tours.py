@@ -23,7 +23,8 @@ from tools.train.collect.tour_world import KinematicBase, TourWorld, record_tour
 from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.collect.worker import messages
 from tools.train.config.collect import CollectConfig, TourConfig
-from tools.train.drives.drive import TOUR_DRIVER, Dataset, Drive, DriveError
+from tools.train.config.errors import TrainError
+from tools.train.drives.drive import TOUR_DRIVER, Dataset, Drive
 from tools.train.run.distributed import SINGLE
 from tools.train.run.job import QuietProgress
 from tools.train.samples.anchors import Anchor
@@ -194,7 +195,7 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
     assert said[0]["drive"]["driver"] == drive.about.driver == TOUR_DRIVER
     assert np.array_equal(Seconds(drive, False).frame(1), drive.frame(10))
     assert np.array_equal(Seconds(drive, True).frame(1), drive.frame(10)[:, ::-1])
-    with pytest.raises(DriveError, match="frame 7 has no image"):
+    with pytest.raises(TrainError, match="frame 7 has no image"):
         drive.frame(7)
 
 
@@ -202,7 +203,7 @@ def test_only_a_tour_may_lack_pictures() -> None:
     drive = made_up_drive("a", 30)
     ends = drive.jpeg_end.copy()
     ends[5] = ends[4]
-    with pytest.raises(DriveError, match="increasing values"):
+    with pytest.raises(TrainError, match="increasing values"):
         replace(drive, jpeg_end=ends)
 
 

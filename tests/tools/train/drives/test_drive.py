@@ -11,8 +11,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from tests.support.train.training_drives import about, dataset, drive
+from tools.train.config.errors import TrainError
 from tools.train.drives.dataset import LINES, DatasetWriter
-from tools.train.drives.drive import INDEX, About, Dataset, Drive, DriveError, Entry
+from tools.train.drives.drive import INDEX, About, Dataset, Drive, Entry
 
 # -- one file a drive -------------------------------------------------------------------------------------------------
 
@@ -48,7 +49,7 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
     drive().save(tmp_path / "a")
     found = Drive.load(tmp_path / "a", pictures=False)
     assert len(found) == 60 and found.T_odom_base(0).as_tuple() == (0.0, 0.0, 0.0)
-    with pytest.raises(DriveError, match="without its images"):
+    with pytest.raises(TrainError, match="without its images"):
         found.frame(0)
 
 
@@ -77,18 +78,18 @@ def test_the_trace_of_a_frame_is_the_newest_written_by_then() -> None:
     ],
 )
 def test_arrays_that_cannot_be_are_refused(name: str, value: np.ndarray, says: str) -> None:
-    with pytest.raises(DriveError, match=says):
+    with pytest.raises(TrainError, match=says):
         replace(drive(), **{name: value})
 
 
 def test_traces_must_be_a_second_apart() -> None:
-    with pytest.raises(DriveError, match="every 10 frames"):
+    with pytest.raises(TrainError, match="every 10 frames"):
         about(traces=({"k": 0}, {"k": 11}))
 
 
 @pytest.mark.parametrize("name", ["../a", "", "a/b", ".a"])
 def test_an_id_is_no_path(name: str) -> None:
-    with pytest.raises(DriveError, match="expected an id of"):
+    with pytest.raises(TrainError, match="expected an id of"):
         about(name)
 
 
@@ -96,17 +97,17 @@ def test_a_header_with_a_key_too_many_is_refused(tmp_path: Path) -> None:
     drive().save(tmp_path / "a")
     arrays = load_file(tmp_path / "a")
     save_file(arrays, tmp_path / "b", metadata={"drive": json.dumps({"format": 1, "more": 2})})
-    with pytest.raises(DriveError, match="keys in its header"):
+    with pytest.raises(TrainError, match="keys in its header"):
         Drive.load(tmp_path / "b")
     save_file(arrays, tmp_path / "c")
-    with pytest.raises(DriveError, match="header is not a drive"):
+    with pytest.raises(TrainError, match="header is not a drive"):
         Drive.load(tmp_path / "c")
 
 
 def test_a_torn_file_is_one_clear_line(tmp_path: Path) -> None:
     drive().save(tmp_path / "a")
     (tmp_path / "b").write_bytes((tmp_path / "a").read_bytes()[:-100])
-    with pytest.raises(DriveError, match="not a readable drive"):
+    with pytest.raises(TrainError, match="not a readable drive"):
         Drive.load(tmp_path / "b")
 
 
@@ -152,12 +153,12 @@ def test_verifying_finds_one_wrong_byte(tmp_path: Path) -> None:
     data[-1] ^= 1
     found.path("e0").write_bytes(data)
     Dataset.open(tmp_path)
-    with pytest.raises(DriveError, match="differs from the indexed file"):
+    with pytest.raises(TrainError, match="differs from the indexed file"):
         Dataset.open(tmp_path, verify=True)
 
 
 def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DriveError, match="record one with collect"):
+    with pytest.raises(TrainError, match="record one with collect"):
         Dataset.open(tmp_path)
 
 
@@ -204,7 +205,7 @@ def test_the_counts_say_how_drives_ended(tmp_path: Path) -> None:
 
 
 def test_two_writers_at_a_time_are_refused(tmp_path: Path) -> None:
-    with DatasetWriter(tmp_path), pytest.raises(DriveError, match="another process"):
+    with DatasetWriter(tmp_path), pytest.raises(TrainError, match="another process"):
         DatasetWriter(tmp_path)
     DatasetWriter(tmp_path).close()
 

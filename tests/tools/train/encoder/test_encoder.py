@@ -16,9 +16,10 @@ from tests.support.train.train_drives import tiny_model
 from tests.support.train.train_encoder_rank import CONFIG, encoder_job
 from tests.support.train.train_stage_contract import Run, StageContract
 from tools.train.config.encoder import EncoderConfig, FramesConfig
+from tools.train.config.errors import TrainError
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
-from tools.train.encoder.encoder import EncoderError, budget, run
+from tools.train.encoder.encoder import budget, run
 from tools.train.run import optim
 from tools.train.samples.tokens import encoder_sha256
 
@@ -79,7 +80,7 @@ def test_the_result_names_the_encoder_that_was_left(tmp_path: Path) -> None:
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_encoder_rank"
-    error = EncoderError
+    error = TrainError
     other = dataclasses.replace(CONFIG, batch=7)
 
     def prepare(self, out: Path) -> list[str]:
@@ -124,7 +125,7 @@ def test_a_network_whose_tokens_have_no_labels_is_refused(tmp_path: Path) -> Non
         tiny_model(), vision=odd, language=dataclasses.replace(tiny_model().language, token_merge=3)
     )
     recipe = dataclasses.replace(job.recipe, model=model)
-    with pytest.raises(EncoderError, match="3 x 3 tokens"):
+    with pytest.raises(TrainError, match="3 x 3 tokens"):
         run(dataclasses.replace(job, recipe=recipe))
 
 

@@ -11,18 +11,8 @@ import pytest
 from export.core.typed import plain
 from sim_hil.layouts import is_reserved
 from tools.train.config.encoder import MOST_SCENES, FramesConfig
-from tools.train.encoder.data import (
-    FIRST_LAYOUT,
-    FramesError,
-    FrameSet,
-    Shard,
-    fill,
-    finish,
-    frames_sha256,
-    made,
-    path_of,
-    plan,
-)
+from tools.train.config.errors import TrainError
+from tools.train.encoder.data import FIRST_LAYOUT, FrameSet, Shard, fill, finish, frames_sha256, made, path_of, plan
 from tools.train.encoder.labels import CLASSES, LANDMARK, PERSON, label_shapes
 from tools.train.encoder.worker import render
 from tools.train.run.job import QuietProgress
@@ -197,7 +187,7 @@ def test_the_hash_of_all_is_of_every_file(tmp_path: Path, shards: list[Shard]) -
     finish(tmp_path, shards[1])
     assert frames_sha256(tmp_path, shards) != before
     path_of(tmp_path, shards[0].name).unlink()
-    with pytest.raises(FramesError, match="missing"):
+    with pytest.raises(TrainError, match="missing"):
         frames_sha256(tmp_path, shards)
 
 
@@ -216,5 +206,5 @@ def test_what_is_there_counts_as_done(tmp_path: Path, shards: list[Shard]) -> No
 
 def test_a_file_that_is_not_of_pictures_is_refused(tmp_path: Path, shards: list[Shard]) -> None:
     fake(tmp_path, shards[0])
-    with pytest.raises(FramesError, match="not readable"):
+    with pytest.raises(TrainError, match="not readable"):
         FrameSet(tmp_path, shards[:1])

@@ -18,13 +18,14 @@ from export.model.network import build
 from tests.support.train.train_drives import MadeUpTokens, tiny_model
 from tests.support.train.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, trained
 from tests.support.train.train_stage_contract import Run, StageContract
+from tools.train.config.errors import TrainError
 from tools.train.config.imitate import POINT_GOAL, ImitateConfig, ImitateEvalConfig, SampleConfig
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates, SampleError
-from tools.train.imitate.imitate import POINT_GOAL_FILE, ImitateError, budget, fit, run
-from tools.train.imitate.point_goal_net import PointGoalFileError, build_point_goal, load_point_goal
+from tools.train.imitate.imitate import POINT_GOAL_FILE, budget, fit, run
+from tools.train.imitate.point_goal_net import build_point_goal, load_point_goal
 from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy
 from tools.train.pipeline.chain import Step, run_step
 from tools.train.run import optim
@@ -84,7 +85,7 @@ def test_all_of_the_action_expert_learns_and_nothing_else(whole: Run) -> None:
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_imitate_rank"
-    error = ImitateError
+    error = TrainError
     other = dataclasses.replace(CONFIG, inject_delay=False)
 
     @pytest.fixture(autouse=True)
@@ -210,7 +211,7 @@ def test_the_point_goal_stage_leaves_its_own_weights(tmp_path: Path) -> None:
     plans = network(torch.zeros(2, 4, 32), torch.zeros(2, 3), torch.tensor([[5.0, 0.0], [0.0, 0.0]]))
     assert plans.shape == (2, 30, 3) and torch.isfinite(plans).all()
     assert not stage_weights(tmp_path, "imitate").exists()
-    with pytest.raises(PointGoalFileError, match="another size"):
+    with pytest.raises(TrainError, match="another size"):
         load_point_goal(path, with_action(steps=10))
 
 

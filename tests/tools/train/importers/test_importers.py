@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tools.train.config.errors import TrainError
 from tools.train.drives.drive import Dataset
 from tools.train.drives.futures import relative
 from tools.train.importers import gnd, scand
 from tools.train.importers.__main__ import import_folder, main
 from tools.train.importers.cut import FRAMES, drives, pieces
-from tools.train.importers.recording import ImportedError, Recording, read_picture
+from tools.train.importers.recording import Recording, read_picture
 
 FIRST_NS = 1_636_492_800_123_456_789
 SPEED_MPS, TURN_RADPS = 0.6, 0.1
@@ -232,7 +233,7 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
     ],
 )
 def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, Any], says: str) -> None:
-    with pytest.raises(ImportedError, match=says):
+    with pytest.raises(TrainError, match=says):
         list(drives(scand.read(_scand(tmp_path / "A", 21.0, texts)), "scand", "spot"))
 
 
@@ -242,21 +243,21 @@ def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, An
 def test_a_missing_column_is_named(tmp_path: Path) -> None:
     folder = _scand(tmp_path / "A", 1.0)
     (folder / "odometry.csv").write_text("stamp_ns,x_m,y_m\n1,2,3\n")
-    with pytest.raises(ImportedError, match="column theta_rad is missing"):
+    with pytest.raises(TrainError, match="column theta_rad is missing"):
         scand.read(folder)
 
 
 def test_a_row_that_is_not_of_numbers_is_refused(tmp_path: Path) -> None:
     folder = _scand(tmp_path / "A", 1.0)
     (folder / "odometry.csv").write_text("stamp_ns,x_m,y_m,theta_rad\n1,2,north,3\n")
-    with pytest.raises(ImportedError, match="not of numbers"):
+    with pytest.raises(TrainError, match="not of numbers"):
         scand.read(folder)
 
 
 def test_a_picture_without_a_stamp_is_refused(tmp_path: Path) -> None:
     folder = _scand(tmp_path / "A", 1.0)
     _picture(folder / "image" / "first.jpg", 1)
-    with pytest.raises(ImportedError, match="whole nanoseconds"):
+    with pytest.raises(TrainError, match="whole nanoseconds"):
         scand.read(folder)
 
 
@@ -266,7 +267,7 @@ def test_a_recording_reads_nothing_outside_of_its_folder(tmp_path: Path, name: s
     content = json.loads((folder / "recording.json").read_text())
     content["frames"][3]["file"] = name
     (folder / "recording.json").write_text(json.dumps(content))
-    with pytest.raises(ImportedError, match="not a path below"):
+    with pytest.raises(TrainError, match="not a path below"):
         gnd.read(folder)
 
 
@@ -275,21 +276,21 @@ def test_a_quaternion_that_is_none_is_refused(tmp_path: Path) -> None:
     content = json.loads((folder / "recording.json").read_text())
     content["poses"][3]["quaternion_xyzw"] = [0.0, 0.0, 0.0, 0.5]
     (folder / "recording.json").write_text(json.dumps(content))
-    with pytest.raises(ImportedError, match="length 1"):
+    with pytest.raises(TrainError, match="length 1"):
         gnd.read(folder)
 
 
 def test_stamps_that_do_not_grow_are_refused(recording: Recording) -> None:
     stamps = recording.stamps_s.copy()
     stamps[5] = stamps[4]
-    with pytest.raises(ImportedError, match="increasing stamps"):
+    with pytest.raises(TrainError, match="increasing stamps"):
         replace(recording, stamps_s=stamps)
 
 
 def test_a_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
     for name in ("a.jpg", "a.png"):
         (tmp_path / name).write_bytes(b"something else entirely")
-        with pytest.raises(ImportedError, match=name):
+        with pytest.raises(TrainError, match=name):
             read_picture(tmp_path / name)
 
 

@@ -22,22 +22,16 @@ from export.model.weights import WeightsInfo, save_weights
 from tools.train import cli
 from tools.train.collect.collection import CollectFailedError
 from tools.train.config.collect import DaggerConfig
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
-from tools.train.pipeline.model_card import CardError, card, ship, write_card
+from tools.train.pipeline.model_card import card, ship, write_card
 from tools.train.rl.vector_env import RolloutFailedError
 from tools.train.run.exported import ExportError, export_artifacts, model_argument
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import (
-    NetworkFileError,
-    finish_network,
-    import_start,
-    read_network,
-    start_network,
-    weights_before,
-)
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.network_file import finish_network, import_start, read_network, start_network, weights_before
+from tools.train.run.run_dir import RunDir
 from tools.train.samples.delays import Delays
 
 TINY = load_recipe("tiny")
@@ -91,7 +85,7 @@ def test_a_step_is_done_once_its_result_is_there(run_dir: RunDir) -> None:
 
 def test_a_stage_that_was_begun_is_neither_written_over_nor_forgotten(run_dir: RunDir) -> None:
     (run_dir.stage("sft") / "checkpoint").touch()
-    with pytest.raises(RunDirError, match="--resume"):
+    with pytest.raises(TrainError, match="--resume"):
         may_begin(run_dir, Step("sft"), resume=False)
     may_begin(run_dir, Step("sft"), resume=True)
 
@@ -121,12 +115,12 @@ def test_borrowed_drives_are_not_added_to(run_dir: RunDir, tmp_path: Path) -> No
     other = RunDir.open(tmp_path / "other", TINY)
     run_dir.finish("collect", {})
     other.borrow(run_dir, ("collect",), TINY)
-    with pytest.raises(RunDirError, match=r"dagger.rounds=0"):
+    with pytest.raises(TrainError, match=r"dagger.rounds=0"):
         may_begin(other, Step("dagger", 1), resume=False)
 
 
 def test_a_round_needs_a_policy(run_dir: RunDir) -> None:
-    with pytest.raises(RunDirError, match="run imitate first"):
+    with pytest.raises(TrainError, match="run imitate first"):
         run_step(job(run_dir), Step("dagger", 1))
 
 
@@ -184,10 +178,10 @@ def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir,
 
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
     path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    with pytest.raises(NetworkFileError, match="language differs from the recipe's"):
+    with pytest.raises(TrainError, match="language differs from the recipe's"):
         read_network(path, with_overrides(TINY.model, {"language.layers": "2"}), 9)
     path.write_bytes(b"nothing")
-    with pytest.raises(NetworkFileError, match="not weights of edge-train"):
+    with pytest.raises(TrainError, match="not weights of edge-train"):
         read_network(path, TINY.model, 9)
 
 
@@ -232,7 +226,7 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: Run
     [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
 )
 def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
-    with pytest.raises(RunDirError, match=says):
+    with pytest.raises(TrainError, match=says):
         steps_until(after, recipe, steps_of("all", recipe))
 
 
@@ -335,7 +329,7 @@ def test_what_makes_no_sense_is_one_line(
 
 def test_reinforcement_learning_needs_no_drives_before_it() -> None:
     assert steps_until("imitate", TINY, steps_of("rl", TINY))[-1] == Step("imitate")
-    with pytest.raises(RunDirError, match="newest_only"):
+    with pytest.raises(TrainError, match="newest_only"):
         steps_until("imitate", TINY, steps_of("dagger", TINY))
 
 
@@ -381,7 +375,7 @@ def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[s
         (ExportError("a gate failed"), EXIT_CHECK_FAILED),
         (CollectFailedError("its process ended"), EXIT_CHECK_FAILED),
         (RolloutFailedError("its process ended"), EXIT_CHECK_FAILED),
-        (RunDirError("no such drive"), EXIT_BAD_INPUT),
+        (TrainError("no such drive"), EXIT_BAD_INPUT),
         (OSError("the disk is full"), EXIT_BAD_INPUT),
     ],
 )
@@ -439,13 +433,13 @@ def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, 
 
 
 def test_without_weights_there_is_no_card(run_dir: RunDir) -> None:
-    with pytest.raises(CardError, match="train first"):
+    with pytest.raises(TrainError, match="train first"):
         write_card(run_dir, TINY)
 
 
 def test_scores_of_something_else_are_refused(trained: RunDir, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
-    with pytest.raises(CardError, match=r"result.json of edge-bench"):
+    with pytest.raises(TrainError, match=r"result.json of edge-bench"):
         write_card(trained, TINY, [tmp_path / "other.json"])
 
 

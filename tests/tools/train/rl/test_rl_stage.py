@@ -16,11 +16,12 @@ from edge.inference.latency_profile import LatencyProfile
 from export.model.network import TicVla
 from export.model.weights import WeightsInfo, save_weights
 from tests.tools.train.rl.test_rl_tail import LIMITS, tiny_config, tiny_episode, tiny_network
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import PpoConfig, RlConfig
 from tools.train.rl import rollout
 from tools.train.rl.ppo import TailLearner
-from tools.train.rl.rl import STAGE, RlError, Score, State, improve, run
+from tools.train.rl.rl import STAGE, Score, State, improve, run
 from tools.train.rl.worker import RolloutOrder
 from tools.train.run.job import StageJob, StopFlag
 from tools.train.run.network_file import finish_network
@@ -193,7 +194,7 @@ def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> No
     _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
     other = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, reward_scale=0.5)
     job = StageJob(Recipe("test", 0, tiny_config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
-    with pytest.raises(RlError, match="another recipe"):
+    with pytest.raises(TrainError, match="another recipe"):
         improve(
             job,
             TailLearner(tiny_network(), LIMITS, other.log_std),
@@ -236,21 +237,21 @@ def test_progress_is_shown_after_every_episode(tmp_path: Path) -> None:
 
 
 def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
-    with pytest.raises(RlError, match="run imitate first"):
+    with pytest.raises(TrainError, match="run imitate first"):
         run(_job(tmp_path, RlConfig()))
 
 
 def test_an_untrained_action_expert_is_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
     finish_network(job, "sft", tiny_network())
-    with pytest.raises(RlError, match=r"sft/model.safetensors: the action expert is untrained"):
+    with pytest.raises(TrainError, match=r"sft/model.safetensors: the action expert is untrained"):
         run(job)
 
 
 def test_start_weights_with_an_untrained_action_expert_are_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
     save_weights(tiny_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
-    with pytest.raises(RlError, match="is untrained"):
+    with pytest.raises(TrainError, match="is untrained"):
         run(job)
 
 

@@ -12,10 +12,10 @@ import torch
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, build
 from tests.support.train.train_drives import tiny_model
+from tools.train.config.errors import TrainError
 from tools.train.config.rl import PpoConfig
 from tools.train.rl import rollout
 from tools.train.rl.action_tail import (
-    ActionTailError,
     check_tail,
     freeze_all_but_tail,
     load_tail,
@@ -98,14 +98,14 @@ def test_another_networks_tail_is_refused() -> None:
     tensors = {name: each.detach().clone() for name, each in tail_parameters(network.action).items()}
     load_tail(network.action, tensors)
     tensors.pop("out.bias")
-    with pytest.raises(ActionTailError, match=r"out\.bias is missing"):
+    with pytest.raises(TrainError, match=r"out\.bias is missing"):
         load_tail(network.action, tensors)
 
 
 def test_an_expert_guided_by_waypoints_is_refused() -> None:
     tiny = tiny_config()
     config = dataclasses.replace(tiny, action=dataclasses.replace(tiny.action, semantic_interface="waypoints"))
-    with pytest.raises(ActionTailError, match="waypoints"):
+    with pytest.raises(TrainError, match="waypoints"):
         check_tail(build(config, 0).action)
 
 
@@ -152,7 +152,7 @@ def test_a_rollout_is_read_as_it_was_driven(tmp_path: Path) -> None:
 def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
     path = tmp_path / "0.safetensors"
     path.write_bytes(b"half")
-    with pytest.raises(rollout.RolloutError, match="not readable"):
+    with pytest.raises(TrainError, match="not readable"):
         rollout.read([path])
 
 

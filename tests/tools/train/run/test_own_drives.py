@@ -8,13 +8,14 @@ import pytest
 
 from tests.support.train.training_drives import dataset, drive
 from tools.train import cli
+from tools.train.config.errors import TrainError
 from tools.train.config.recipe import load_recipe
-from tools.train.drives.drive import Dataset, DriveError
+from tools.train.drives.drive import Dataset
 from tools.train.pipeline.model_card import card
 from tools.train.run import own_drives
 from tools.train.run.network_file import START, import_start
 from tools.train.run.own_drives import take_drives
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.run_dir import RunDir
 
 TINY = load_recipe("tiny")
 
@@ -48,13 +49,13 @@ def test_a_second_call_changes_nothing(run_dir: RunDir, theirs: Dataset) -> None
 
 def test_a_run_that_has_collected_takes_no_others(run_dir: RunDir, theirs: Dataset) -> None:
     (run_dir.stage("collect") / "index.jsonl").write_text("")
-    with pytest.raises(RunDirError, match="has other drives"):
+    with pytest.raises(TrainError, match="has other drives"):
         take_drives(run_dir, theirs.folder)
 
 
 def test_a_run_takes_one_data_set_only(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
     take_drives(run_dir, theirs.folder)
-    with pytest.raises(RunDirError, match="has other drives"):
+    with pytest.raises(TrainError, match="has other drives"):
         take_drives(run_dir, dataset(tmp_path / "more", drive("c")).folder)
 
 
@@ -85,7 +86,7 @@ def test_links_among_their_files_are_followed(run_dir: RunDir, theirs: Dataset) 
 
 def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: Dataset) -> None:
     theirs.path("b").write_bytes(b"half")
-    with pytest.raises(DriveError, match="differs from the indexed file"):
+    with pytest.raises(TrainError, match="differs from the indexed file"):
         take_drives(run_dir, theirs.folder)
     assert not run_dir.begun("collect")
 

@@ -17,13 +17,14 @@ import torch
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tests.support.train import train_ranks
+from tools.train.config.errors import TrainError
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.run import checkpoint
 from tools.train.run.distributed import SINGLE, BatchOrder, Ranks
 from tools.train.run.job import StageJob
 from tools.train.run.optim import Optimiser, autocast, computes_bf16, learning_rate
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.run_dir import RunDir
 
 NANO = PRESETS["nano"]
 ROOT = Path(__file__).parents[4]
@@ -62,7 +63,7 @@ def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> Non
     later = load_recipe("tiny", ["sft.epochs=9"])
     assert load_recipe(str(RunDir.open(made.out, later).recipe_path)) == later
     (made.stage("sft") / "state").touch()
-    with pytest.raises(RunDirError, match=r"sft.epochs: found 9, recipe 8"):
+    with pytest.raises(TrainError, match=r"sft.epochs: found 9, recipe 8"):
         RunDir.open(made.out, load_recipe("tiny", ["sft.epochs=8"]))
 
 
@@ -71,7 +72,7 @@ def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tm
     made = run_dir(tmp_path)
     RunDir.open(made.out, load_recipe("tiny", [setting]))
     (made.stage("collect") / "drive").touch()
-    with pytest.raises(RunDirError, match="was started with another recipe"):
+    with pytest.raises(TrainError, match="was started with another recipe"):
         RunDir.open(made.out, load_recipe("tiny"))
 
 
@@ -84,7 +85,7 @@ def test_how_many_processes_work_on_it_may_always_change(tmp_path: Path) -> None
 def test_somebody_elses_folder_is_not_taken(tmp_path: Path) -> None:
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "to-mother.txt").touch()
-    with pytest.raises(RunDirError, match="new or empty directory"):
+    with pytest.raises(TrainError, match="new or empty directory"):
         RunDir.open(tmp_path / "letters", load_recipe("tiny"))
 
 
@@ -125,13 +126,13 @@ def test_another_runs_stages_are_used_where_they_would_be_the_same(tmp_path: Pat
     ablation.borrow(base, ("collect", "encoder", "sft"), recipe)
     assert ablation.result("sft") == {"of": "sft"} and ablation.borrowed("sft")
     for setting in ("sft.epochs=99", "model.language.mlp=64"):
-        with pytest.raises(RunDirError, match="--from"):
+        with pytest.raises(TrainError, match="--from"):
             RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny", [setting]))
 
 
 def test_a_stage_that_has_not_finished_is_not_lent(tmp_path: Path) -> None:
     base = run_dir(tmp_path)
-    with pytest.raises(RunDirError, match="sft has not finished"):
+    with pytest.raises(TrainError, match="sft has not finished"):
         RunDir(tmp_path / "x").borrow(base, ("sft",), load_recipe("tiny"))
 
 
@@ -207,7 +208,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Pat
 def test_a_damaged_checkpoint_is_one_clear_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "c"
     path.write_bytes(content)
-    with pytest.raises(checkpoint.CheckpointFileError, match="delete it to start again") as caught:
+    with pytest.raises(TrainError, match="delete it to start again") as caught:
         checkpoint.load(path)
     assert "\n" not in str(caught.value)
 
@@ -216,7 +217,7 @@ def test_weights_are_no_checkpoint(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 
     save_file({"a": torch.ones(1)}, str(tmp_path / "c"))
-    with pytest.raises(checkpoint.CheckpointFileError, match="expected format"):
+    with pytest.raises(TrainError, match="expected format"):
         checkpoint.load(tmp_path / "c")
 
 

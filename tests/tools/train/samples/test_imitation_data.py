@@ -16,12 +16,13 @@ from export.model.network import build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, tiny_model, write_dataset
 from tests.support.train.train_imitate_rank import FRAMES, SideStates, side_dataset, side_drive
+from tools.train.config.errors import TrainError
 from tools.train.config.imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
 from tools.train.drives.drive import NOISE, Dataset, Drive
 from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Samples, States
 from tools.train.samples.action_batch import Group
 from tools.train.samples.delays import Delays
-from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames, DriveFramesError
+from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames
 from tools.train.samples.kv_build import build_kv_cache
 from tools.train.samples.kv_cache import CachedState
 
@@ -434,7 +435,7 @@ def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
     late = Delays.uniform(DelayConfig(low_s=40.0, high_s=50.0))
     with pytest.raises(SampleError, match="no frame"):
         of(dataset, delays=late)
-    with pytest.raises(DriveFramesError, match="10 to 50"):
+    with pytest.raises(TrainError, match="10 to 50"):
         DriveFrames.of(dataset.load("left-a", pictures=False), 51, EVEN)
 
 

@@ -16,13 +16,14 @@ from edge.state.reasoning_text import format_text
 from export.model.network import TicVla, build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.config.errors import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import Dataset
 from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import WAYPOINTS_START, Drawn, Prompts, anchors_of
 from tools.train.samples.kv_build import build_kv_cache, cache_key
-from tools.train.samples.kv_cache import KvCache, KvCacheError
+from tools.train.samples.kv_cache import KvCache
 
 CONTENT = NANO_TOKENIZER.read_bytes()
 TOKENS = MadeUpTokens()
@@ -173,20 +174,20 @@ def test_ranks_share_the_drives(tmp_path: Path, cache: KvCache, network: TicVla,
 def test_only_the_drives_that_are_asked_for_are_made(tmp_path: Path, network: TicVla, dataset: Dataset) -> None:
     some = build_kv_cache(tmp_path, network, CONTENT, dataset, TOKENS, CONFIG, seed=3, ids=("b",))
     assert some.anchors("b") == (0, 10)
-    with pytest.raises(KvCacheError, match="no states of this drive"):
+    with pytest.raises(TrainError, match="no states of this drive"):
         some.anchors("a")
 
 
 def test_a_cache_that_is_not_whole_is_refused(tmp_path: Path, cache: KvCache) -> None:
-    with pytest.raises(KvCacheError, match="no state of frame 7"):
+    with pytest.raises(TrainError, match="no state of frame 7"):
         cache.at("a", 7)
-    with pytest.raises(KvCacheError, match="build it first"):
+    with pytest.raises(TrainError, match="build it first"):
         KvCache(tmp_path / "nowhere")
     shutil.copytree(cache.folder, tmp_path / "copy")
     np.save(tmp_path / "copy" / "b.npy", np.zeros((3, 32), np.float16))
-    with pytest.raises(KvCacheError, match="expected f16"):
+    with pytest.raises(TrainError, match="expected f16"):
         KvCache(tmp_path / "copy").at("b", 0)
     index = json.loads((tmp_path / "copy" / "kv.json").read_text())
     (tmp_path / "copy" / "kv.json").write_text(json.dumps({**index, "format": 9}))
-    with pytest.raises(KvCacheError, match="format 1"):
+    with pytest.raises(TrainError, match="format 1"):
         KvCache(tmp_path / "copy")

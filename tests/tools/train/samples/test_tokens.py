@@ -16,10 +16,11 @@ from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.quantize.precision import Precision
 from tests.support.train.train_drives import made_up_drive, tiny_model, write_dataset
+from tools.train.config.errors import TrainError
 from tools.train.drives.drive import Dataset, Drive
 from tools.train.run.job import QuietProgress
 from tools.train.samples import tokens as tokens_module
-from tools.train.samples.tokens import TokenCache, TokenCacheError, encode, encoder_sha256
+from tools.train.samples.tokens import TokenCache, encode, encoder_sha256
 
 FRAMES = 7
 
@@ -63,7 +64,7 @@ def test_tokens_are_what_the_encoder_makes_of_every_picture(dataset: Dataset, ne
 def test_nothing_is_made_unless_it_is_asked_for(dataset: Dataset, network: TicVla) -> None:
     cache = TokenCache(dataset, network.vision)
     assert cache.missing() == ("a", "b") and not cache.folder.exists()
-    with pytest.raises(TokenCacheError, match="drive a is not encoded yet"):
+    with pytest.raises(TrainError, match="drive a is not encoded yet"):
         cache.frames("a")
 
 
@@ -134,7 +135,7 @@ def test_an_array_of_another_shape_is_refused_with_what_to_do(dataset: Dataset, 
     cache = TokenCache(dataset, network.vision)
     cache.build()
     np.save(cache.folder / "a.npy", np.zeros((2, 4, 32), np.float16))
-    with pytest.raises(TokenCacheError, match="delete it"):
+    with pytest.raises(TrainError, match="delete it"):
         cache.frames("a")
 
 
@@ -142,14 +143,14 @@ def test_tokens_that_half_precision_cannot_hold_are_refused(dataset: Dataset) ->
     wild = build(tiny_model(), 1)
     with torch.no_grad():
         wild.vision.projector[3].weight *= 1e6
-    with pytest.raises(TokenCacheError, match="float16"):
+    with pytest.raises(TrainError, match="float16"):
         TokenCache(dataset, wild.vision).build()
 
 
 def test_an_unknown_drive_is_named(dataset: Dataset, network: TicVla) -> None:
     cache = TokenCache(dataset, network.vision)
     for ask in (lambda: cache.frames("nowhere"), lambda: cache.missing(["nowhere"]), lambda: cache.build(["nowhere"])):
-        with pytest.raises(TokenCacheError, match="nowhere"):
+        with pytest.raises(TrainError, match="nowhere"):
             ask()
 
 

@@ -20,13 +20,14 @@ from sim_hil.benchmark.language.tasks import Task, begins_ahead, make_task
 from tests.support.train.train_drives import made_up_drive, write_dataset
 from tests.support.train.training_scenarios import SPEED_MPS, drive_along, scenarios
 from tools.train.collect.record import off_way_m
+from tools.train.config.errors import TrainError
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import Drive
 from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import anchors_of
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario
-from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, RelabelError, relabel, relabel_along
+from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, relabel, relabel_along
 
 CONFIG = RelabelConfig(ways=2, tries=24)
 CROWDED = "person ahead 2 m coming, person left 3 m standing"
@@ -187,7 +188,7 @@ def test_what_is_written_is_read_and_made_only_once(tmp_path: Path) -> None:
     _, drive, found = _told("corridor")
     dataset = write_dataset(tmp_path, [drive])
     relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    with pytest.raises(RelabelError, match=r"a\.json.*build"):
+    with pytest.raises(TrainError, match=r"a\.json.*build"):
         relabels.anchors(drive)
     relabels.build(dataset.ids)
     read = relabels.anchors(drive)

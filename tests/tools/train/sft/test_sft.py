@@ -22,6 +22,7 @@ from tests.support.train.train_sft_rank import CONFIG, sft_job, trained
 from tests.support.train.train_stage_contract import Run, StageContract
 from tests.support.train.training_scenarios import drive_along, scenarios
 from tools.train.config.collect import CollectConfig, TourConfig
+from tools.train.config.errors import TrainError
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
 from tools.train.config.sft import RelabelConfig, SftConfig
@@ -33,7 +34,7 @@ from tools.train.run.job import StageJob
 from tools.train.run.network_file import stage_weights
 from tools.train.samples.anchors import Prompts, anchors_of
 from tools.train.samples.mirror import Views
-from tools.train.sft.sft import Samples, SftError, budget, run
+from tools.train.sft.sft import Samples, budget, run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -87,7 +88,7 @@ def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_sft_rank"
-    error = SftError
+    error = TrainError
     other = dataclasses.replace(CONFIG, batch=7)
 
     @pytest.fixture(autouse=True)
@@ -115,7 +116,7 @@ def test_bfloat16_gives_about_the_same_losses(
 
 def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
     silent = write_dataset(tmp_path / "collect", [made_up_drive("a", 20, traces=())])
-    with pytest.raises(SftError, match="no anchors"):
+    with pytest.raises(TrainError, match="no anchors"):
         trained(silent, sft_job(tmp_path))
 
 
