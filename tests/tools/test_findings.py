@@ -25,8 +25,8 @@ from tools.findings import __main__ as findings
 from tools.findings.__main__ import main, plan_lines, plan_of, rows_of
 from tools.findings.rows import CLAIMS, ROWS, RUNS, Finding, Level, runs_of
 from tools.findings.verdict import FAILS, HOLDS, OPEN, judge, judge_all, verdict_of
-from tools.train.config.errors import TrainError
-from tools.train.config.evaluate import EvaluateConfig
+from tools.train.config.checks import TrainError
+from tools.train.config.rl import EvaluateConfig
 from tools.train.pipeline.evaluate import write_suite
 
 TWO_S = LatencyProfile.constant(2.0)

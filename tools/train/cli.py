@@ -32,9 +32,8 @@ from edge.core.cli import (
 from edge.inference.latency_profile import load_profile
 from reporting.build_progress import duration, peak_rss_bytes
 from sim_hil.benchmark.runs import RunsError
-from tools.train.config.errors import TrainError
-from tools.train.config.recipe import Recipe, load_recipe, recipe_names, stage_seed
-from tools.train.config.variants import VARIANTS
+from tools.train.config.checks import TrainError
+from tools.train.config.recipe import VARIANTS, Recipe, load_recipe, recipe_names, stage_seed
 from tools.train.pipeline import budget, chain
 from tools.train.pipeline.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.pipeline.model_card import ship, write_card

@@ -16,7 +16,7 @@ from unittest.mock import patch
 import torch
 
 from tools.train import cli
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step
 from tools.train.run.distributed import leave

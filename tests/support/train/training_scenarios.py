@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.core.geometry import SE2
 from tests.support.train.train_drives import made_up_drive
-from tools.train.config.scenes import KINDS
+from tools.train.config.collect import KINDS
 from tools.train.drives.drive import Drive
 from tools.train.scenes.progress_labels import RouteProgress
 from tools.train.scenes.scenarios import Scenario, scenario_group

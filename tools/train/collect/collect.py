@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tools.train.collect.collection import Collection, fill, job_count, result_of
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.run.job import StageJob

@@ -12,7 +12,7 @@ from typing import Any, Final
 from edge.artifacts.manifest import load_artifacts
 from tools.train.collect.collection import Collection, fill, job_count, result_of
 from tools.train.collect.dagger_driver import PolicyOptions
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import POLICY_DRIVER
 from tools.train.run.job import StageJob

@@ -37,8 +37,7 @@ from tools.train.collect.record import (
 )
 from tools.train.collect.steering import SteeringNoise, Velocity
 from tools.train.collect.tour_world import TourWorld, record_tour
-from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
-from tools.train.config.scenes import SHARES
+from tools.train.config.collect import RATE_HZ, SHARES, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
 from tools.train.scenes.scenarios import Scenario, ScenarioError, training_episodes
 from tools.train.scenes.trace_sentences import aspects_json

@@ -1,4 +1,4 @@
-"""The recipe of a training run: network, seed and one configuration table per stage, read strictly from TOML."""
+"""The recipe of a training run: network, seed and a table per stage, read strictly from TOML; the paper's variants."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 from zlib import crc32
 
@@ -18,9 +19,8 @@ from export.model.config_file import config_for, config_from_dict, with_override
 from reporting.toml_text import toml_text
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
-from tools.train.config.evaluate import EvaluateConfig
 from tools.train.config.imitate import ImitateConfig
-from tools.train.config.rl import RlConfig
+from tools.train.config.rl import EvaluateConfig, RlConfig
 from tools.train.config.sft import SftConfig
 
 if sys.version_info >= (3, 11):
@@ -39,6 +39,35 @@ STAGES: Final[Mapping[str, type]] = {
     "evaluate": EvaluateConfig,
 }
 """Configuration class of each stage."""
+_UNAWARE: Final = ("model.action.latency_aware=false", "imitate.inject_delay=false")
+VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "full": (),
+        "waypoints": ("model.action.semantic_interface=waypoints",),
+        "waypoints-no-latency": ("model.action.semantic_interface=waypoints", *_UNAWARE),
+        "values-only": ("model.action.semantic_interface=values-only",),
+        "no-latency": _UNAWARE,
+        "no-motion-offset": ("model.action.motion_offset=false",),
+        "no-reasoning": ("imitate.sample.reasoning=false",),
+        "offsets": ("model.action.parameterisation=offsets",),
+        "horizon-1s": ("model.action.steps=10",),
+        "horizon-5s": ("model.action.steps=50",),
+        "depth-3": ("model.action.layers=3",),
+        "depth-12": ("model.action.layers=12",),
+        "diffusion": ("model.action.head=diffusion",),
+        "flow": ("model.action.head=flow",),
+        "point-goal-bc": ("imitate.policy=point-goal",),
+        # Trained from scratch, whereas the recipe's values are for a policy that already drives.
+        "point-goal-rl": (
+            "rl.policy=point-goal",
+            "rl.ppo.action_lr=3e-4",
+            "rl.log_std=-1.2,-0.7",
+            "rl.warmup_iterations=0",
+            "rl.imitation=0.0",
+        ),
+    }
+)
+"""The paper's ablations and baselines as settings (tables 1, 2, 5, 6, 11, 13), named as in the benchmark."""
 MAX_RECIPE_BYTES: Final = 1 << 20
 """Upper limit of a recipe file, bytes."""
 

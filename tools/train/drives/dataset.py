@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from edge.core.cli import write_whole
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import DRIVES, FORMAT, INDEX, Dataset, Entry, intact
 
 LINES: Final = "index.jsonl"

@@ -23,8 +23,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from edge.core.geometry import SE2
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
-from tools.train.config.errors import TrainError
 
 FUTURE_STEPS: Final = 50
 """Labelled future poses of a frame, 0.1 s apart."""

@@ -24,9 +24,9 @@ from edge.core.cli import write_whole
 from export.core.typed import build, plain
 from sim_hil.benchmark.suite.episode import ROBOTS
 from sim_hil.benchmark.workers.worker_pool import Told, Workers
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import CORRIDOR, OUTDOORS
 from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
-from tools.train.config.errors import TrainError
-from tools.train.config.scenes import CORRIDOR, OUTDOORS
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder.labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
 from tools.train.run.job import StageProgress

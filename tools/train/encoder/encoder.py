@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from edge.state.frame import fit_frame
 from export.model.network import TicVla
+from tools.train.config.checks import TrainError
 from tools.train.config.encoder import EncoderConfig
-from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.encoder.data import FrameSet, fill, frames_sha256, plan
 from tools.train.encoder.heads import Balance, EncoderHeads, as_tensors, losses, total

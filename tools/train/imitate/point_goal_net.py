@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from export.model.attention import projection
 from export.model.config import TicVlaConfig
+from tools.train.config.checks import TrainError
 
 FORMAT: Final = "tic-vla-edge-point-goal/1"
 _KEY: Final = "point_goal"  # the only metadata key: the order of several keys would not be reproducible
@@ -24,10 +25,6 @@ GOAL_SCALE_M: Final = 10.0
 """Unit of the goal distance, m."""
 GOAL_MOST: Final = 3.0
 """Clip of the goal distance, in units of GOAL_SCALE_M (30 m)."""
-
-
-class PointGoalFileError(ValueError):
-    """A file that is not a point-goal network, or one of another size; one line."""
 
 
 class PointGoalNet(nn.Module):
@@ -89,17 +86,17 @@ def save_point_goal(network: PointGoalNet, path: Path, origin: str) -> None:
 
 
 def load_point_goal(path: Path, config: TicVlaConfig) -> PointGoalNet:
-    """Load a network that `save_point_goal` wrote, in evaluation mode. Raises PointGoalFileError."""
+    """Load a network that `save_point_goal` wrote, in evaluation mode. Raises TrainError."""
     network = PointGoalNet(config)
     try:
         with safe_open(str(path), framework="pt") as file:
             if json.loads((file.metadata() or {}).get(_KEY, "{}")).get("format") != FORMAT:
-                raise PointGoalFileError(f"{path}: expected a point-goal network of edge-train")
+                raise TrainError(f"{path}: expected a point-goal network of edge-train")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 — not a mapping
     except (OSError, SafetensorError, json.JSONDecodeError) as error:
-        raise PointGoalFileError(f"{path}: not readable ({error})") from error
+        raise TrainError(f"{path}: not readable ({error})") from error
     wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != wanted:
-        raise PointGoalFileError(f"{path}: expected tensors of another size; train the network again")
+        raise TrainError(f"{path}: expected tensors of another size; train the network again")
     network.load_state_dict(tensors)
     return network.eval()

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Entry
 from tools.train.importers import gnd, scand

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
-from tools.train.config.errors import TrainError
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
 from tools.train.drives.futures import driven_future, relative
 from tools.train.importers.recording import Recording, Texts, read_picture

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.importers.recording import Recording, read_json, read_words
 
 KIND: Final = "gnd"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.jpeg import MAX_BYTES, jpeg_refusal
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.scenes.trace_sentences import aspects_of_json
 
 TEXTS: Final = "texts.json"

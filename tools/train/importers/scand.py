@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.importers.recording import Recording, read_words
 
 KIND: Final = "scand"

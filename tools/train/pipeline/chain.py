@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from tools.train.collect import collect
 from tools.train.collect.dagger import run_round
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder import encoder

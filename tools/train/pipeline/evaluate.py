@@ -17,9 +17,9 @@ from sim_hil.benchmark.runs import run_episodes
 from sim_hil.benchmark.suite.episode import load_suite, suite_to_toml
 from sim_hil.benchmark.workers.jobs import RunWatcher
 from sim_hil.scene.writer import scene_to_toml
-from tools.train.config.errors import TrainError
-from tools.train.config.evaluate import EvaluateConfig
-from tools.train.config.scenes import SHARES
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import SHARES
+from tools.train.config.rl import EvaluateConfig
 from tools.train.run.exported import export_artifacts
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import weights_before

@@ -13,21 +13,16 @@ from torch import Tensor
 
 from export.model.action import ActionExpert
 from export.model.heads import integrated
-
-
-class ActionTailError(ValueError):
-    """An action expert that cannot be split, or weights that are not a tail's; one line."""
+from tools.train.config.checks import TrainError
 
 
 def check_tail(expert: ActionExpert) -> None:
-    """Raise ActionTailError unless the expert's last layer and head alone compute the trajectory (head `query`)."""
+    """Raise TrainError unless the expert's last layer and head alone compute the trajectory (head `query`)."""
     head = getattr(expert.config.action, "head", "query")
     if head != "query":
-        raise ActionTailError(
-            f"action.head {head!r}: reinforcement learning trains the query head alone; end with imitate"
-        )
+        raise TrainError(f"action.head {head!r}: reinforcement learning trains the query head alone; end with imitate")
     if expert.config.action.semantic_interface == "waypoints":
-        raise ActionTailError(
+        raise TrainError(
             "semantic_interface 'waypoints': reinforcement learning needs kv or values-only, which a generation fixes"
         )
 
@@ -47,11 +42,11 @@ def freeze_all_but_tail(expert: ActionExpert) -> None:
 
 
 def load_tail(expert: ActionExpert, tensors: Mapping[str, Tensor]) -> None:
-    """Replace the tail's weights. Raises ActionTailError unless the names are exactly the tail's."""
+    """Replace the tail's weights. Raises TrainError unless the names are exactly the tail's."""
     wanted = tail_parameters(expert)
     if set(tensors) != set(wanted):
         odd = sorted(set(tensors) ^ set(wanted))[0]
-        raise ActionTailError(f"weights of the last layer and the head: {odd} is missing or unknown")
+        raise TrainError(f"weights of the last layer and the head: {odd} is missing or unknown")
     with torch.no_grad():
         for name, each in wanted.items():
             each.copy_(tensors[name])

@@ -26,10 +26,10 @@ from export.model.network import initialise
 from export.model.weights import weights_sha256
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import LOG_STD_RANGE, RlConfig
-from tools.train.config.scenes import TASKS_PER_SCENE
 from tools.train.imitate.point_goal_net import build_point_goal, save_point_goal
 from tools.train.rl.action_tail import check_tail
 from tools.train.rl.command_policy import CommandLimits

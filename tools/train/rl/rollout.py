@@ -16,6 +16,8 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from tools.train.config.checks import TrainError
+
 FORMAT: Final = "tic-vla-edge-rollout/1"
 GOAL_SCALE_M: Final = 10.0
 """Unit of goal coordinates for the value network, m."""
@@ -23,10 +25,6 @@ GOAL_FARTHEST_M: Final = 40.0
 """Goals farther away are clipped to this distance for the value network, m."""
 
 Floats = npt.NDArray[np.float32]
-
-
-class RolloutError(ValueError):
-    """A rollout file that is incomplete or inconsistent; one line."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +160,7 @@ class Rollout:
 
 
 def read(paths: Sequence[Path]) -> Rollout:
-    """Read the jobs' files as one rollout, in the order given. Raises RolloutError, OSError."""
+    """Read the jobs' files as one rollout, in the order given. Raises TrainError, OSError."""
     parts: list[dict[str, npt.NDArray[Any]]] = []
     semantic: list[Floats] = []
     ends: list[EpisodeEnd] = []
@@ -178,7 +176,7 @@ def read(paths: Sequence[Path]) -> Rollout:
         parts.append(arrays)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
     if joined and sum(end.steps for end in ends) != len(joined["reward"]):
-        raise RolloutError(f"rollout {paths[0].parent}: the number of steps differs from the sum over its episodes")
+        raise TrainError(f"rollout {paths[0].parent}: the number of steps differs from the sum over its episodes")
     return Rollout(joined, tuple(semantic), tuple(ends))
 
 
@@ -187,13 +185,13 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], list[EpisodeEnd]]:
         with safe_open(str(path), framework="np") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
-                raise RolloutError(f"rollout {path}: expected format {FORMAT}, found {header.get('format')}")
+                raise TrainError(f"rollout {path}: expected format {FORMAT}, found {header.get('format')}")
             ends = [EpisodeEnd(**end) for end in json.loads(header["ends"])]
             return {name: file.get_tensor(name) for name in file.keys()}, ends  # noqa: SIM118 — not a mapping
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, RolloutError):
+        if isinstance(error, TrainError):
             raise
-        raise RolloutError(f"rollout {path}: not readable ({error})") from error
+        raise TrainError(f"rollout {path}: not readable ({error})") from error
 
 
 def _rows(driven: Sequence[EpisodeSteps], name: str) -> Floats:

@@ -32,7 +32,7 @@ from sim_hil.benchmark.env.gym_env import DynaNavEnv
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.workers.worker_process import Message, worker_main
-from tools.train.config.scenes import TASKS_PER_SCENE
+from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.imitate.point_goal_net import PointGoalNet
 from tools.train.rl import rollout
 from tools.train.rl.action_tail import check_tail, load_tail

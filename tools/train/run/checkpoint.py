@@ -12,12 +12,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from tools.train.config.checks import TrainError
+
 FORMAT: Final = "tic-vla-edge-checkpoint/1"
 _KEYS: Final = ("format", "meta")
-
-
-class CheckpointFileError(ValueError):
-    """A file that is damaged or not a checkpoint; one line."""
 
 
 def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, object]) -> None:
@@ -36,20 +34,20 @@ def save(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, obj
 
 
 def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read the tensors, on the CPU, and the JSON of a checkpoint. Raises CheckpointFileError, FileNotFoundError."""
+    """Read the tensors, on the CPU, and the JSON of a checkpoint. Raises TrainError, FileNotFoundError."""
     if not path.is_file():
         raise FileNotFoundError(f"checkpoint {path}: not found")
     try:
         with safe_open(str(path), framework="pt") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
-                raise CheckpointFileError(f"checkpoint {path}: expected format {FORMAT}, found {header.get('format')}")
+                raise TrainError(f"checkpoint {path}: expected format {FORMAT}, found {header.get('format')}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 — not a mapping
         return tensors, json.loads(header["meta"])
     except (SafetensorError, KeyError, ValueError) as error:
-        if isinstance(error, CheckpointFileError):
+        if isinstance(error, TrainError):
             raise
-        raise CheckpointFileError(f"checkpoint {path}: damaged ({error}); delete it to start again") from error
+        raise TrainError(f"checkpoint {path}: damaged ({error}); delete it to start again") from error
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -10,7 +10,7 @@ from typing import Final, Generic, TypeVar
 
 from torch import Tensor, nn
 
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.run import checkpoint
 from tools.train.run.job import StageJob
 from tools.train.run.optim import Optimiser

@@ -16,7 +16,7 @@ from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
 

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any, Final
 
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset
 from tools.train.run.job import StageJob

@@ -14,7 +14,7 @@ from typing import Any, Final
 from edge.core.cli import write_whole
 from export import model
 from sim_hil.benchmark.workers.code_version import code_sha256
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
 from tools.train.run.optim import computes_bf16
 

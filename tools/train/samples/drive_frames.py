@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ
-from tools.train.config.errors import TrainError
 from tools.train.config.imitate import WeightConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, Drive
 from tools.train.scenes.trace_sentences import NO_PEOPLE

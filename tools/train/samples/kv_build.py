@@ -15,7 +15,7 @@ import torch
 from tokenizers import Tokenizer
 
 from export.model.network import TicVla
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import POLICY_DRIVER, Dataset

@@ -19,7 +19,7 @@ import numpy as np
 
 from edge.core.cli import write_whole
 from edge.state.reasoning_text import Waypoints, parse_waypoints
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.samples.language_batch import Halves
 
 FORMAT: Final = 1

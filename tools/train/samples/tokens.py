@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from edge.core.cli import write_whole
 from edge.state.frame import fit_frame
 from export.model.vision import VisionEncoder
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress

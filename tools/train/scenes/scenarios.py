@@ -22,7 +22,7 @@ from sim_hil.benchmark.suite.build import timeout_s
 from sim_hil.benchmark.suite.episode import ROBOTS, Episode
 from sim_hil.layouts import RESERVED_BELOW, LayoutError, is_reserved
 from sim_hil.scene.scene import Scene
-from tools.train.config.scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
+from tools.train.config.collect import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
 from tools.train.scenes.sites import Site
 
 WORDINGS: Final = 12  # wordings of one task

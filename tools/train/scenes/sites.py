@@ -14,7 +14,7 @@ from sim_hil.benchmark.suite.robots import robot_grid, route_grid
 from sim_hil.layouts import generate, is_reserved
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, load_scene
-from tools.train.config.scenes import CORRIDOR, KINDS, OUTDOORS
+from tools.train.config.collect import CORRIDOR, KINDS, OUTDOORS
 
 # Objects of the demo's corridor that are distinguishable and can be goals.
 _CORRIDOR_LANDMARKS: Final = frozenset(

@@ -32,8 +32,8 @@ from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import SceneObject, Vec3
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
-from tools.train.config.errors import TrainError
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks

@@ -20,8 +20,8 @@ from edge.state.reasoning_text import format_text
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.tours import build_tours, tour_anchors
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ
-from tools.train.config.errors import TrainError
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig

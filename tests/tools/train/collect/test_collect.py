@@ -22,9 +22,9 @@ from tools.train.collect import collect, collection
 from tools.train.collect.collection import CollectFailedError, Collection, fill, job_count
 from tools.train.collect.dagger_driver import PolicyOptions
 from tools.train.collect.worker import Draw, Order, messages
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig
-from tools.train.config.errors import TrainError
-from tools.train.config.evaluate import EvaluateConfig
+from tools.train.config.rl import EvaluateConfig
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset, Drive
 from tools.train.run.distributed import Ranks

@@ -26,8 +26,8 @@ from tools.train.collect.collection import Collection
 from tools.train.collect.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
 from tools.train.collect.record import CameraSettings, DrivePlan, record
 from tools.train.collect.steering import Velocity
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, DaggerConfig
-from tools.train.config.errors import TrainError
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY
 from tools.train.run import own_drives
 from tools.train.run.distributed import Ranks

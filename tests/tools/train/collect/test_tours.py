@@ -22,8 +22,8 @@ from tools.train.collect.record import CameraSettings, Recorded
 from tools.train.collect.tour_world import KinematicBase, TourWorld, record_tour
 from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.collect.worker import messages
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
-from tools.train.config.errors import TrainError
 from tools.train.drives.drive import TOUR_DRIVER, Dataset, Drive
 from tools.train.run.distributed import SINGLE
 from tools.train.run.job import QuietProgress

@@ -10,8 +10,16 @@ import pytest
 from export.model.config import PRESETS
 from sim_hil.benchmark.conditions.variants import VARIANTS as BENCHMARK_VARIANTS
 from tools.train.config.collect import DaggerConfig
-from tools.train.config.recipe import Recipe, RecipeError, filled, load_recipe, recipe_names, recipe_of, stage_seed
-from tools.train.config.variants import VARIANTS
+from tools.train.config.recipe import (
+    VARIANTS,
+    Recipe,
+    RecipeError,
+    filled,
+    load_recipe,
+    recipe_names,
+    recipe_of,
+    stage_seed,
+)
 
 NANO = PRESETS["nano"]
 

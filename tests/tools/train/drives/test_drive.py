@@ -11,7 +11,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from tests.support.train.training_drives import about, dataset, drive
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import LINES, DatasetWriter
 from tools.train.drives.drive import INDEX, About, Dataset, Drive, Entry
 

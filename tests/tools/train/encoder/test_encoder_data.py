@@ -10,8 +10,8 @@ import pytest
 
 from export.core.typed import plain
 from sim_hil.layouts import is_reserved
+from tools.train.config.checks import TrainError
 from tools.train.config.encoder import MOST_SCENES, FramesConfig
-from tools.train.config.errors import TrainError
 from tools.train.encoder.data import FIRST_LAYOUT, FrameSet, Shard, fill, finish, frames_sha256, made, path_of, plan
 from tools.train.encoder.labels import CLASSES, LANDMARK, PERSON, label_shapes
 from tools.train.encoder.worker import render

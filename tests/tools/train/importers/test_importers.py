@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import Dataset
 from tools.train.drives.futures import relative
 from tools.train.importers import gnd, scand

@@ -21,8 +21,8 @@ from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights
 from tools.train import cli
 from tools.train.collect.collection import CollectFailedError
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig
-from tools.train.config.errors import TrainError
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until

@@ -16,7 +16,7 @@ from edge.inference.latency_profile import LatencyProfile
 from export.model.network import TicVla
 from export.model.weights import WeightsInfo, save_weights
 from tests.tools.train.rl.test_rl_tail import LIMITS, tiny_config, tiny_episode, tiny_network
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import PpoConfig, RlConfig
 from tools.train.rl import rollout

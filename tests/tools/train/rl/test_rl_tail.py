@@ -12,7 +12,7 @@ import torch
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, build
 from tests.support.train.train_drives import tiny_model
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.rl import PpoConfig
 from tools.train.rl import rollout
 from tools.train.rl.action_tail import (

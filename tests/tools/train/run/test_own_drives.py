@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.train.training_drives import dataset, drive
 from tools.train import cli
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import load_recipe
 from tools.train.drives.drive import Dataset
 from tools.train.pipeline.model_card import card

@@ -17,7 +17,7 @@ import torch
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tests.support.train import train_ranks
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.run import checkpoint

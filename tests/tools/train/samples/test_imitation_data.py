@@ -16,7 +16,7 @@ from export.model.network import build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, tiny_model, write_dataset
 from tests.support.train.train_imitate_rank import FRAMES, SideStates, side_dataset, side_drive
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
 from tools.train.drives.drive import NOISE, Dataset, Drive
 from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Samples, States

@@ -16,7 +16,7 @@ from edge.state.reasoning_text import format_text
 from export.model.network import TicVla, build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import Dataset

@@ -16,7 +16,7 @@ from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.quantize.precision import Precision
 from tests.support.train.train_drives import made_up_drive, tiny_model, write_dataset
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import Dataset, Drive
 from tools.train.run.job import QuietProgress
 from tools.train.samples import tokens as tokens_module

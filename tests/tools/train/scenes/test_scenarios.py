@@ -15,7 +15,7 @@ from sim_hil.layouts import BENCHMARK_SEEDS, LayoutError
 from sim_hil.scene.scene import Scene, load_scene
 from tests.support.train.training_scenarios import EACH, SEED, all_scenarios, scenarios
 from tools.demo import INSTRUCTION
-from tools.train.config.scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
+from tools.train.config.collect import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
 from tools.train.scenes.scenarios import (
     FIRST_SEED,
     LEAST_WORDINGS,

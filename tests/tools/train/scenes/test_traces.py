@@ -31,7 +31,7 @@ from sim_hil.crowd.people import RENDER_FIELDS, People
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
-from tools.train.config.scenes import CORRIDOR, KINDS
+from tools.train.config.collect import CORRIDOR, KINDS
 from tools.train.scenes import trace_sentences as trace_words
 from tools.train.scenes.scenarios import Scenario
 from tools.train.scenes.traces import PEOPLE_M, Tracer

@@ -20,7 +20,7 @@ from sim_hil.benchmark.language.tasks import Task, begins_ahead, make_task
 from tests.support.train.train_drives import made_up_drive, write_dataset
 from tests.support.train.training_scenarios import SPEED_MPS, drive_along, scenarios
 from tools.train.collect.record import off_way_m
-from tools.train.config.errors import TrainError
+from tools.train.config.checks import TrainError
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import Drive
 from tools.train.run.distributed import Ranks
