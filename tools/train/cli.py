@@ -39,12 +39,10 @@ from tools.train.pipeline.chain import Step, is_done, may_begin, run_step, steps
 from tools.train.pipeline.model_card import ship, write_card
 from tools.train.run.curves import draw_curves
 from tools.train.run.distributed import SINGLE, Ranks, leave, ranks_of_environment
-from tools.train.run.exported import ExportError
-from tools.train.run.job import StageFailedError, StageJob, StopFlag
-from tools.train.run.network_file import START, import_start
+from tools.train.run.job import StageFailedError, StageJob, StopFlag, progress_for
+from tools.train.run.network_file import START, ExportError, import_start
 from tools.train.run.optim import computes_bf16
 from tools.train.run.own_drives import take_drives
-from tools.train.run.progress_display import progress_for
 from tools.train.run.run_dir import RunDir
 
 COMMAND: Final = "edge-train"

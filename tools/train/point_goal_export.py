@@ -24,7 +24,7 @@ from export.model.config_file import config_from_dict
 from export.model.vision import VisionEncoder
 from sim_hil.benchmark.policies.point_goal_net import FORMAT, KEY
 from tools.train.config.checks import TrainError
-from tools.train.imitate.point_goal_net import PointGoalNet, load_point_goal
+from tools.train.imitate.trainable_policies import PointGoalNet, load_point_goal
 from tools.train.run.network_file import read_network, weights_before
 
 OPSET: Final = 20

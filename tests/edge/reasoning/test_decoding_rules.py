@@ -35,7 +35,7 @@ from edge.reasoning.decoding_rules import (
 )
 from edge.state.reasoning_text import AHEAD, Plan, Progress, Stop, Turn, TurnBack, format_progress, parse_progress
 from edge.state.ring import EncodedFrame
-from tools.train.scenes.trace_sentences import plan_metres
+from tools.train.drives.trace_sentences import plan_metres
 
 HERE = SE2(0.0, 0.0, 0.0)
 SIDES = st.sampled_from(["left", "right"])

@@ -1,4 +1,8 @@
-"""Recording of many drives by worker processes into one data set, for `collect`, `dagger` and tours."""
+"""Recording of many drives by worker processes into one data set: the stage `collect`, DAgger rounds, and tours.
+
+In a DAgger round (Ross et al. 2011) the exported policy drives through the robot's code, with latencies drawn for each
+drive, and the expert labels every frame with its own action.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +16,29 @@ from typing import Any, Final
 
 import numpy as np
 
+from edge.artifacts.manifest import load_artifacts
+from export.core.typed import plain
 from sim_hil.benchmark.workers.worker_pool import Told, Workers
-from tools.train.collect.dagger_driver import PolicyOptions
+from tools.train.collect.steering import PolicyOptions
 from tools.train.collect.worker import MODULE, Order
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.drives.dataset import DatasetWriter
-from tools.train.drives.drive import Entry
-from tools.train.run.job import StageFailedError
-from tools.train.scenes.scenarios import KEPT_SEEDS, MAX_SEED
+from tools.train.drives.drive import POLICY_DRIVER, Entry
+from tools.train.drives.scenarios import KEPT_SEEDS, MAX_SEED
+from tools.train.run.job import StageFailedError, StageJob
+from tools.train.run.own_drives import prefixes_of
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
+EXPERT_PREFIX: Final = "e"
 _TAG: Final = 0xC0
 _MOST_DROPPED: Final = 0.5
 """Share of unusable drives above which the recording fails: the cause lies outside single drives."""
-
-
-class CollectFailedError(StageFailedError):
-    """A collection that cannot continue; one line."""
+BETA: Final = 0.5
+"""Share of the expert's commands in round 1; each later round has half of the previous one's."""
+_EXPERT_TURNS: Final = 1_000
+"""First collection number of the expert's drives; rounds, at most 100, use the numbers from 1 on."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ def fill(
     stopped: Callable[[], bool] = lambda: False,
     command: Sequence[str] = WORKER,
 ) -> None:
-    """Record the drives that the data set lacks. Raises CollectFailedError, OSError, KeyboardInterrupt if `stopped`."""
+    """Record the drives that the data set lacks. Raises StageFailedError, OSError, KeyboardInterrupt if `stopped`."""
     waiting = deque(collection.orders(writer.folder, writer.has))
     under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
     logs = writer.folder / "logs"
@@ -88,16 +97,14 @@ def fill(
                 order = waiting.popleft()
                 key = order.id(order.start)
                 under_way[key] = (order, "")
-                workers.start(key, order.as_json(), logs / f"{key}.log")
+                workers.start(key, plain(order), logs / f"{key}.log")
             for told in workers.wait(_POLL_S):
                 _take(told, writer, under_way, waiting)
             done, dropped = len(writer.entries(collection.prefix)), len(writer.dropped(collection.prefix))
             update(done + dropped, collection.count)
             if dropped > max(16, _MOST_DROPPED * (done + dropped)):
                 last = writer.dropped(collection.prefix)[-1].why
-                raise CollectFailedError(
-                    f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}"
-                )
+                raise StageFailedError(f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}")
     finally:
         workers.close()
 
@@ -117,13 +124,13 @@ def _take(told: Told, writer: DatasetWriter, under_way: dict[str, tuple[Order, s
         if message["dropped"] not in order.skip:
             writer.drop(str(message["dropped"]), str(message["why"]))
     else:
-        raise CollectFailedError(str(message.get("refused", f"a worker said {message}")))
+        raise StageFailedError(str(message.get("refused", f"a worker said {message}")))
 
 
 def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: deque[Order]) -> None:
     """A process has died: the drive that it had begun is given up, and the rest of its layout is tried again."""
     if not begun:
-        raise CollectFailedError(f"the process of drive {order.id(order.start)} and those after it {why}")
+        raise StageFailedError(f"the process of drive {order.id(order.start)} and those after it {why}")
     if not writer.has(begun):
         writer.drop(begun, f"its process {why.split(':')[0]}")
     ids = [order.id(number) for number in range(order.start, order.start + order.count)]
@@ -134,9 +141,46 @@ def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: d
 
 def job_count(asked: int) -> int:
     """Return the number of parallel processes: `asked`, or one per available core if it is 0."""
-    return asked if asked else len(os.sched_getaffinity(0))
+    return asked or len(os.sched_getaffinity(0))
 
 
-def result_of(writer: DatasetWriter, prefix: str) -> dict[str, Any]:
-    """Return the counts of a collection and the hash of the whole data set."""
-    return {**writer.summary(prefix), "sha256": writer.finish().sha256}
+def collect(job: StageJob) -> dict[str, Any]:
+    """Record the recipe's drives into `collect/`, or continue an interrupted recording. Raises TrainError."""
+    config = _config(job)
+    with DatasetWriter(job.run_dir.stage("collect")) as writer:
+        _record(job, writer, Collection(EXPERT_PREFIX, config.episodes, job.seed, 0, config))
+        return {**writer.summary(EXPERT_PREFIX), "sha256": writer.finish().sha256}
+
+
+def run_round(job: StageJob, artifacts: Path, round_number: int) -> dict[str, Any]:
+    """Record round `round_number` (1, 2, …) into `collect/`, or continue an interrupted recording.
+
+    Raises ArtifactError for artifacts that cannot drive, TrainError.
+    """
+    if round_number < 1:
+        raise ValueError(f"dagger: rounds count from 1, found {round_number}")
+    config, numbers = _config(job), job.recipe.dagger
+    sha256 = load_artifacts(artifacts).manifest_sha256
+    beta = BETA / 2 ** (round_number - 1)
+    policy = PolicyOptions(str(artifacts.absolute()), sha256, beta, numbers.latency_mean_s)
+    prefix, beside = prefixes_of(round_number)
+    driven = Collection(prefix, numbers.episodes, job.seed, round_number, config, policy)
+    expert = Collection(beside, numbers.expert_episodes, job.seed, _EXPERT_TURNS + round_number, config)
+    with DatasetWriter(job.run_dir.stage("collect")) as writer:
+        if others := sorted({entry.driver for entry in writer.entries(prefix)} - {f"{POLICY_DRIVER}{sha256[:12]}"}):
+            raise TrainError(f"dagger round {round_number}: started with {others[0]}; continue with the same artifacts")
+        for collection in (expert, driven) if expert.count else (driven,):
+            _record(job, writer, collection)
+        result = {**writer.summary(prefix), "sha256": writer.finish().sha256, "beta": beta, "policy": sha256}
+        return result | ({"expert": writer.summary(beside)} if expert.count else {})
+
+
+def _config(job: StageJob) -> CollectConfig:
+    if job.ranks.world > 1:
+        raise TrainError("collect starts its own processes (collect.jobs): run it without torchrun")
+    return job.recipe.collect
+
+
+def _record(job: StageJob, writer: DatasetWriter, collection: Collection) -> None:
+    jobs = job_count(collection.config.jobs)
+    fill(writer, collection, jobs, update=job.progress.update, stopped=job.should_stop)

@@ -19,7 +19,7 @@ from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.scene.scene import Vec2
 from tools.train.collect.steering import Velocity
-from tools.train.scenes.sites import Site
+from tools.train.drives.scenarios import Site
 
 _LATEST: Final = 0.8  # a detour begins within this share of the route's length
 _LEAST_M: Final = 1.0  # shortest detour

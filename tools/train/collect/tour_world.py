@@ -31,12 +31,11 @@ from tools.train.collect.detour import DetourProgress, draw_detour
 from tools.train.collect.record import CameraSettings, NothingToLearnError, Recorded
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
+from tools.train.drives.scenarios import Scenario, Site
+from tools.train.drives.trace_sentences import aspects_json
+from tools.train.drives.traces import Tracer, turning_first
 from tools.train.encoder.poses import body_state
 from tools.train.samples.augment import encoded
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.sites import Site
-from tools.train.scenes.trace_sentences import aspects_json
-from tools.train.scenes.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]

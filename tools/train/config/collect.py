@@ -23,8 +23,6 @@ RATE_HZ: Final = 10
 """Frames per second of a recorded drive."""
 TRACE_EVERY: Final = 10
 """Frames between two reasoning texts: one per second."""
-PLANNED_DRIVE_S: Final = 30.0
-"""Typical length of a drive, s; used only to estimate a run's work."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,6 @@ class CollectConfig(Checked):
             raise ValueError("expected shares of the drifts with a sum up to 1")
         if self.jpeg_quality_min > self.jpeg_quality_max:
             raise ValueError("expected jpeg_quality_min up to jpeg_quality_max")
-
-
-OF_TOURS: Final = "tours: "
-"""Prefix of the budget lines that concern tours."""
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class LossConfig(Checked):
     """Weight of an error of 1 rad relative to an error of 1 m."""
 
     walls: Annotated[float, Range(0, 100)] = 0.0
-    """Weight of each metre that a plan is too close to walls (`tools.train.scenes.walls`); 0: walls are ignored. Heads
+    """Weight of each metre that a plan is too close to walls (`tools.train.drives.walls`); 0: walls are ignored. Heads
     with another objective do not use it."""
     room_m: Annotated[float, Range(0, 1)] = 0.2
     """Distance to walls below which a plan is too close, m, unless the expert's plan is as close."""

@@ -118,7 +118,7 @@ class EvaluateConfig(Checked):
 
     episodes: Annotated[int, Range(1, 10_000)] = 60
     scenario_seed: Annotated[int, Range(0, 9_999)] = 9001
-    """Seed of the layouts (`tools.train.scenes.scenarios`); no other stage uses this one."""
+    """Seed of the layouts (`tools.train.drives.scenarios`); no other stage uses this one."""
     kinds: Mapping[str, float] = field(default_factory=dict)
     """Shares of the kinds of scenes; empty: the default shares."""
     latency_s: Annotated[float, Range(0, 60)] = 2.0

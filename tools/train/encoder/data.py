@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from edge.core.cli import write_whole
-from export.core.typed import build, plain
+from export.core.typed import plain
 from sim_hil.benchmark.suite.episode import ROBOTS
 from sim_hil.benchmark.workers.worker_pool import Told, Workers
 from tools.train.config.checks import TrainError
@@ -35,7 +35,7 @@ from tools.train.samples.augment import Picture, decoded
 FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder.worker"
 FIRST_LAYOUT: Final = 10_000_000_000
-"""First seed of the layouts, above all seeds of drives (`tools.train.scenes.scenarios`)."""
+"""First seed of the layouts, above all seeds of drives (`tools.train.drives.scenarios`)."""
 _OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts per stage seed, and the first held-out one
 _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
@@ -75,11 +75,6 @@ class Shard:
             "pixels": PIXELS,
         }
         return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
-
-    @staticmethod
-    def of_json(content: dict[str, Any]) -> Shard:
-        """Build a shard from `plain` content. Raises FieldError."""
-        return build(Shard, content, "shard")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from edge.state.frame import fit_frame
 from export.model.network import TicVla
 from tools.train.config.checks import TrainError
 from tools.train.config.encoder import EncoderConfig
-from tools.train.config.recipe import Recipe
 from tools.train.encoder.data import FrameSet, fill, frames_sha256, plan
 from tools.train.encoder.heads import Balance, EncoderHeads, as_tensors, losses, total
 from tools.train.encoder.labels import COLUMNS, PIXELS, mirrored_label
@@ -37,16 +36,6 @@ from tools.train.samples.tokens import encoder_sha256
 
 STAGE: Final = "encoder"
 _HEADS, _AUGMENT, _LOOK = 0xE0C2, 0xE0C3, 0xE0C4
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number of samples, key of the throughput) of this stage's work."""
-    frames = recipe.encoder.frames
-    rendered = frames.count + frames.held if frames.count else 0
-    return [
-        ("pictures with labels", rendered, "render"),
-        ("pictures learned from", frames.count * recipe.encoder.epochs, "encoder"),
-    ]
 
 
 def run(job: StageJob) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from export.core.typed import build
 from sim_hil.benchmark.language.visibility import ASPECT
 from sim_hil.benchmark.workers.worker_process import Message, worker_main
 from sim_hil.crowd.people import UPDATE_HZ, People, appearances
@@ -24,12 +25,12 @@ from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
 from tools.train.config.encoder import MOST_SCENES
 from tools.train.drives.drive import PICTURE_PX
+from tools.train.drives.scenarios import Site
 from tools.train.encoder.data import WORKER, Shard, finish, path_of
 from tools.train.encoder.ids import IdWorld, view_of
 from tools.train.encoder.labels import PIXELS, SceneLabels, label_shapes
 from tools.train.encoder.poses import Poses, body_state
 from tools.train.samples.augment import encoded
-from tools.train.scenes.sites import Site
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ _AWAY_M: Final = -1e5
 
 def messages(job: Message) -> Iterator[Mapping[str, Any]]:
     """Render the job `{"folder": path, "shard": Shard}`; yield `{"frames": n}` as progress and at the end."""
-    for done in render(Path(job["folder"]), Shard.of_json(job["shard"])):
+    for done in render(Path(job["folder"]), build(Shard, job["shard"], "shard")):
         yield {"frames": done}
 
 

@@ -24,12 +24,12 @@ from edge.state.semantic import waypoints_now
 from export.model.config import TicVlaConfig
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import SampleConfig
+from tools.train.drives.walls import nothing_near
 from tools.train.samples.action_batch import Around, Group
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.kv_cache import CachedState
 from tools.train.samples.language_batch import FrameTokens
-from tools.train.scenes.walls import nothing_near
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,14 @@ class States(Protocol):
 
 
 @dataclass(frozen=True)
+class Source:
+    """Visual tokens and semantic states of drives, by their ids."""
+
+    tokens: FrameTokens
+    states: States
+
+
+@dataclass(frozen=True)
 class SampleChoice:
     """Frames `ks` of drive number `drive` with the state of frame `anchor`, and their delays `ages` in 0.1 s."""
 
@@ -75,14 +83,18 @@ class Samples:
         config: SampleConfig,
         model: TicVlaConfig,
         *,
+        mirror: Source | None = None,
         drop: bool = True,
     ) -> None:
-        """`drop`: apply the network's dropout of K‖V and state. Raises SampleError if no frame can be drawn."""
+        """`mirror`: of mirrored drives; `drop`: apply the network's dropout of K‖V and state.
+
+        Raises SampleError if no frame can be drawn.
+        """
         if round(model.action.step_s * RATE_HZ, 6) != 1:
             raise SampleError(f"action.step_s: expected 0.1, the spacing of the labels, found {model.action.step_s:g}")
         self.drives = tuple(drives)
         self.config = config
-        self._tokens, self._states, self._delays = tokens, states, delays
+        self._plain, self._mirror, self._delays = Source(tokens, states), mirror, delays
         self._by_waypoints = model.action.semantic_interface == "waypoints"
         self._near_walls = any(drive.walls is not None for drive in self.drives)
         self._drop_kv, self._drop_state = (model.action.kv_dropout, model.action.state_dropout) if drop else (0.0, 0.0)
@@ -105,15 +117,17 @@ class Samples:
         if not chances or self._upto[-1] <= 0:
             raise SampleError("no frame has both a label and a semantic state at a possible delay")
 
-    def _anchors(self, drive_id: str) -> tuple[int, ...]:
+    def _source(self, drive: DriveFrames) -> Source:
+        return self._mirror if drive.in_mirror and self._mirror is not None else self._plain
+
+    def _anchors(self, drive: DriveFrames) -> tuple[int, ...]:
         """Return the frames with usable states; the semantic interface `waypoints` requires waypoints in the text."""
-        anchors = self._states.anchors(drive_id)
+        states = self._source(drive).states
+        anchors = states.anchors(drive.id)
         if not self._by_waypoints:
             return anchors
-        draws = range(self._states.draws)
-        return tuple(
-            k for k in anchors if all(self._states.at(drive_id, k, draw).waypoints is not None for draw in draws)
-        )
+        draws = range(states.draws)
+        return tuple(k for k in anchors if all(states.at(drive.id, k, draw).waypoints is not None for draw in draws))
 
     def _chances(self, drive: DriveFrames) -> tuple[Array, dict[int, float], float]:
         """Return probabilities of a drive.
@@ -122,7 +136,7 @@ class Samples:
         probability of a delay that reaches before the first frame.
         """
         mass, beyond = self._delays.mass, self._delays.beyond
-        anchors = self._anchors(drive.id)
+        anchors = self._anchors(drive)
         if not anchors:
             return np.zeros(len(drive)), {}, 0.0
         # One state represents all delays up to the next state.
@@ -166,7 +180,8 @@ class Samples:
         which, cut, end = rng.uniform(size=3)
         noise = rng.standard_normal((count, 3))
         keep_state = rng.uniform(size=count) >= self._drop_state
-        state = self._states.at(drive.id, chosen.anchor, int(which * self._states.draws))
+        source = self._source(drive)
+        state = source.states.at(drive.id, chosen.anchor, int(which * source.states.draws))
         ks = list(chosen.ks)
         offsets = [self._offset(drive, chosen.anchor, k, row) for k, row in zip(ks, noise, strict=True)]
         delays_s = [min(age / RATE_HZ, self.config.longest_told_s) for age in chosen.ages]
@@ -181,7 +196,7 @@ class Samples:
             keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
             if self.config.reasoning and self._text_alone(cut):
                 keep[:, : state.prompt_tokens] = False
-        frames = self._tokens.frames(drive.id)
+        frames = source.tokens.frames(drive.id)
         visual = np.stack([frames[k] for k in ks])
         if self.config.blind:
             visual[rng.uniform(size=count) < self.config.blind] = 0
@@ -208,7 +223,8 @@ class Samples:
 
     def waypoints_of(self, chosen: SampleChoice) -> Waypoints | None:
         """Return the waypoints in a choice's state, m in the robot frame at the anchor; None if it has none."""
-        return self._states.at(self.drives[chosen.drive].id, chosen.anchor).waypoints
+        drive = self.drives[chosen.drive]
+        return self._source(drive).states.at(drive.id, chosen.anchor).waypoints
 
     def draw(self, rng: np.random.Generator) -> Group:
         """Draw a choice and assemble it."""

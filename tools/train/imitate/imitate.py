@@ -16,25 +16,19 @@ import torch
 
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
-from tools.train.config.collect import PLANNED_DRIVE_S
-from tools.train.config.imitate import POINT_GOAL, TIC_VLA, DelayConfig, ImitateConfig, SampleConfig
-from tools.train.config.recipe import Recipe
+from tools.train.config.imitate import POINT_GOAL, DelayConfig, ImitateConfig, SampleConfig
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import NoStates, SampleError, Samples, States
-from tools.train.imitate.evaluation import draw_errors, evaluate
-from tools.train.imitate.mirror_drives import (
-    MIRROR,
-    BothStates,
-    BothTokens,
-    Mirror,
-    MirroredDrives,
-    MirrorTokens,
-    balanced,
-    mirrored_frames,
+from tools.train.drives.walls import Scenes
+from tools.train.imitate.data import NoStates, SampleError, Samples, Source, States
+from tools.train.imitate.evaluation import evaluate
+from tools.train.imitate.trainable_policies import (
+    ActionExpertPolicy,
+    PointGoalNet,
+    PointGoalNetPolicy,
+    TrainablePolicy,
+    build_point_goal,
+    save_point_goal,
 )
-from tools.train.imitate.mirror_drives import STATES as MIRRORED_STATES
-from tools.train.imitate.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
-from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy, TrainablePolicy
 from tools.train.run.job import StageJob
 from tools.train.run.loop import Ahead, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
@@ -43,26 +37,18 @@ from tools.train.run.own_drives import drives_after
 from tools.train.samples.action_batch import Group, collate
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.samples.kv_build import SEEN_PARTS, build_kv_cache, parts_sha256
-from tools.train.samples.kv_cache import KvCache
+from tools.train.samples.kv_cache import SEEN_PARTS, KvCache, build_kv_cache, parts_sha256
 from tools.train.samples.language_batch import FrameTokens
 from tools.train.samples.mirror import FOLDER as MIRRORED
-from tools.train.samples.mirror import SecondsDataset
+from tools.train.samples.mirror import STATES as MIRRORED_STATES
+from tools.train.samples.mirror import MirroredDrives, MirrorTokens, SecondsDataset, balanced, mirrored_frames
 from tools.train.samples.tokens import TokenCache
-from tools.train.scenes.walls import Scenes
 
 STAGE: Final = "imitate"
 STATES: Final = "kv"
 """Folder of the semantic states, in the data set."""
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 _DRAWS, _HELD, _NOISE, _START = 0x1A11, 0x1A12, 0x1A13, 0x1A14
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number, key of the throughput) of this stage's work, from the planned number of drives."""
-    config, seconds = recipe.imitate, round(PLANNED_DRIVE_S * recipe.collect.episodes)
-    states = [("semantic states", seconds * config.states.draws, "kv")] if config.policy == TIC_VLA else []
-    return [*states, ("samples learned", config.samples, "imitate")]
 
 
 def run(job: StageJob) -> dict[str, Any]:
@@ -85,7 +71,7 @@ def run(job: StageJob) -> dict[str, Any]:
     mirror = None
     if seconds is not None:
         mirror_tokens, mirrored = MirrorTokens(seconds), MirroredDrives.of(dataset)
-        mirror = Mirror(mirror_tokens, _states(job, network, mirrored, mirror_tokens, MIRRORED_STATES, dataset.train))
+        mirror = Source(mirror_tokens, _states(job, network, mirrored, mirror_tokens, MIRRORED_STATES, dataset.train))
     own = None
     if config.evaluate.own_words and dataset.val:
         own = _states(job, network, dataset, tokens, STATES, dataset.val, own=True)
@@ -138,7 +124,7 @@ def _point_goal(
 ) -> dict[str, Any]:
     student: PointGoalNet = build_point_goal(network.config, job.generator(_START)).to(job.device)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, network.config.kv_dim)
-    mirror = None if seconds is None else Mirror(MirrorTokens(seconds), states)
+    mirror = None if seconds is None else Source(MirrorTokens(seconds), states)
     policy = PointGoalNetPolicy(student, job.recipe.imitate.loss)
     result = fit(job, policy, dataset, tokens, states, of=parts_sha256(network, ("vision",)), mirror=mirror)
     if job.ranks.first:
@@ -168,7 +154,7 @@ def fit(
     *,
     of: str,
     share: float = 1.0,
-    mirror: Mirror | None = None,
+    mirror: Source | None = None,
     own: States | None = None,
 ) -> dict[str, Any]:
     """Train a policy in place and return its errors against the expert. Raises TrainError, SampleError.
@@ -183,8 +169,7 @@ def fit(
     if mirror is not None:
         reflected = _frames(job, MirroredDrives.of(dataset), dataset.train, config.sample, scenes)
         drives = balanced(drives, [mirrored_frames(drive) for drive in reflected], config.mirrored)
-        tokens, states = BothTokens(tokens, mirror.tokens), BothStates(states, mirror.states)
-    data = _samples(job, drives, tokens, states, delays, policy)
+    data = _samples(job, drives, tokens, states, delays, policy, mirror)
     unseen = _frames(job, dataset, dataset.val, config.sample.undisturbed(), scenes)
     held = _held_out(job, unseen, tokens, states, delays, policy)
     policy.begin(data.drives)
@@ -210,7 +195,7 @@ def fit(
     result: dict[str, Any] = {
         "steps": total,
         "drives": len(dataset.train),
-        "frames": sum(len(drive) for drive in drives if not drive.id.startswith(MIRROR)),
+        "frames": sum(len(drive) for drive in drives if not drive.in_mirror),
         "mean_age_s": delays.mean_s,
         **numbers,
     }
@@ -223,7 +208,6 @@ def fit(
                 policy.plan, samples, config.evaluate, seed=job.seed, device=torch.device(job.device),
                 semantics=policy.uses_semantics,
             )  # fmt: skip
-            draw_errors(result[name], job.run_dir.curves / f"{STAGE}_{name}.png")
     return result
 
 
@@ -276,6 +260,7 @@ def _samples(
     states: States,
     delays: Delays,
     policy: TrainablePolicy,
+    mirror: Source | None = None,
     *,
     held: bool = False,
 ) -> Samples:
@@ -283,7 +268,8 @@ def _samples(
     if not policy.uses_semantics:
         # Such a policy works with any semantic interface.
         model = replace(model, action=replace(model.action, semantic_interface="kv"))
-    return Samples(drives, tokens, states, delays, config.undisturbed() if held else config, model, drop=not held)
+    used = config.undisturbed() if held else config
+    return Samples(drives, tokens, states, delays, used, model, mirror=mirror, drop=not held)
 
 
 def _held_out(

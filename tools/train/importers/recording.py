@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge.core.jpeg import MAX_BYTES, jpeg_refusal
 from tools.train.config.checks import TrainError
-from tools.train.scenes.trace_sentences import aspects_of_json
+from tools.train.drives.trace_sentences import aspects_of_json
 
 TEXTS: Final = "texts.json"
 MAX_TABLE_BYTES: Final = 200_000_000

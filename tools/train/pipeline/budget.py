@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from reporting.build_progress import duration
-from tools.train.collect import collect
-from tools.train.config.collect import OF_TOURS
+from tools.train.config.collect import RATE_HZ
+from tools.train.config.imitate import TIC_VLA
 from tools.train.config.recipe import Recipe
-from tools.train.encoder import encoder
-from tools.train.imitate import imitate
-from tools.train.pipeline.chain import Step
-from tools.train.rl import rl
+from tools.train.config.sft import SftConfig
+from tools.train.pipeline.chain import GO_ON, Step
 from tools.train.run.optim import computes_bf16
-from tools.train.sft import sft
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -27,15 +24,11 @@ else:
 Work = list[tuple[str, int, str]]
 """(description, number of samples, key in the throughput table) of each kind of work."""
 
-BUDGETS: Final[Mapping[str, Callable[[Recipe], Work]]] = {
-    "collect": collect.budget,
-    "encoder": encoder.budget,
-    "sft": sft.budget,
-    "imitate": imitate.budget,
-    "rl": rl.budget,
-}
-"""Function of each stage that returns its work; `evaluate` and `dagger` are computed here."""
 FILE: Final = Path(__file__).with_name("throughput.toml")
+_DRIVE_S, _TOUR_S, _EPISODE_STEPS = 30.0, 45.0, 300  # typical lengths; an episode's are of 0.1 s
+_OF_TOURS: Final = "tours: "  # prefix of the lines that concern tours
+_DECIDE: Final = 0.3  # share of deciding anchors, measured in `nano`'s 328 drives
+_RELABELLED: Final = 0.2  # share of a drive's anchors that each other instruction adds, measured in 16 drives
 
 
 @dataclass(frozen=True)
@@ -73,15 +66,50 @@ def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
 
 
 def _work(recipe: Recipe, step: Step) -> Work:
-    if step.stage == "dagger":
-        expert = (
-            [("drives of the expert", recipe.dagger.expert_episodes, "drive")] if recipe.dagger.expert_episodes else []
-        )
-        return [*expert, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
-    if step.stage == "evaluate":
-        return [("episodes", recipe.evaluate.episodes, "policy-drive")]
-    work = BUDGETS[step.stage](recipe)
-    return _after_round(recipe, step.stage, work) if step.round else work
+    """Return a step's work; stages that learn from drives are planned with drives of 30 s."""
+    seconds = round(_DRIVE_S * recipe.collect.episodes)
+    work: Work = []
+    if step.stage == "collect":
+        work = [("drives of the expert", recipe.collect.episodes, "drive")]
+    elif step.stage == "encoder":
+        frames = recipe.encoder.frames
+        work = [
+            ("pictures with labels", frames.count + frames.held if frames.count else 0, "render"),
+            ("pictures learned from", frames.count * recipe.encoder.epochs, "encoder"),
+        ]
+    elif step.stage == "sft":
+        work = _sft(recipe.sft, seconds)
+    elif step.stage == "imitate":
+        states = [("semantic states", seconds * recipe.imitate.states.draws, "kv")]
+        work = states if recipe.imitate.policy == TIC_VLA else []
+        work = [*work, ("samples learned", recipe.imitate.samples, "imitate")]
+    elif step.stage == "dagger":
+        expert = [("drives of the expert", recipe.dagger.expert_episodes, "drive")]
+        work = expert if recipe.dagger.expert_episodes else []
+        work = [*work, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
+    elif step.stage == "rl":
+        rl = recipe.rl
+        evaluations = 1 + -(-rl.iterations // rl.evaluate_every)
+        episodes = rl.iterations * rl.episodes + evaluations * rl.evaluate_episodes + 2 * rl.final_episodes
+        work = [("steps driven and learned from", episodes * _EPISODE_STEPS, "ppo")]
+    elif step.stage == "evaluate":
+        work = [("episodes", recipe.evaluate.episodes, "policy-drive")]
+    return _after_round(recipe, step.stage, work) if step.round and step.stage in GO_ON else work
+
+
+def _sft(config: SftConfig, seconds: int) -> Work:
+    deciding = 1 + _DECIDE * (config.deciding - 1)
+    anchors = round(seconds * (deciding * (1 + _RELABELLED * config.retold.ways))) * config.epochs
+    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    if not config.tours.count:
+        return drives
+    toured = round(_TOUR_S * config.tours.count)
+    return [
+        *drives,
+        (f"{_OF_TOURS}made", config.tours.count, "tour"),
+        (f"{_OF_TOURS}frames encoded", toured * (2 if config.mirrored > 0 else 1), "encode"),
+        (f"{_OF_TOURS}anchors learned", round(toured * deciding) * config.epochs, "sft"),
+    ]
 
 
 def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> Work:
@@ -96,7 +124,7 @@ def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]
     # No new tours; a share of them is trained on again.
     tours = {"tour": 0.0, "encode": 0.0, "sft": share * recipe.sft.tours_again}
     counts = (
-        (what, round(count * (tours if what.startswith(OF_TOURS) else shares).get(key, share)), key)
+        (what, round(count * (tours if what.startswith(_OF_TOURS) else shares).get(key, share)), key)
         for what, count, key in work
     )
     return [line for line in counts if line[1] > 0]
@@ -120,13 +148,5 @@ def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], devi
 
 def as_json(budget: Sequence[Line]) -> list[dict[str, Any]]:
     """Return the estimate as the value that `--json` writes."""
-    return [
-        {
-            "step": line.step,
-            "what": line.what,
-            "samples": line.samples,
-            "rate_per_s": line.rate,
-            "seconds": line.seconds,
-        }
-        for line in budget
-    ]
+    keys = ("step", "what", "samples", "rate_per_s", "seconds")
+    return [dict(zip(keys, (*astuple(line), line.seconds), strict=True)) for line in budget]

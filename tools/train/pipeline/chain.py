@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from tools.train.collect import collect
-from tools.train.collect.dagger import run_round
+from tools.train.collect.collection import collect, run_round
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.drives.drive import file_sha256
@@ -16,9 +15,8 @@ from tools.train.encoder import encoder
 from tools.train.imitate import imitate
 from tools.train.pipeline import evaluate
 from tools.train.rl import rl
-from tools.train.run.exported import export_artifacts
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import ORDER, START, stage_weights, weights_before
+from tools.train.run.network_file import ORDER, START, export_artifacts, stage_weights, weights_before
 from tools.train.run.run_dir import RunDir
 from tools.train.sft import sft
 
@@ -33,8 +31,8 @@ ADOPTED: Final = "adopted"
 """Key in the result of a stage that did not run here because the run started with that stage's weights."""
 
 StageRun = Callable[[StageJob], dict[str, Any]]
-RUNS: Final[Mapping[str, StageRun]] = {
-    "collect": collect.run,
+RUNS: Final[dict[str, StageRun]] = {
+    "collect": collect,
     "encoder": encoder.run,
     "sft": sft.run,
     "imitate": imitate.run,
@@ -122,7 +120,7 @@ def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
     shutil.copyfile(start, run_dir.model_path)
 
 
-def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | None = None) -> dict[str, Any]:
+def run_step(job: StageJob, step: Step) -> dict[str, Any]:
     """Run one step and record its result. Raises the stage's errors."""
     if step.stage == "dagger":
         result = _round(job, step)
@@ -136,15 +134,10 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
             job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
         job.ranks.barrier()
         job = replace(job, resume=False)
-    result = (stage_run or module_run)(step.stage)(job)
+    result = RUNS[step.stage](job)
     if job.ranks.first:
         job.run_dir.finish(step.stage, result)
     return result
-
-
-def module_run(stage: str) -> StageRun:
-    """Return the function that runs a stage."""
-    return RUNS[stage]
 
 
 def _round(job: StageJob, step: Step) -> dict[str, Any]:

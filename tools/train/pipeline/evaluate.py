@@ -20,10 +20,9 @@ from sim_hil.scene.writer import scene_to_toml
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import SHARES
 from tools.train.config.rl import EvaluateConfig
-from tools.train.run.exported import export_artifacts
+from tools.train.drives.scenarios import training_episodes
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import weights_before
-from tools.train.scenes.scenarios import training_episodes
+from tools.train.run.network_file import export_artifacts, weights_before
 
 STAGE: Final = "evaluate"
 SUITE: Final = "training.toml"

@@ -28,20 +28,24 @@ from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import TASKS_PER_SCENE
-from tools.train.config.recipe import Recipe
 from tools.train.config.rl import LOG_STD_RANGE, RlConfig
-from tools.train.imitate.point_goal_net import build_point_goal, save_point_goal
-from tools.train.rl.action_tail import check_tail
-from tools.train.rl.command_policy import CommandLimits
+from tools.train.drives.scenarios import KEPT_SEEDS
+from tools.train.imitate.trainable_policies import build_point_goal, save_point_goal
+from tools.train.rl.action_tail import CommandLimits, check_tail
 from tools.train.rl.ppo import Learner, PointGoalLearner, PpoOptimiser, TailLearner
 from tools.train.rl.rollout import Rollout
 from tools.train.rl.vector_env import drive
 from tools.train.rl.worker import RolloutOrder
 from tools.train.run import checkpoint
-from tools.train.run.exported import export_artifacts
 from tools.train.run.job import StageFailedError, StageJob
-from tools.train.run.network_file import START, finish_network, is_trained, read_network, weights_before
-from tools.train.scenes.scenarios import KEPT_SEEDS
+from tools.train.run.network_file import (
+    START,
+    export_artifacts,
+    finish_network,
+    is_trained,
+    read_network,
+    weights_before,
+)
 
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 # Seeds of scenarios that no other stage uses, for evaluation (selects the best), training and the final comparison.
@@ -50,16 +54,6 @@ _EVALUATION_TASKS: Final = 2  # per layout: more layouts are more informative th
 STAGE: Final = "rl"
 ROLLOUTS: Final = "rollouts"
 _ROUNDING: Final = 1e-9
-STEPS_PER_EPISODE: Final = 300
-"""Typical number (30 s at 10 Hz); used only to estimate a run's duration."""
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number of samples, key of the throughput table) of this stage's work."""
-    config = recipe.rl
-    evaluations = 1 + -(-config.iterations // config.evaluate_every)
-    episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes + 2 * config.final_episodes
-    return [("steps driven and learned from", episodes * STEPS_PER_EPISODE, "ppo")]
 
 
 Drive = Callable[..., Rollout]
@@ -174,7 +168,7 @@ def _score(content: Mapping[str, float] | None) -> Score | None:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Improve the newest weights of the run. Raises TrainError, RolloutFailedError, KeyboardInterrupt."""
+    """Improve the newest weights of the run. Raises TrainError, StageFailedError, KeyboardInterrupt."""
     if job.ranks.world > 1:
         raise TrainError(
             "torchrun: reinforcement learning starts its own processes (rl.jobs); run edge-train rl without torchrun"
@@ -281,10 +275,10 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
     state.steps += rollout.steps
     learner.take(rollout)
     ppo = config.ppo
-    found = learner.estimates(gamma=ppo.gamma, lam=ppo.gae_lambda, reward_scale=config.reward_scale)
+    advantages, returns = learner.estimates(gamma=ppo.gamma, lam=ppo.gae_lambda, reward_scale=config.reward_scale)
     generator = job.generator("ppo", state.iteration)
     warm = state.iteration >= config.warmup_iterations
-    stats = state.optimiser.update(learner, found.advantages, found.returns, generator, policy=warm)
+    stats = state.optimiser.update(learner, advantages, returns, generator, policy=warm)
     return {**numbers, **{key: float(value) for key, value in asdict(stats).items()}}
 
 

@@ -18,10 +18,6 @@ COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
 _POLL_S: Final = 0.5
 
 
-class RolloutFailedError(StageFailedError):
-    """A worker process that ended without a rollout; one line."""
-
-
 def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
     """Split an order into orders of at most `per_job` episodes, each with its own file below `order.out`.
 
@@ -50,7 +46,7 @@ def drive(
     """Drive an order's episodes; files of jobs that have finished before are reused.
 
     `finished` takes for each episode whether it succeeded. The number of jobs does not change the result. Raises
-    RolloutFailedError, KeyboardInterrupt when `stopped`.
+    StageFailedError, KeyboardInterrupt when `stopped`.
     """
     folder = Path(order.out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +65,7 @@ def drive(
                 if line.message is not None:
                     finished(bool(line.message["success"]))
                 elif line.why:
-                    raise RolloutFailedError(f"rollout {line.key}: {line.why}")
+                    raise StageFailedError(f"rollout {line.key}: {line.why}")
     finally:
         workers.close()
     return read([Path(part.out) for part in orders])

@@ -33,16 +33,14 @@ from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.workers.worker_process import Message, worker_main
 from tools.train.config.collect import TASKS_PER_SCENE
-from tools.train.imitate.point_goal_net import PointGoalNet
+from tools.train.drives.scenarios import FIRST_SEED, Scenario, training_episodes
+from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl import rollout
-from tools.train.rl.action_tail import check_tail, load_tail
-from tools.train.rl.command_policy import CommandLimits
-from tools.train.rl.policies import PointGoalRolloutPolicy, RolloutPolicy, TailPolicy
+from tools.train.rl.action_tail import CommandLimits, check_tail, load_tail
+from tools.train.rl.policies import Models, PointGoalRolloutPolicy, RolloutPolicy, TailPolicy
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, goal_features
-from tools.train.rl.virtual_time_reasoner import Models
 from tools.train.run import checkpoint
 from tools.train.run.network_file import read_network
-from tools.train.scenes.scenarios import FIRST_SEED, Scenario, training_episodes
 
 MODULE: Final = "tools.train.rl.worker"
 _TAG, _CROWD, _DELAYS = 0x71, 0xC0, 0xDE

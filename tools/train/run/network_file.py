@@ -1,18 +1,22 @@
-"""Weights between stages: each stage starts with those of the previous one and writes its own."""
+"""Weights between stages, and their export: each stage starts with those of the previous one and writes its own."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from safetensors import SafetensorError, safe_open
 
+from edge.artifacts.files import MANIFEST_NAME
+from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.checkpoint.load import load_checkpoint
-from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
+from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
@@ -148,3 +152,50 @@ def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
     shutil.copyfile(path, partial)
     partial.replace(job.run_dir.model_path)
     return path
+
+
+TARGET: Final = "cpu"
+COMMAND: Final[Sequence[str]] = (sys.executable, "-m", "export.cli")
+_TAIL_CHARS: Final = 500
+
+
+class ExportError(RuntimeError):
+    """Weights that could not be exported; one line."""
+
+
+def export_artifacts(
+    weights: Path,
+    config: TicVlaConfig,
+    out: Path,
+    say: Callable[[str], None] = lambda line: None,
+    command: Sequence[str] = COMMAND,
+) -> Path:
+    """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
+    digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
+    if (out / MANIFEST_NAME).is_file() and mark.is_file():
+        if json.loads(mark.read_text(encoding="utf-8")).get("weights_sha256") == digest:
+            return out
+        mark.unlink()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
+    say(f"exporting the weights of stage {weights.parent.name}")
+    log = out.with_name(out.name + ".log")
+    with log.open("wb") as output:
+        code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
+    if code.returncode == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+    if code.returncode != EXIT_DONE:
+        said = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:].strip().splitlines()
+        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {said[-1] if said else f'see {log}'}")
+    write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
+    return out
+
+
+def model_argument(config: TicVlaConfig, out: Path) -> str:
+    """Return the value of `--model`: a preset's name, or the path of a file that is written beside `out`."""
+    for name, preset in PRESETS.items():
+        if preset == config:
+            return name
+    path = out.with_name(out.name + ".model.json")
+    write_whole(path, json.dumps(config.to_dict(), indent=1) + "\n")
+    return str(path)

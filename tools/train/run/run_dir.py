@@ -31,6 +31,8 @@ class RunDir:
 
     def __init__(self, out: Path) -> None:
         self.out = out
+        self.recipe_path, self.model_path = out / "recipe.toml", out / "model.safetensors"
+        self.log_path, self.curves = out / "log.jsonl", out / "curves"
 
     @staticmethod
     def open(out: Path, recipe: Recipe) -> RunDir:
@@ -116,26 +118,6 @@ class RunDir:
         while self.begun(f"{stage}-{number}"):
             number += 1
         return number
-
-    @property
-    def recipe_path(self) -> Path:
-        """Path of the run's recipe with all values."""
-        return self.out / "recipe.toml"
-
-    @property
-    def model_path(self) -> Path:
-        """Path of the network's weights after the last finished stage."""
-        return self.out / "model.safetensors"
-
-    @property
-    def log_path(self) -> Path:
-        """Path of the log, one JSON object per line: `{"stage", "step", values…}`."""
-        return self.out / "log.jsonl"
-
-    @property
-    def curves(self) -> Path:
-        """Folder of the plots."""
-        return self.out / "curves"
 
     def stage(self, name: str) -> Path:
         """Return the folder of a stage; create it if needed."""

@@ -14,8 +14,8 @@ from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import WeightConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, Drive
-from tools.train.scenes.trace_sentences import NO_PEOPLE
-from tools.train.scenes.walls import Walls
+from tools.train.drives.trace_sentences import NO_PEOPLE
+from tools.train.drives.walls import Walls
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,8 @@ class DriveFrames:
     """[N]: relative probability of drawing the frame; 0 if too few steps of the label are known."""
     walls: Walls | None = None
     """Walls along the drive; None if they are not used or not known."""
+    in_mirror: bool = False
+    """Whether tokens and states are those of the mirrored drive."""
 
     def __len__(self) -> int:
         return len(self.state)

@@ -19,8 +19,7 @@ from export.model.language import LanguageModel
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
-from tools.train.samples.greedy import decode
-from tools.train.samples.language_batch import FrameTokens, Row, collate, frames_of
+from tools.train.samples.language_batch import FrameTokens, Row, collate, decode, frames_of
 
 _TAG: Final = 0xE7A1
 

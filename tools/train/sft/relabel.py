@@ -36,14 +36,13 @@ from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario, ScenarioError, Site, SiteError, is_sound, scenario_of
+from tools.train.drives.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
+from tools.train.drives.traces import Sight, Tracer, turning_first
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import Anchor, anchors_of
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario, ScenarioError, is_sound, scenario_of
-from tools.train.scenes.sites import Site, SiteError
-from tools.train.scenes.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
-from tools.train.scenes.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
 FORMAT: Final = 2

@@ -21,9 +21,7 @@ from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.config.checks import TrainError
-from tools.train.config.collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ
 from tools.train.config.optim import OptimConfig
-from tools.train.config.recipe import Recipe
 from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig
 from tools.train.drives.drive import Dataset
 from tools.train.run.job import StageJob
@@ -32,19 +30,16 @@ from tools.train.run.network_file import finish_network, read_network, stage_wei
 from tools.train.run.optim import Optimiser, autocast
 from tools.train.run.own_drives import drives_after
 from tools.train.samples.anchors import Anchor, Prompts, anchors_of, draw, waiting
-from tools.train.samples.kv_build import parts_sha256
+from tools.train.samples.augment import disturbed, shifted
+from tools.train.samples.kv_cache import parts_sha256
 from tools.train.samples.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
 from tools.train.samples.mirror import FOLDER as MIRRORED
 from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.samples.tokens import TokenCache
-from tools.train.sft.language_augment import disturbed, shifted
 from tools.train.sft.language_eval import evaluate, glance
 from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
-PLANNED_TOUR_S: Final = 45.0
-_DECIDE: Final = 0.3  # share of deciding anchors, measured in `nano`'s 328 drives
-_RETOLD: Final = 0.2  # share of a drive's anchors that each other instruction adds, measured in 16 drives
 _DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
 
 
@@ -118,25 +113,6 @@ class Samples:
         if self._show is None or sample.noise_seed is None:
             return frames
         return disturbed(frames, self._show, np.random.default_rng((_NOISE, sample.noise_seed)))
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number, key of the throughput) of this stage's work, planned with drives of 30 s."""
-    config, seconds = recipe.sft, round(PLANNED_DRIVE_S * recipe.collect.episodes)
-    each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
-    anchors = round(seconds * each) * config.epochs
-    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
-    if not config.tours.count:
-        return drives
-    toured = round(PLANNED_TOUR_S * config.tours.count)
-    shown = round(toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
-    frames = toured * (2 if config.mirrored > 0 else 1)
-    tours = (
-        ("made", config.tours.count, "tour"),
-        ("frames encoded", frames, "encode"),
-        ("anchors learned", shown, "sft"),
-    )
-    return [*drives, *((f"{OF_TOURS}{what}", count, key) for what, count, key in tours)]
 
 
 def run(job: StageJob) -> dict[str, Any]:

@@ -20,16 +20,16 @@ from sim_hil.benchmark.policies.select import robot_config
 from tests.support.train.train_fake_worker import BEGUN
 from tools.train.collect import collect, collection
 from tools.train.collect.collection import CollectFailedError, Collection, fill, job_count
-from tools.train.collect.dagger_driver import PolicyOptions
+from tools.train.collect.steering import PolicyOptions
 from tools.train.collect.worker import Draw, Order, messages
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig
 from tools.train.config.rl import EvaluateConfig
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset, Drive
+from tools.train.drives.scenarios import KEPT_SEEDS
 from tools.train.run.distributed import Ranks
 from tools.train.run.job import QuietProgress
-from tools.train.scenes.scenarios import KEPT_SEEDS
 
 FAKE = (sys.executable, "-m", "tests.support.train.train_fake_worker")
 Faulty = Callable[..., None]

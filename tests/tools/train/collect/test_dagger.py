@@ -23,9 +23,8 @@ from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tests.support.train.training_drives import dataset, drive
 from tools.train.collect import dagger
 from tools.train.collect.collection import Collection
-from tools.train.collect.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
 from tools.train.collect.record import CameraSettings, DrivePlan, record
-from tools.train.collect.steering import Velocity
+from tools.train.collect.steering import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, Velocity, draw_latency
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY

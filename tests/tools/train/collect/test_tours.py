@@ -25,11 +25,11 @@ from tools.train.collect.worker import messages
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.drives.drive import TOUR_DRIVER, Dataset, Drive
+from tools.train.drives.scenarios import Scenario
 from tools.train.run.distributed import SINGLE
 from tools.train.run.job import QuietProgress
 from tools.train.samples.anchors import Anchor
 from tools.train.samples.mirror import Joined, Seconds, SecondsDataset, Views
-from tools.train.scenes.scenarios import Scenario
 
 STRAIGHT = np.stack((np.arange(0, 8, 0.1), np.zeros(80)), axis=1)
 

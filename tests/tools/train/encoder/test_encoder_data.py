@@ -12,11 +12,11 @@ from export.core.typed import plain
 from sim_hil.layouts import is_reserved
 from tools.train.config.checks import TrainError
 from tools.train.config.encoder import MOST_SCENES, FramesConfig
+from tools.train.drives import scenarios
 from tools.train.encoder.data import FIRST_LAYOUT, FrameSet, Shard, fill, finish, frames_sha256, made, path_of, plan
 from tools.train.encoder.labels import CLASSES, LANDMARK, PERSON, label_shapes
 from tools.train.encoder.worker import render
 from tools.train.run.job import QuietProgress
-from tools.train.scenes import scenarios
 
 SMALL = FramesConfig(count=24, held=0, per_scene=12, kinds=("corridor",), people_indoors=8, moment=4, jobs=2)
 

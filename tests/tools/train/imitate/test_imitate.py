@@ -25,8 +25,12 @@ from tools.train.config.recipe import load_recipe
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates, SampleError
 from tools.train.imitate.imitate import POINT_GOAL_FILE, budget, fit, run
-from tools.train.imitate.point_goal_net import build_point_goal, load_point_goal
-from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy
+from tools.train.imitate.trainable_policies import (
+    ActionExpertPolicy,
+    PointGoalNetPolicy,
+    build_point_goal,
+    load_point_goal,
+)
 from tools.train.pipeline.chain import Step, run_step
 from tools.train.run import optim
 from tools.train.run.job import StageJob

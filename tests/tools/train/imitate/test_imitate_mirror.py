@@ -15,20 +15,20 @@ from tools.train.config.imitate import DelayConfig, SampleConfig
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import Samples
 from tools.train.imitate.imitate import run
-from tools.train.imitate.mirror_drives import (
+from tools.train.samples.anchors import anchors_of
+from tools.train.samples.delays import Delays
+from tools.train.samples.drive_frames import DriveFrames
+from tools.train.samples.mirror import (
     MIRROR,
     BothStates,
     BothTokens,
     MirroredDrives,
     MirrorTokens,
     balanced,
+    mirrored,
     mirrored_drive,
     mirrored_frames,
 )
-from tools.train.samples.anchors import anchors_of
-from tools.train.samples.delays import Delays
-from tools.train.samples.drive_frames import DriveFrames
-from tools.train.samples.mirror import mirrored
 
 EVEN = SampleConfig().undisturbed()
 

@@ -28,9 +28,17 @@ from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
 from tools.train.pipeline.model_card import card, ship, write_card
 from tools.train.rl.vector_env import RolloutFailedError
-from tools.train.run.exported import ExportError, export_artifacts, model_argument
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import finish_network, import_start, read_network, start_network, weights_before
+from tools.train.run.network_file import (
+    ExportError,
+    export_artifacts,
+    finish_network,
+    import_start,
+    model_argument,
+    read_network,
+    start_network,
+    weights_before,
+)
 from tools.train.run.run_dir import RunDir
 from tools.train.samples.delays import Delays
 

@@ -13,8 +13,7 @@ from tools.train.config.recipe import load_recipe
 from tools.train.pipeline.budget import Line, budget_of, lines_of
 from tools.train.pipeline.chain import steps_of
 from tools.train.run.curves import draw_curves, panels_of, smoothed
-from tools.train.run.job import PlainProgress
-from tools.train.run.progress_display import StageBar
+from tools.train.run.job import PlainProgress, StageBar
 from tools.train.run.run_dir import RunDir
 
 TINY = load_recipe("tiny")

@@ -20,6 +20,7 @@ from edge.state.semantic import SemanticState
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
+from tools.train.drives.scenarios import FIRST_SEED
 from tools.train.rl import worker as rl_worker
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, PolicyOutput
 from tools.train.rl.vector_env import split
@@ -33,7 +34,6 @@ from tools.train.rl.worker import (
     drive_episode,
     scenarios,
 )
-from tools.train.scenes.scenarios import FIRST_SEED
 
 TIMES = LatencyProfile("some", "drawn", (1.0, 2.0, 3.0))
 ORDER = RolloutOrder("", "", {}, 0, "", "out", 9003, (0, 1, 0, 1, 0), {}, TIMES, True, "none", 10.0, 7)

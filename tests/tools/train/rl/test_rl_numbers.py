@@ -17,7 +17,7 @@ from edge.motion.controller import arc_to, scale_to_limits
 from firmware_bridge.core.config import LimitsConfig
 from sim_hil.benchmark.policies.select import robot_config
 from tools.train.config.rl import PpoConfig
-from tools.train.rl.command_policy import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
+from tools.train.rl.action_tail import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
 from tools.train.rl.ppo import PpoOptimiser, PpoStats, advantages
 
 pytestmark = pytest.mark.usefixtures("one_thread")

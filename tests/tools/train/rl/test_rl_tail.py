@@ -16,7 +16,9 @@ from tools.train.config.checks import TrainError
 from tools.train.config.rl import PpoConfig
 from tools.train.rl import rollout
 from tools.train.rl.action_tail import (
+    CommandLimits,
     check_tail,
+    command_mean,
     freeze_all_but_tail,
     load_tail,
     now_of,
@@ -26,7 +28,6 @@ from tools.train.rl.action_tail import (
     tail,
     tail_parameters,
 )
-from tools.train.rl.command_policy import CommandLimits, command_mean
 from tools.train.rl.ppo import PpoOptimiser, TailLearner
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps
 

@@ -22,6 +22,7 @@ from sim_hil.benchmark.conditions.latency import Timing
 from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
 from tests.support.train.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.config.sft import DrawConfig
+from tools.train.drives.trace_sentences import aspects_of_json
 from tools.train.samples.anchors import (
     WAYPOINTS_START,
     Anchor,
@@ -34,7 +35,6 @@ from tools.train.samples.anchors import (
     too_far,
     waiting,
 )
-from tools.train.scenes.trace_sentences import aspects_of_json
 
 NANO = PRESETS["nano"]
 PERIOD_NS = 100_000_000

@@ -14,11 +14,11 @@ from edge.state.frame import fit_frame
 from edge.state.reasoning_text import format_text, parse_text
 from export.model.network import build
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.drives import trace_sentences as trace_words
 from tools.train.drives.drive import Drive
 from tools.train.samples.anchors import anchors_of
 from tools.train.samples.mirror import SecondsDataset, Views, mirrored, mirrored_reasoning, mirrored_text
 from tools.train.samples.tokens import TokenCache, encode
-from tools.train.scenes import trace_sentences as trace_words
 
 
 @pytest.mark.parametrize(

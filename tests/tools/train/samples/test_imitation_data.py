@@ -23,8 +23,7 @@ from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Sample
 from tools.train.samples.action_batch import Group
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames
-from tools.train.samples.kv_build import build_kv_cache
-from tools.train.samples.kv_cache import CachedState
+from tools.train.samples.kv_cache import CachedState, build_kv_cache
 
 TEN_S = Delays.uniform(DelayConfig())
 PLAIN = SampleConfig().undisturbed()

@@ -22,8 +22,7 @@ from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import Dataset
 from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import WAYPOINTS_START, Drawn, Prompts, anchors_of
-from tools.train.samples.kv_build import build_kv_cache, cache_key
-from tools.train.samples.kv_cache import KvCache
+from tools.train.samples.kv_cache import KvCache, build_kv_cache, cache_key
 
 CONTENT = NANO_TOKENIZER.read_bytes()
 TOKENS = MadeUpTokens()

@@ -13,8 +13,7 @@ from edge.reasoning.decoding_rules import LineConstraint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
-from tools.train.samples.greedy import decode
-from tools.train.samples.language_batch import IGNORED, Row, buckets, collate, row_losses, run
+from tools.train.samples.language_batch import IGNORED, Row, buckets, collate, decode, row_losses, run
 
 IMAGE = 5
 DEVICE = torch.device("cpu")

@@ -12,7 +12,7 @@ from edge.state.reasoning_text import format_text, parse_waypoints
 from tests.support.train.training_drives import drive
 from tools.train.config.sft import AROUND, ShowConfig
 from tools.train.samples.anchors import Anchor, anchors_of, waiting
-from tools.train.sft.language_augment import disturbed, shifted
+from tools.train.samples.augment import disturbed, shifted
 
 
 @pytest.fixture(scope="module")

@@ -23,10 +23,10 @@ from tools.train.collect.record import off_way_m
 from tools.train.config.checks import TrainError
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import Drive
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario
 from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import anchors_of
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario
 from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, relabel, relabel_along
 
 CONFIG = RelabelConfig(ways=2, tries=24)

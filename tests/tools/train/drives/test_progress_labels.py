@@ -15,8 +15,8 @@ from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
 from tools.train.config.collect import CORRIDOR, KINDS
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario
 
 Points = list[tuple[float, float]]
 

@@ -16,15 +16,17 @@ from sim_hil.scene.scene import Scene, load_scene
 from tests.support.train.training_scenarios import EACH, SEED, all_scenarios, scenarios
 from tools.demo import INSTRUCTION
 from tools.train.config.collect import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
-from tools.train.scenes.scenarios import (
+from tools.train.drives.scenarios import (
     FIRST_SEED,
     LEAST_WORDINGS,
     ScenarioError,
+    Site,
+    SiteError,
+    corridor,
     kind_of_group,
     scenario_group,
     training_episodes,
 )
-from tools.train.scenes.sites import Site, SiteError, corridor
 
 SUITE = load_suite("dynanav")
 

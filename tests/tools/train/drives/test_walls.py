@@ -16,15 +16,15 @@ from tests.support.train.train_drives import VAL_LAYOUT, MadeUpTokens, tiny_mode
 from tests.support.train.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive, trained
 from tools.train.config.imitate import DelayConfig, LossConfig, SampleConfig
 from tools.train.drives.drive import Drive
+from tools.train.drives.scenarios import Site
+from tools.train.drives.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
 from tools.train.imitate.data import Samples
 from tools.train.imitate.evaluation import plans_into_walls
-from tools.train.imitate.mirror_drives import mirrored_drive
 from tools.train.imitate.trainable_policies import plan_loss
 from tools.train.samples.action_batch import Group, collate
 from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.scenes.sites import Site
-from tools.train.scenes.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
+from tools.train.samples.mirror import mirrored_drive
 
 SCENES = Scenes()
 CPU = torch.device("cpu")

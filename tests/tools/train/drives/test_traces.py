@@ -32,9 +32,9 @@ from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
 from tools.train.config.collect import CORRIDOR, KINDS
-from tools.train.scenes import trace_sentences as trace_words
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.traces import PEOPLE_M, Tracer
+from tools.train.drives import trace_sentences as trace_words
+from tools.train.drives.scenarios import Scenario
+from tools.train.drives.traces import PEOPLE_M, Tracer
 
 NOBODY = (np.zeros((0, 3)), np.zeros((0, 2)))
 AHEAD = [(2.0, 0.0)]

@@ -32,9 +32,9 @@ from sim_hil.benchmark.language.task_checks import MIN_PIXELS, RANGE_INDOORS_M, 
 from sim_hil.benchmark.language.visibility import EYE_M, HFOV_RAD
 from sim_hil.scene.scene import SceneObject, Vec2, Vec3
 from sim_hil.simulation.camera import MOUNTS
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.trace_sentences import (
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario
+from tools.train.drives.trace_sentences import (
     MAX_OBJECTS,
     MAX_PEOPLE,
     five_aspects,
