@@ -34,16 +34,14 @@ from reporting.build_progress import duration, peak_rss_bytes
 from sim_hil.benchmark.runs import RunsError
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import VARIANTS, Recipe, load_recipe, recipe_names, stage_seed
-from tools.train.pipeline import budget, chain
+from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.pipeline.model_card import ship, write_card
 from tools.train.run.curves import draw_curves
-from tools.train.run.distributed import SINGLE, Ranks, leave, ranks_of_environment
+from tools.train.run.distributed import SINGLE, Ranks, computes_bf16, leave, ranks_of_environment
 from tools.train.run.job import StageFailedError, StageJob, StopFlag, progress_for
 from tools.train.run.network_file import START, ExportError, import_start
-from tools.train.run.optim import computes_bf16
-from tools.train.run.own_drives import take_drives
-from tools.train.run.run_dir import RunDir
+from tools.train.run.run_dir import RunDir, take_drives
 
 COMMAND: Final = "edge-train"
 COMMANDS: Final = (*chain.ALL, "all", "card")
@@ -162,9 +160,9 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
             raise TrainError("--drives belongs to stages, not to card")
         steps = [step for step in steps if step.stage != "collect" or not args.dry_run]
     if args.dry_run:
-        plan = budget.budget_of(recipe, steps, args.device)
-        sys.stderr.write("\n".join(budget.lines_of(recipe, steps, plan, args.device)) + "\n")
-        return {"command": args.command, "recipe": recipe.name, "budget": budget.as_json(plan)}
+        plan = chain.budget_of(recipe, steps, args.device)
+        sys.stderr.write("\n".join(chain.lines_of(recipe, steps, plan, args.device)) + "\n")
+        return {"command": args.command, "recipe": recipe.name, "budget": chain.as_json(plan)}
     if args.out is None:
         raise TrainError("--out is missing: expected the folder of the run, e.g. --out out/run")
     if args.command == "card":

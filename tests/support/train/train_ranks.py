@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from tools.train.config.optim import OptimConfig
+from tools.train.config.checks import OptimConfig
 from tools.train.run.distributed import BatchOrder, Ranks, leave, ranks_of_environment
-from tools.train.run.optim import Optimiser
+from tools.train.run.loop import Optimiser
 
 SAMPLES, BATCH, EPOCHS = 50, 8, 3
 

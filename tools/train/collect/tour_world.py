@@ -27,14 +27,14 @@ from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.crowd.people import UPDATE_HZ, People
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.simulation.camera import CameraWorld
-from tools.train.collect.detour import DetourProgress, draw_detour
 from tools.train.collect.record import CameraSettings, NothingToLearnError, Recorded
+from tools.train.collect.steering import DetourProgress, draw_detour
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
 from tools.train.drives.scenarios import Scenario, Site
 from tools.train.drives.trace_sentences import aspects_json
 from tools.train.drives.traces import Tracer, turning_first
-from tools.train.encoder.poses import body_state
+from tools.train.encoder.worker import body_state
 from tools.train.samples.augment import encoded
 
 Array = NDArray[np.float64]

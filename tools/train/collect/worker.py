@@ -23,7 +23,6 @@ from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.workers.worker_process import Message, worker_main
 from sim_hil.scene.scene import SceneError
-from tools.train.collect.detour import draw_detour
 from tools.train.collect.record import (
     CameraSettings,
     DrivePlan,
@@ -32,7 +31,7 @@ from tools.train.collect.record import (
     TraceAt,
     record,
 )
-from tools.train.collect.steering import PolicyDriver, PolicyOptions, SteeringNoise, Velocity
+from tools.train.collect.steering import PolicyDriver, PolicyOptions, SteeringNoise, Velocity, draw_detour
 from tools.train.collect.tour_world import TourWorld, record_tour
 from tools.train.config.collect import RATE_HZ, SHARES, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry

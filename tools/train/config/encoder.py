@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Final
 
-from tools.train.config.checks import Checked, Count, Fraction, Jobs, Natural, Quality, Range, Share
+from tools.train.config.checks import Checked, Count, Fraction, Jobs, Natural, OptimConfig, Quality, Range, Share
 from tools.train.config.collect import CORRIDOR, KINDS
-from tools.train.config.optim import OptimConfig
 
 MOST_SCENES: Final = 50_000
 """Upper limit of scenes per split; a layout that cannot be built is replaced by the one this many further on."""

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, TypeAlias
 
-from tools.train.config.checks import Checked, Count, Fraction, Natural, Range, Share
+from tools.train.config.checks import Checked, Count, Fraction, Natural, OptimConfig, Range, Share
 from tools.train.config.collect import TRACE_EVERY
-from tools.train.config.optim import OptimConfig
 from tools.train.config.sft import DrawConfig
 
 TIC_VLA, POINT_GOAL = "tic-vla", "point-goal"

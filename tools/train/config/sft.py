@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Final, TypeAlias
 
-from tools.train.config.checks import Checked, Count, Fraction, Natural, Positive, Range, Share
+from tools.train.config.checks import Checked, Count, Fraction, Natural, OptimConfig, Positive, Range, Share
 from tools.train.config.collect import TourConfig
-from tools.train.config.optim import OptimConfig
 
 Deviation: TypeAlias = Annotated[float, Range(0)]
 AROUND: Final = 3

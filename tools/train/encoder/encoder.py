@@ -23,14 +23,12 @@ from export.model.network import TicVla
 from tools.train.config.checks import TrainError
 from tools.train.config.encoder import EncoderConfig
 from tools.train.encoder.data import FrameSet, fill, frames_sha256, plan
-from tools.train.encoder.heads import Balance, EncoderHeads, as_tensors, losses, total
+from tools.train.encoder.heads import Balance, EncoderHeads, Fixed, Score, as_tensors, decide, losses, total
 from tools.train.encoder.labels import COLUMNS, PIXELS, mirrored_label
-from tools.train.encoder.score import Fixed, Score, decide
-from tools.train.run.distributed import BatchOrder
+from tools.train.run.distributed import BatchOrder, autocast
 from tools.train.run.job import StageJob
-from tools.train.run.loop import Ahead, TrainingLoop
+from tools.train.run.loop import Ahead, Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, start_network
-from tools.train.run.optim import Optimiser, autocast
 from tools.train.samples.augment import augmented
 from tools.train.samples.tokens import encoder_sha256
 

@@ -19,7 +19,7 @@ from export.model.network import TicVla
 from tools.train.config.imitate import POINT_GOAL, DelayConfig, ImitateConfig, SampleConfig
 from tools.train.drives.drive import Dataset
 from tools.train.drives.walls import Scenes
-from tools.train.imitate.data import NoStates, SampleError, Samples, Source, States
+from tools.train.imitate.data import Delays, NoStates, SampleError, Samples, Source, States
 from tools.train.imitate.evaluation import evaluate
 from tools.train.imitate.trainable_policies import (
     ActionExpertPolicy,
@@ -29,13 +29,12 @@ from tools.train.imitate.trainable_policies import (
     build_point_goal,
     save_point_goal,
 )
+from tools.train.run.distributed import autocast
 from tools.train.run.job import StageJob
-from tools.train.run.loop import Ahead, TrainingLoop
+from tools.train.run.loop import Ahead, Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.run.optim import Optimiser, autocast
-from tools.train.run.own_drives import drives_after
+from tools.train.run.run_dir import drives_after
 from tools.train.samples.action_batch import Group, collate
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.kv_cache import SEEN_PARTS, KvCache, build_kv_cache, parts_sha256
 from tools.train.samples.language_batch import FrameTokens
@@ -57,7 +56,7 @@ def run(job: StageJob) -> dict[str, Any]:
     Raises TrainError, SampleError, LatencyError.
     """
     config = job.recipe.imitate
-    dataset = drives_after(job, STAGE)
+    dataset = drives_after(job.run_dir, job.recipe, STAGE)
     network, share = _start(job, config)
     tokens = _encoded(job, TokenCache(dataset, network.vision), dataset.ids)
     seconds: TokenCache | None = None

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final
+from typing import Any
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
 from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Entry
-from tools.train.importers import gnd, scand
 from tools.train.importers.cut import drives
-
-LAYOUTS: Final[Mapping[str, ModuleType]] = {scand.KIND: scand, gnd.KIND: gnd}
+from tools.train.importers.recording import LAYOUTS
 
 EXAMPLES = """examples:
   python -m tools.train.importers scand extracted/scand --robot jackal --out data/real
@@ -31,13 +27,13 @@ def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, A
 
     Raises TrainError, OSError.
     """
-    module = LAYOUTS[layout]
-    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and module.is_recording(folder))
+    form = LAYOUTS[layout]
+    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and form.fits(folder))
     if not folders:
-        raise TrainError(f"{root}: found no recording of {layout}; {module.__name__} describes its folders")
+        raise TrainError(f"{root}: found no recording of {layout}; expected folders with {' and '.join(form.files)}")
     with DatasetWriter(out) as writer:
         for folder in folders:
-            for drive in drives(module.read(folder), layout, robot):
+            for drive in drives(form.read(folder), layout, robot):
                 if not writer.has(drive.id):
                     path = writer.path(drive.id)
                     drive.save(path)

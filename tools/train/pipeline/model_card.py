@@ -21,8 +21,7 @@ from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.pipeline.chain import ADOPTED, GO_ON
 from tools.train.run.network_file import CARD, START, START_CARD, read_network, stage_weights
-from tools.train.run.own_drives import IMPORTED
-from tools.train.run.run_dir import VERSIONS, RunDir
+from tools.train.run.run_dir import IMPORTED, VERSIONS, RunDir
 
 _HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # Markdown has six levels
 _THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."

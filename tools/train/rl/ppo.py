@@ -136,7 +136,7 @@ class Learner(ABC):
         return values
 
     def estimates(self, *, gamma: float, lam: float, reward_scale: float, batch: int = 256) -> tuple[Tensor, Tensor]:
-        """Estimate advantages and returns [S] of the rollout with the current value network; rewards are scaled first."""
+        """Estimate advantages and returns [S] of the rollout with the current value network, after scaling rewards."""
         if self._rollout is None:
             raise RuntimeError("estimates: expected a rollout to be taken first")
         t, device = self._tensors, self.log_std.device

@@ -34,10 +34,16 @@ from tools.train.imitate.trainable_policies import build_point_goal, save_point_
 from tools.train.rl.action_tail import CommandLimits, check_tail
 from tools.train.rl.ppo import Learner, PointGoalLearner, PpoOptimiser, TailLearner
 from tools.train.rl.rollout import Rollout
-from tools.train.rl.vector_env import drive
-from tools.train.rl.worker import RolloutOrder
-from tools.train.run import checkpoint
+from tools.train.rl.worker import RolloutOrder, drive
 from tools.train.run.job import StageFailedError, StageJob
+from tools.train.run.loop import (
+    load_checkpoint,
+    optimiser_tensors,
+    restore_optimiser,
+    save_checkpoint,
+    under,
+    with_prefix,
+)
 from tools.train.run.network_file import (
     START,
     export_artifacts,
@@ -101,7 +107,7 @@ class State:
     def write_policy(self) -> Path:
         """Write the current policy for the workers and return its path."""
         log_std = [float(v) for v in self._learner.log_std.detach().clamp(*LOG_STD_RANGE)]
-        checkpoint.save(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
+        save_checkpoint(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
         return self._policy
 
     def begin(self) -> None:
@@ -130,17 +136,17 @@ class State:
         """Write the checkpoint of the finished iteration."""
         learner, optimiser = self._learner, self.optimiser
         tensors = {
-            **checkpoint.with_prefix("policy", learner.policy_tensors()),
-            **checkpoint.with_prefix("start", self._kept["start"]),
-            **checkpoint.with_prefix("best", self._kept["best"]),
-            **checkpoint.with_prefix("value", learner.network.value.state_dict()),
-            **checkpoint.with_prefix("actor", checkpoint.optimiser_tensors(optimiser.actor)),
-            **checkpoint.with_prefix("critic", checkpoint.optimiser_tensors(optimiser.critic)),
+            **with_prefix("policy", learner.policy_tensors()),
+            **with_prefix("start", self._kept["start"]),
+            **with_prefix("best", self._kept["best"]),
+            **with_prefix("value", learner.network.value.state_dict()),
+            **with_prefix("actor", optimiser_tensors(optimiser.actor)),
+            **with_prefix("critic", optimiser_tensors(optimiser.critic)),
             "log_std": learner.log_std.detach(),
         }
         scores = {name: asdict(score) for name in ("first", "best") if (score := getattr(self, name)) is not None}
         meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved, **scores}
-        checkpoint.save(self._path, tensors, meta)
+        save_checkpoint(self._path, tensors, meta)
 
     def load(self) -> None:
         """Resume from the checkpoint if requested and present. Raises TrainError for another run's checkpoint."""
@@ -148,15 +154,15 @@ class State:
             self._job.run_dir.rewind(STAGE, -1)
             shutil.rmtree(self._path.parent / ROLLOUTS, ignore_errors=True)
             return
-        tensors, meta = checkpoint.load(self._path)
+        tensors, meta = load_checkpoint(self._path)
         if meta["key"] != self._key:
             raise TrainError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
         learner, optimiser = self._learner, self.optimiser
-        learner.load_policy(checkpoint.under("policy", tensors))
-        self._kept = {name: checkpoint.under(name, tensors) for name in ("start", "best")}
-        learner.network.value.load_state_dict(checkpoint.under("value", tensors))
-        checkpoint.restore_optimiser(optimiser.actor, checkpoint.under("actor", tensors))
-        checkpoint.restore_optimiser(optimiser.critic, checkpoint.under("critic", tensors))
+        learner.load_policy(under("policy", tensors))
+        self._kept = {name: under(name, tensors) for name in ("start", "best")}
+        learner.network.value.load_state_dict(under("value", tensors))
+        restore_optimiser(optimiser.actor, under("actor", tensors))
+        restore_optimiser(optimiser.critic, under("critic", tensors))
         learner.log_std.data.copy_(tensors["log_std"])
         self.iteration, self.steps, self.improved = int(meta["iteration"]), int(meta["steps"]), bool(meta["improved"])
         self.first, self.best = _score(meta.get("first")), _score(meta.get("best"))

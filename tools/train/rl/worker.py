@@ -10,9 +10,10 @@ exactly.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +32,7 @@ from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.gym_env import DynaNavEnv
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
+from sim_hil.benchmark.workers.worker_pool import Workers
 from sim_hil.benchmark.workers.worker_process import Message, worker_main
 from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.drives.scenarios import FIRST_SEED, Scenario, training_episodes
@@ -38,8 +40,11 @@ from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl import rollout
 from tools.train.rl.action_tail import CommandLimits, check_tail, load_tail
 from tools.train.rl.policies import Models, PointGoalRolloutPolicy, RolloutPolicy, TailPolicy
-from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, goal_features
-from tools.train.run import checkpoint
+from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, Rollout, goal_features, read
+from tools.train.run.job import StageFailedError
+from tools.train.run.loop import (
+    load_checkpoint,
+)
 from tools.train.run.network_file import read_network
 
 MODULE: Final = "tools.train.rl.worker"
@@ -97,7 +102,7 @@ def messages(content: Message) -> Iterator[Message]:
     order = RolloutOrder.of_json(content)
     limits = robot_config().limits
     network = read_network(Path(order.network), config_from_dict(order.model), order.network_seed).eval()
-    tensors, meta = checkpoint.load(Path(order.policy))
+    tensors, meta = load_checkpoint(Path(order.policy))
     log_std = (float(meta["log_std"][0]), float(meta["log_std"][1])) if order.explore else None
     options = DriveOptions(network.config.vision.image_px, log_std, order.drift, order.max_s)
     policies = _tail_policies(order, network, tensors) if order.artifacts else _point_goal_policies(network, tensors)
@@ -294,6 +299,63 @@ def _is_stuck(recent_xy: deque[tuple[float, float]]) -> bool:
         return False
     xy = np.array(recent_xy)
     return float(np.hypot(*(xy - xy[-1]).T).max()) < STUCK_M
+
+
+COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
+_POLL_S: Final = 0.5
+
+
+def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
+    """Split an order into orders of at most `per_job` episodes, each with its own file below `order.out`.
+
+    Each part keeps the position of its episodes in the whole order, so that every episode has its own random seed.
+    """
+    return [
+        replace(
+            order,
+            numbers=order.numbers[first : first + per_job],
+            first=order.first + first,
+            out=str(Path(order.out) / f"{first // per_job:03d}.safetensors"),
+        )
+        for first in range(0, len(order.numbers), per_job)
+    ]
+
+
+def drive(
+    order: RolloutOrder,
+    *,
+    jobs: int,
+    per_job: int,
+    finished: Callable[[bool], None] = lambda success: None,
+    stopped: Callable[[], bool] = lambda: False,
+    command: Sequence[str] = COMMAND,
+) -> Rollout:
+    """Drive an order's episodes; files of jobs that have finished before are reused.
+
+    `finished` takes for each episode whether it succeeded. The number of jobs does not change the result. Raises
+    StageFailedError, KeyboardInterrupt when `stopped`.
+    """
+    folder = Path(order.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    orders = split(order, per_job)
+    waiting = [part for part in orders if not Path(part.out).is_file()]
+    workers = Workers(command, jobs or len(os.sched_getaffinity(0)))
+    try:
+        while waiting or workers.running():
+            if stopped():
+                raise KeyboardInterrupt
+            while waiting and workers.free():
+                part = waiting.pop(0)
+                stem = Path(part.out).stem
+                workers.start(stem, part.to_json(), folder / f"{stem}.log")
+            for line in workers.wait(_POLL_S):
+                if line.message is not None:
+                    finished(bool(line.message["success"]))
+                elif line.why:
+                    raise StageFailedError(f"rollout {line.key}: {line.why}")
+    finally:
+        workers.close()
+    return read([Path(part.out) for part in orders])
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import cache
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -178,3 +179,18 @@ def _gradient(parameter: torch.nn.Parameter) -> torch.Tensor:
 
 def _device() -> str:
     return "cuda" if dist.get_backend() == "nccl" else "cpu"
+
+
+def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
+    """Return a context for bfloat16 if `bf16` is set and the device supports it, else for float32."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, dtype=torch.bfloat16) if bf16 and computes_bf16(kind) else nullcontext()
+
+
+@cache
+def computes_bf16(device: str) -> bool:
+    """Return whether the device has bfloat16 instructions: emulation takes twelve times as long as float32."""
+    if torch.device(device).type != "cpu":
+        return True
+    found = torch.cpu.get_capabilities()
+    return any(found.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))

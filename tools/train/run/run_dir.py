@@ -1,4 +1,4 @@
-"""The folder of a training run: recipe, versions, one folder per stage, the log and the weights."""
+"""The folder of a training run: recipe, versions, one folder per stage, the log, the weights, and the run's drives."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +17,9 @@ from export import model
 from sim_hil.benchmark.workers.code_version import code_sha256
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
-from tools.train.run.optim import computes_bf16
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.drives.drive import Dataset
+from tools.train.run.distributed import computes_bf16
 
 VERSIONS: Final = "versions.json"
 TIMINGS: Final = "timings.json"
@@ -204,3 +207,51 @@ def _training_sha256() -> str:
             digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+_PARTIAL: Final = "collect.partial"
+IMPORTED: Final = "imported"
+"""Key in the result of `collect`: the drives were imported."""
+
+
+def prefixes_of(round_number: int) -> tuple[str, str]:
+    """Return the id prefixes of a round's drives, the policy's and the expert's; rounds count from 1."""
+    return f"d{round_number}-", f"n{round_number}-"
+
+
+def drives_after(run_dir: RunDir, recipe: Recipe, stage: str) -> Dataset:
+    """Return the drives that a stage trains on: all, or those of the newest round (`dagger.newest_only`)."""
+    dataset, rounds = Dataset.open(run_dir.stage("collect")), run_dir.retired(stage)
+    return dataset.of(*prefixes_of(rounds)) if rounds and recipe.dagger.newest_only else dataset
+
+
+def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
+    """Import the data set in `folder` as the result of the run's stage `collect`; files are hard-linked if possible.
+
+    An interrupted call leaves no drives. Returns the stage's result. Raises TrainError for a damaged data set,
+    TrainError if the run has other drives.
+    """
+    dataset = Dataset.open(folder)
+    done = run_dir.result("collect")
+    if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
+        return done
+    if run_dir.begun("collect"):
+        raise TrainError(f"--drives {folder}: {run_dir.out} has other drives; name another --out")
+    Dataset.open(folder, verify=True)
+    partial = run_dir.out / _PARTIAL
+    shutil.rmtree(partial, ignore_errors=True)
+    with DatasetWriter(partial) as writer:
+        for entry in dataset.entries:
+            _link_or_copy(dataset.path(entry.id).resolve(), writer.path(entry.id))
+            writer.add(entry)
+        result = {IMPORTED: True, **writer.summary(""), "sha256": writer.finish().sha256}
+    run_dir.finish(_PARTIAL, result)
+    partial.replace(run_dir.out / "collect")
+    return result
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copyfile(source, target)

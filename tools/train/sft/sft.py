@@ -19,16 +19,15 @@ from tokenizers import Tokenizer
 from edge.state.reasoning_text import format_text
 from export.checkpoint import tokenizer_for
 from export.model.network import TicVla
-from tools.train.collect.tours import build_tours, tour_anchors
-from tools.train.config.checks import TrainError
-from tools.train.config.optim import OptimConfig
+from tools.train.collect.collection import build_tours, tour_anchors
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig
 from tools.train.drives.drive import Dataset
+from tools.train.run.distributed import autocast
 from tools.train.run.job import StageJob
-from tools.train.run.loop import TrainingLoop
+from tools.train.run.loop import Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.run.optim import Optimiser, autocast
-from tools.train.run.own_drives import drives_after
+from tools.train.run.run_dir import drives_after
 from tools.train.samples.anchors import Anchor, Prompts, anchors_of, draw, waiting
 from tools.train.samples.augment import disturbed, shifted
 from tools.train.samples.kv_cache import parts_sha256
@@ -121,7 +120,7 @@ def run(job: StageJob) -> dict[str, Any]:
     Raises TrainError.
     """
     config = job.recipe.sft
-    dataset = drives_after(job, STAGE)
+    dataset = drives_after(job.run_dir, job.recipe, STAGE)
     network, epochs, optim = _start(job, config)
     plain = TokenCache(dataset, network.vision)
     mirror: TokenCache | None = None

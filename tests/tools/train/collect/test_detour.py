@@ -9,7 +9,7 @@ import pytest
 
 from sim_hil.benchmark.language.openings import Frame
 from tests.support.train.training_scenarios import all_scenarios, scenarios
-from tools.train.collect.detour import Detour, draw_detour, wrong_opening
+from tools.train.collect.steering import Detour, draw_detour, wrong_opening
 from tools.train.drives.scenarios import Scenario
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,6 @@ from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tools.train.collect import record as recording
-from tools.train.collect.detour import Detour
 from tools.train.collect.record import (
     CameraSettings,
     DrivePlan,
@@ -29,7 +28,7 @@ from tools.train.collect.record import (
     off_way_m,
     record,
 )
-from tools.train.collect.steering import Velocity
+from tools.train.collect.steering import Detour, Velocity
 from tools.train.config.collect import CollectConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
 from tools.train.drives.futures import relative

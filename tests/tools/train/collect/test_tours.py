@@ -17,10 +17,9 @@ from edge.core.geometry import SE2
 from sim_hil.benchmark.policies.expert import driving_of
 from tests.support.train.train_drives import made_up_drive, write_dataset
 from tests.support.train.training_scenarios import progress_of, scenarios
-from tools.train.collect.collection import Collection
+from tools.train.collect.collection import Collection, build_tours, tour_anchors
 from tools.train.collect.record import CameraSettings, Recorded
 from tools.train.collect.tour_world import KinematicBase, TourWorld, record_tour
-from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.collect.worker import messages
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, TourConfig

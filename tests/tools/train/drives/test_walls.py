@@ -18,11 +18,10 @@ from tools.train.config.imitate import DelayConfig, LossConfig, SampleConfig
 from tools.train.drives.drive import Drive
 from tools.train.drives.scenarios import Site
 from tools.train.drives.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
-from tools.train.imitate.data import Samples
+from tools.train.imitate.data import Delays, Samples
 from tools.train.imitate.evaluation import plans_into_walls
 from tools.train.imitate.trainable_policies import plan_loss
 from tools.train.samples.action_batch import Group, collate
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.mirror import mirrored_drive
 

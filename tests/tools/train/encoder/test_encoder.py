@@ -15,9 +15,8 @@ from export.model.network import build
 from tests.support.train.train_drives import tiny_model
 from tests.support.train.train_encoder_rank import CONFIG, encoder_job
 from tests.support.train.train_stage_contract import Run, StageContract
-from tools.train.config.checks import TrainError
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.encoder import EncoderConfig, FramesConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.encoder.encoder import budget, run
 from tools.train.run import optim

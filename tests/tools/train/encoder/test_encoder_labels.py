@@ -38,7 +38,7 @@ from tools.train.encoder.labels import (
     label_shapes,
     mirrored_label,
 )
-from tools.train.encoder.poses import quaternion_xyzw
+from tools.train.encoder.worker import quaternion_xyzw
 
 SIDE = 8
 AWAY = (-1e5, -1e5, 0.0)

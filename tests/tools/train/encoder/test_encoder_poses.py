@@ -13,7 +13,7 @@ from sim_hil.robots.go2.body import rotation_matrix
 from sim_hil.scene.nav_grid import NavGrid
 from tests.tools.train.encoder.test_encoder_labels import SCENE
 from tools.train.encoder import poses as encoder_poses
-from tools.train.encoder.poses import Poses, body_state, quaternion_xyzw
+from tools.train.encoder.worker import Poses, body_state, quaternion_xyzw
 
 PEOPLE = np.array([(1.0, 0.0, 0.0), (4.0, -1.0, 0.0), (10.0, 1.0, 0.0)])
 NOBODY = np.zeros((0, 3))

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from tests.tools.train.encoder.test_encoder_heads import perfect, some_labels
-from tools.train.encoder.heads import as_tensors
+from tools.train.encoder.heads import Fixed, Score, as_tensors, decide
 from tools.train.encoder.labels import CLASSES, LANDMARK, NONE, PERSON
-from tools.train.encoder.score import Fixed, Score, decide
 
 SIDE = 8
 MACHINE = CLASSES.index("vending_machine")

@@ -18,9 +18,8 @@ from export.model.network import build
 from tests.support.train.train_drives import MadeUpTokens, tiny_model
 from tests.support.train.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, trained
 from tests.support.train.train_stage_contract import Run, StageContract
-from tools.train.config.checks import TrainError
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.imitate import POINT_GOAL, ImitateConfig, ImitateEvalConfig, SampleConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates, SampleError

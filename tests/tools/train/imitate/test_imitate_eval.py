@@ -13,10 +13,9 @@ from tests.support.train.train_drives import MadeUpTokens, tiny_model
 from tests.support.train.train_imitate_rank import SideStates, side_dataset
 from tools.train.config.imitate import DelayConfig, ImitateEvalConfig, SampleConfig
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import Samples
+from tools.train.imitate.data import Delays, Samples
 from tools.train.imitate.evaluation import draw_errors, evaluate, keep_state, to_waypoints
 from tools.train.samples.action_batch import ActionBatch
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 
 CPU = torch.device("cpu")

@@ -13,10 +13,9 @@ from tests.support.train.train_drives import MadeUpTokens, tiny_model
 from tests.support.train.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive
 from tools.train.config.imitate import DelayConfig, SampleConfig
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import Samples
+from tools.train.imitate.data import Delays, Samples
 from tools.train.imitate.imitate import run
 from tools.train.samples.anchors import anchors_of
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
 from tools.train.samples.mirror import (
     MIRROR,

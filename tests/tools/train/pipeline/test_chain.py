@@ -24,10 +24,11 @@ from tools.train.collect.collection import CollectFailedError
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig
 from tools.train.config.recipe import Recipe, load_recipe
+from tools.train.imitate.data import Delays
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
 from tools.train.pipeline.model_card import card, ship, write_card
-from tools.train.rl.vector_env import RolloutFailedError
+from tools.train.rl.worker import RolloutFailedError
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import (
     ExportError,
@@ -40,7 +41,6 @@ from tools.train.run.network_file import (
     weights_before,
 )
 from tools.train.run.run_dir import RunDir
-from tools.train.samples.delays import Delays
 
 TINY = load_recipe("tiny")
 SCORE = {

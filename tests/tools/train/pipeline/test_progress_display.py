@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 from tools.train.config.recipe import load_recipe
-from tools.train.pipeline.budget import Line, budget_of, lines_of
-from tools.train.pipeline.chain import steps_of
+from tools.train.pipeline.chain import Line, budget_of, lines_of, steps_of
 from tools.train.run.curves import draw_curves, panels_of, smoothed
 from tools.train.run.job import PlainProgress, StageBar
 from tools.train.run.run_dir import RunDir

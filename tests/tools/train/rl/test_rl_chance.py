@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tools.train.rl.virtual_time_reasoner import START_NS, RolloutReasoner
 
 from edge.core.geometry import SE2
 from edge.inference.latency_profile import LatencyProfile
@@ -23,8 +24,6 @@ from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tools.train.drives.scenarios import FIRST_SEED
 from tools.train.rl import worker as rl_worker
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, PolicyOutput
-from tools.train.rl.vector_env import split
-from tools.train.rl.virtual_time_reasoner import START_NS, RolloutReasoner
 from tools.train.rl.worker import (
     CONTROL_S,
     CommandLimiter,
@@ -33,6 +32,7 @@ from tools.train.rl.worker import (
     delays,
     drive_episode,
     scenarios,
+    split,
 )
 
 TIMES = LatencyProfile("some", "drawn", (1.0, 2.0, 3.0))

@@ -14,8 +14,7 @@ from tools.train.drives.drive import Dataset
 from tools.train.pipeline.model_card import card
 from tools.train.run import own_drives
 from tools.train.run.network_file import START, import_start
-from tools.train.run.own_drives import take_drives
-from tools.train.run.run_dir import RunDir
+from tools.train.run.run_dir import RunDir, take_drives
 
 TINY = load_recipe("tiny")
 

@@ -17,13 +17,12 @@ import torch
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tests.support.train import train_ranks
-from tools.train.config.checks import TrainError
-from tools.train.config.optim import OptimConfig
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.run import checkpoint
 from tools.train.run.distributed import SINGLE, BatchOrder, Ranks
 from tools.train.run.job import StageJob
-from tools.train.run.optim import Optimiser, autocast, computes_bf16, learning_rate
+from tools.train.run.loop import Optimiser, autocast, computes_bf16, learning_rate
 from tools.train.run.run_dir import RunDir
 
 NANO = PRESETS["nano"]

@@ -10,7 +10,7 @@ import pytest
 
 from edge.inference.latency_profile import LatencyError, LatencyProfile
 from tools.train.config.imitate import DelayConfig
-from tools.train.samples.delays import Delays
+from tools.train.imitate.data import Delays
 
 
 def test_the_papers_delays_are_uniform_from_0_to_10_s() -> None:

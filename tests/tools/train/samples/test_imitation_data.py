@@ -19,9 +19,8 @@ from tests.support.train.train_imitate_rank import FRAMES, SideStates, side_data
 from tools.train.config.checks import TrainError
 from tools.train.config.imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
 from tools.train.drives.drive import NOISE, Dataset, Drive
-from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Samples, States
+from tools.train.imitate.data import Delays, NoStates, SampleChoice, SampleError, Samples, States
 from tools.train.samples.action_batch import Group
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames
 from tools.train.samples.kv_cache import CachedState, build_kv_cache
 

@@ -21,14 +21,12 @@ from tests.support.train.train_drives import MadeUpTokens, made_up_drive, small_
 from tests.support.train.train_sft_rank import CONFIG, sft_job, trained
 from tests.support.train.train_stage_contract import Run, StageContract
 from tests.support.train.training_scenarios import drive_along, scenarios
-from tools.train.config.checks import TrainError
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
 from tools.train.config.sft import RelabelConfig, SftConfig
 from tools.train.drives.drive import Dataset
-from tools.train.pipeline.budget import budget_of
-from tools.train.pipeline.chain import Step, run_step
+from tools.train.pipeline.chain import Step, budget_of, run_step
 from tools.train.run import optim
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import stage_weights
