@@ -348,7 +348,7 @@ def stop_flag() -> Iterator[StopFlag]:
     def note(_number: int, _frame: FrameType | None) -> None:
         if flag.asked:
             raise KeyboardInterrupt
-        flag.ask()
+        flag.asked = True
         sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; press again to stop immediately\n")
 
     before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {

@@ -116,7 +116,6 @@ def imitate_job(
 def trained(dataset: Dataset, job: StageJob) -> tuple[TicVla, dict[str, Any]]:
     """The network after `fit`, and its result."""
     network = build(job.recipe.model, 1)
-    assert job.recipe.imitate is not None
     policy = ActionExpertPolicy(network.action, job.recipe.imitate.loss)
     return network, fit(job, policy, dataset, MadeUpTokens(), SideStates(dataset), of="test")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from math import inf
 from typing import Annotated, TypeAlias, get_args, get_type_hints
 
@@ -43,7 +42,6 @@ Quality: TypeAlias = Annotated[int, Range(1, 100)]
 """JPEG quality."""
 
 
-@cache
 def ranges_of(config: type) -> dict[str, Range]:
     """Return the range of every field of a class that has one."""
     hints = get_type_hints(config, include_extras=True)

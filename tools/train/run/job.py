@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol, TextIO
 from zlib import crc32
@@ -83,15 +83,11 @@ class PlainProgress:
         sys.stderr.write(f"edge-train: {self._stage}: {line}\n")
 
 
+@dataclass
 class StopFlag:
-    """A flag that a signal handler sets and a stage reads between steps."""
+    """A flag that a signal handler sets: the running stage ends at its next step, with a checkpoint."""
 
-    def __init__(self) -> None:
-        self.asked = False
-
-    def ask(self) -> None:
-        """Request that the running stage ends at its next step, with a checkpoint."""
-        self.asked = True
+    asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -165,24 +161,11 @@ class StageBar(AbstractContextManager["StageBar"]):
         self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
 
 
-class _Lines(AbstractContextManager[StageProgress]):
-    """Context manager around a progress that needs no cleanup."""
-
-    def __init__(self, progress: StageProgress) -> None:
-        self._progress = progress
-
-    def __enter__(self) -> StageProgress:
-        return self._progress
-
-    def __exit__(self, *_: object) -> None:
-        return
-
-
 def progress_for(
     stage: str, *, quiet: bool = False, stream: TextIO | None = None
 ) -> AbstractContextManager[StageProgress]:
     """Return the progress display for a stage: a bar, lines, or with `quiet` nothing."""
     if quiet:
-        return _Lines(QuietProgress())
+        return nullcontext(QuietProgress())
     console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)
-    return StageBar(stage, console) if console.is_terminal else _Lines(PlainProgress(stage))
+    return StageBar(stage, console) if console.is_terminal else nullcontext(PlainProgress(stage))

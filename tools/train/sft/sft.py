@@ -35,7 +35,7 @@ from tools.train.samples.language_batch import Halves, LanguageBatch, Row, bucke
 from tools.train.samples.mirror import FOLDER as MIRRORED
 from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.samples.tokens import TokenCache
-from tools.train.sft.language_eval import evaluate, glance
+from tools.train.sft.language_eval import Speaker, evaluate, evaluate_epoch
 from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
@@ -181,21 +181,22 @@ def fit(
     content = _content(job, dataset, tokenizer, network, more)
     loop = TrainingLoop(job, STAGE, {"language": language}, optimiser, content, config.checkpoint_steps)
     questions = _held(held, config, job.seed)
+    speaker = Speaker(language, prompts, views.plain, config.evaluate)
 
     def losses(samples: Sequence[Sample]) -> torch.Tensor:
         batch = _batch(job, network, data, samples)
         with autocast(job.device, config.optim.bf16):
             return row_losses(language, batch)
 
-    def evaluate_epoch(step: int) -> dict[str, float]:
+    def scores(step: int) -> dict[str, float]:
         if step % per_epoch:
             return {}
         found = {"held_loss": mean_loss(job, network, held, questions)} if questions else {}
         if job.ranks.first:
-            found |= glance(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
+            found |= evaluate_epoch(speaker, held.anchors, config.evaluate, seed=job.seed)
         return found
 
-    numbers = loop.run(_shares(job, data, optimiser.step_count, per_epoch), losses, evaluate_epoch)
+    numbers = loop.run(_shares(job, data, optimiser.step_count, per_epoch), losses, scores)
     result: dict[str, Any] = {
         "steps": total,
         "anchors": len(data.anchors),
@@ -204,7 +205,7 @@ def fit(
         **numbers,
     }
     if job.ranks.first and held.anchors:
-        result["held_out"] = evaluate(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
+        result["held_out"] = evaluate(speaker, held.anchors, config.evaluate, seed=job.seed)
     return result
 
 

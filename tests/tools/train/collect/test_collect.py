@@ -19,7 +19,7 @@ from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.policies.select import robot_config
 from tests.support.train.train_fake_worker import BEGUN
 from tools.train.collect import collect, collection
-from tools.train.collect.collection import CollectFailedError, Collection, fill, job_count
+from tools.train.collect.collection import Collection, StageFailedError, fill, job_count
 from tools.train.collect.steering import PolicyOptions
 from tools.train.collect.worker import Draw, Order, messages
 from tools.train.config.checks import TrainError
@@ -127,19 +127,19 @@ def test_a_process_that_ends_badly_after_its_last_drive_costs_nothing(tmp_path: 
 
 def test_a_process_that_never_begins_ends_the_collection_with_its_last_words(tmp_path: Path, faulty: Faulty) -> None:
     faulty(deaf=True)
-    with pytest.raises(CollectFailedError, match=r"e00000 .* exit code 5: no hands"):
+    with pytest.raises(StageFailedError, match=r"e00000 .* exit code 5: no hands"):
         _collect(tmp_path, count=8)
 
 
 def test_a_refusal_ends_the_collection(tmp_path: Path, faulty: Faulty) -> None:
     faulty(refuse=True)
-    with pytest.raises(CollectFailedError, match="not these artifacts"):
+    with pytest.raises(StageFailedError, match="not these artifacts"):
         _collect(tmp_path, count=8)
 
 
 def test_when_most_drives_give_nothing_it_says_so_instead_of_going_on(tmp_path: Path, faulty: Faulty) -> None:
     faulty(drop=[f"e{number:05d}" for number in range(80)])
-    with pytest.raises(CollectFailedError, match="gave nothing to learn, the last: it left the way"):
+    with pytest.raises(StageFailedError, match="gave nothing to learn, the last: it left the way"):
         _collect(tmp_path, count=80)
 
 
@@ -153,7 +153,7 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
             opened.append(self)
 
     monkeypatch.setattr(collection, "Workers", Watched)
-    with pytest.raises(CollectFailedError):
+    with pytest.raises(StageFailedError):
         _collect(tmp_path)
     assert [workers.running() for workers in opened] == [0]
 

@@ -19,7 +19,7 @@ from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.encoder import EncoderConfig, FramesConfig
 from tools.train.config.recipe import Recipe
 from tools.train.encoder.encoder import budget, run
-from tools.train.run import optim
+from tools.train.run import distributed
 from tools.train.samples.tokens import encoder_sha256
 
 STEPS = 8
@@ -79,7 +79,6 @@ def test_the_result_names_the_encoder_that_was_left(tmp_path: Path) -> None:
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_encoder_rank"
-    error = TrainError
     other = dataclasses.replace(CONFIG, batch=7)
 
     def prepare(self, out: Path) -> list[str]:
@@ -97,7 +96,9 @@ def test_how_many_processes_render_makes_no_difference(tmp_path: Path, whole: Ru
 
 
 def test_bfloat16_gives_about_the_same_losses(tmp_path: Path, whole: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
+    monkeypatch.setattr(
+        distributed, "computes_bf16", lambda _device: True
+    )  # slowly, where there are no instructions for it
     half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
     losses = [line["loss"] for line in trained(tmp_path, config=half).lines if "lr" in line]
     expected = [line["loss"] for line in whole.lines if "lr" in line]

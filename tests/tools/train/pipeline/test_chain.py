@@ -20,7 +20,6 @@ from export.model.config_file import with_overrides
 from export.model.network import build
 from export.model.weights import WeightsInfo, save_weights
 from tools.train import cli
-from tools.train.collect.collection import CollectFailedError
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig
 from tools.train.config.recipe import Recipe, load_recipe
@@ -28,8 +27,8 @@ from tools.train.imitate.data import Delays
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
 from tools.train.pipeline.model_card import card, ship, write_card
-from tools.train.rl.worker import RolloutFailedError
-from tools.train.run.job import StageJob
+from tools.train.rl.worker import StageFailedError
+from tools.train.run.job import StageFailedError, StageJob
 from tools.train.run.network_file import (
     ExportError,
     export_artifacts,
@@ -69,6 +68,12 @@ def stage_that(leaves: str) -> Callable[[str], Callable[[StageJob], dict[str, An
         return run
 
     return stage
+
+
+def use(monkeypatch: pytest.MonkeyPatch, stage: Callable[[str], Callable[[StageJob], dict[str, Any]]]) -> None:
+    """Replace all stages."""
+    for name in chain.RUNS:
+        monkeypatch.setitem(chain.RUNS, name, stage(name))
 
 
 # The chain
@@ -286,7 +291,7 @@ def test_a_network_without_a_name_is_exported_by_its_numbers(tmp_path: Path) -> 
 @pytest.fixture
 def stages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages that do nothing but leave a file."""
-    monkeypatch.setattr(chain, "module_run", stage_that("file"))
+    use(monkeypatch, stage_that("file"))
 
 
 def run(*arguments: object) -> int:
@@ -355,7 +360,7 @@ def test_a_run_keeps_its_own_copy_of_a_devices_delays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     profile, out = tmp_path / "orin.json", tmp_path / "out"
-    monkeypatch.setattr(chain, "module_run", stage_that("weights"))
+    use(monkeypatch, stage_that("weights"))
     asked = ("imitate", "--preset", "tiny", "--out", out, "--delay-profile", profile)
     profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
     assert run(*asked) == EXIT_DONE
@@ -381,8 +386,8 @@ def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[s
     [
         (KeyboardInterrupt(), EXIT_INTERRUPTED),
         (ExportError("a gate failed"), EXIT_CHECK_FAILED),
-        (CollectFailedError("its process ended"), EXIT_CHECK_FAILED),
-        (RolloutFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (StageFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (StageFailedError("its process ended"), EXIT_CHECK_FAILED),
         (TrainError("no such drive"), EXIT_BAD_INPUT),
         (OSError("the disk is full"), EXIT_BAD_INPUT),
     ],
@@ -390,13 +395,13 @@ def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[s
 def test_a_stage_that_cannot_go_on_ends_with_its_code_and_a_line(
     error: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    monkeypatch.setattr(chain, "module_run", raising(error))
+    use(monkeypatch, raising(error))
     assert run("sft", "--preset", "tiny", "--out", tmp_path / "run") == code
     assert "Traceback" not in capsys.readouterr().err and RunDir(tmp_path / "run").result("sft") is None
 
 
 def test_a_bug_is_not_dressed_up_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chain, "module_run", raising(ValueError("shapes do not match")))
+    use(monkeypatch, raising(ValueError("shapes do not match")))
     with pytest.raises(ValueError, match="shapes"):
         run("sft", "--preset", "tiny", "--out", tmp_path / "run")
 

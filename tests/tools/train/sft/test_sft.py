@@ -27,7 +27,7 @@ from tools.train.config.recipe import load_recipe
 from tools.train.config.sft import RelabelConfig, SftConfig
 from tools.train.drives.drive import Dataset
 from tools.train.pipeline.chain import Step, budget_of, run_step
-from tools.train.run import optim
+from tools.train.run import distributed
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import stage_weights
 from tools.train.samples.anchors import Prompts, anchors_of
@@ -86,7 +86,6 @@ def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_sft_rank"
-    error = TrainError
     other = dataclasses.replace(CONFIG, batch=7)
 
     @pytest.fixture(autouse=True)
@@ -103,7 +102,9 @@ class TestStage(StageContract):
 def test_bfloat16_gives_about_the_same_losses(
     tmp_path: Path, dataset: Dataset, whole: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
+    monkeypatch.setattr(
+        distributed, "computes_bf16", lambda _device: True
+    )  # slowly, where there are no instructions for it
     half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
     job = sft_job(tmp_path, half)
     trained(dataset, job)
