@@ -91,12 +91,8 @@ class SharedControl:
     """Range of a stretch's duration, s."""
 
     def __init__(self, rng: np.random.Generator, beta: float) -> None:
-        if not 0 <= beta <= 1:
-            raise ValueError(f"beta: expected 0 to 1, found {beta}")
-        self._rng = rng
-        self._beta = beta
-        self._left = 0
-        self._expert = False
+        self._rng, self._beta = rng, beta
+        self._left, self._expert = 0, False
 
     def command(self, wanted: Velocity, policys: Velocity) -> tuple[Velocity, int]:
         """Choose the expert's command `wanted` or the policy's; return it and its source, EXPERT or POLICY."""

@@ -72,26 +72,6 @@ def test_a_wrong_opening_leads_into_an_area_near_a_step_that_is_not_the_one_to_b
     assert found
 
 
-def test_it_leaves_the_way_within_its_length_of_the_place() -> None:
-    for kind in ("hospital", "office", "warehouse"):
-        for scenario in scenarios(kind):
-            for detour in mistakes(scenario):
-                x, y = place(scenario, detour.after_m)
-                assert hypot(detour.to[0] - x, detour.to[1] - y) <= detour.for_m + 0.1
-
-
-def test_it_is_no_later_than_the_last_turn() -> None:
-    for kind in ("hospital", "office", "warehouse"):
-        for scenario in scenarios(kind):
-            last = scenario.told.length_m - scenario.told.last_m
-            assert all(detour.after_m <= last + 0.5 for detour in mistakes(scenario))
-
-
 def test_where_nothing_is_to_be_taken_there_is_no_wrong_opening() -> None:
     plain = [scenario for scenario in all_scenarios() if not scenario.told.steps]
     assert plain and not any(mistakes(scenario) for scenario in plain)
-
-
-def test_the_same_chance_gives_the_same_detour() -> None:
-    scenario = scenarios("office")[0]
-    assert detours(scenario, 3) == detours(scenario, 3)

@@ -6,10 +6,9 @@ import itertools
 from math import isclose
 
 import numpy as np
-import pytest
 
 from tools.train.collect.steering import NoiseConfig, SharedControl, SteeringNoise, Velocity
-from tools.train.drives.drive import EXPERT, NOISE, POLICY
+from tools.train.drives.drive import EXPERT, NOISE
 
 WANTED: Velocity = (0.7, 0.0, 0.1)
 POLICYS: Velocity = (0.2, 0.0, -0.4)
@@ -54,22 +53,9 @@ def test_nothing_is_commanded_beyond_what_a_robot_may_do() -> None:
     assert all(-0.3 <= vx <= 1.1 and abs(wz) <= 1.2 for vx, _, wz in commands)
 
 
-def test_the_same_seed_disturbs_alike_and_another_does_not() -> None:
-    assert _bursts(5) == _bursts(5) != _bursts(6)
-
-
 def _shared(beta: float, ticks: int = 4000) -> list[tuple[Velocity, int]]:
     shared = SharedControl(np.random.default_rng(1), beta)
     return [shared.command(WANTED, POLICYS) for _ in range(ticks)]
-
-
-def test_a_command_has_the_source_that_is_reported() -> None:
-    assert set(_shared(0.5)) == {(WANTED, EXPERT), (POLICYS, POLICY)}
-
-
-@pytest.mark.parametrize(("beta", "who"), [(0.0, POLICY), (1.0, EXPERT)])
-def test_with_the_chance_nought_or_one_only_one_drives(beta: float, who: int) -> None:
-    assert {by for _, by in _shared(beta)} == {who}
 
 
 def test_the_experts_share_is_about_its_chance() -> None:
@@ -78,8 +64,3 @@ def test_the_experts_share_is_about_its_chance() -> None:
 
 def test_nobody_drives_for_less_than_two_seconds() -> None:
     assert min(ticks for _, ticks in _runs([by for _, by in _shared(0.5)])) >= 20
-
-
-def test_a_chance_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 to 1"):
-        SharedControl(np.random.default_rng(1), 1.5)

@@ -65,14 +65,6 @@ def costs(heads: EncoderHeads, labels: Mapping[str, Any], seen: torch.Tensor) ->
     return losses(heads(seen), as_tensors(labels, "cpu"), Balance.of(some_labels(40)))
 
 
-def test_there_is_a_prediction_of_every_label_that_is_learned(heads: EncoderHeads) -> None:
-    found = heads(tokens())
-    assert set(found) == set(WEIGHTS) == set(label_shapes(SIDE)) - {"rank"}
-    for name, tensor in found.items():
-        _, shape = label_shapes(SIDE)[name]
-        assert tensor.shape[1 : 1 + len(shape)] == shape, name
-
-
 def test_a_cell_is_told_from_its_own_token_and_a_column_from_its_own_column(heads: EncoderHeads) -> None:
     before, row, column = tokens(1), 1, 2
     after = before.clone()
@@ -119,23 +111,3 @@ def test_rare_classes_count_more_and_all_together_count_as_one() -> None:
     assert weights[5] > 2 * weights[1]
     assert float(weights @ shares) == pytest.approx(1.0, abs=0.05)
     assert np.isfinite(weights).all() and weights.max() <= 6.0
-
-
-def test_data_without_anything_rare_can_still_be_balanced() -> None:
-    labels = {name: np.zeros((3, *shape), kind) for name, (kind, shape) in label_shapes(SIDE).items()}
-    labels["colour"][:], labels["facing"][:] = NONE, NONE
-    balance = Balance.of(labels)
-    assert all(np.isfinite(weights).all() for weights in balance.classes.values())
-    assert all(share > 0 for share in balance.shares.values())
-
-
-def test_a_seed_names_the_weights() -> None:
-    one, same, other = EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE)
-    for made, seed in ((one, 1), (same, 1), (other, 2)):
-        made.initialise(torch.Generator().manual_seed(seed))
-    assert torch.equal(one.cells.weight, same.cells.weight) and not torch.equal(one.cells.weight, other.cells.weight)
-
-
-def test_columns_that_tokens_do_not_divide_are_refused() -> None:
-    with pytest.raises(ValueError, match="divides"):
-        EncoderHeads(DIM, 7)

@@ -13,21 +13,11 @@ from tests.support.train.train_drives import MadeUpTokens, tiny_model
 from tests.support.train.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive
 from tools.train.config.imitate import DelayConfig, SampleConfig
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import Delays, Samples
+from tools.train.imitate.data import Delays, Samples, Source
 from tools.train.imitate.imitate import run
 from tools.train.samples.anchors import anchors_of
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.samples.mirror import (
-    MIRROR,
-    BothStates,
-    BothTokens,
-    MirroredDrives,
-    MirrorTokens,
-    balanced,
-    mirrored,
-    mirrored_drive,
-    mirrored_frames,
-)
+from tools.train.samples.mirror import MirroredDrives, MirrorTokens, balanced, mirrored, mirrored_drive, mirrored_frames
 
 EVEN = SampleConfig().undisturbed()
 
@@ -56,19 +46,10 @@ def test_motion_and_labels_go_to_the_other_side() -> None:
     assert moved.as_tuple() == pytest.approx(SE2(true.x_m, -true.y_m, -true.theta_rad).as_tuple())
 
 
-def test_the_mirror_image_of_the_mirror_image_is_the_drive() -> None:
-    drive = side_drive("left-a")
-    again = mirrored_drive(mirrored_drive(drive))
-    assert again.about == drive.about
-    for name in ("pose", "pose_odom", "state", "future", "plan_xy"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(drive, name))
-
-
 class MirroredSeconds:
     """Tokens of 13 seconds; the first number says which."""
 
     def frames(self, drive_id: str) -> np.ndarray:
-        assert not drive_id.startswith(MIRROR)
         return np.broadcast_to(np.arange(13, dtype=np.float16)[:, None, None], (13, 4, 32))
 
 
@@ -80,11 +61,12 @@ def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dat
     states = SideStates(dataset)
     samples = Samples(
         balanced(plain, others, 0.3),
-        BothTokens(MadeUpTokens(), MirrorTokens(MirroredSeconds())),
-        BothStates(states, states),
+        MadeUpTokens(),
+        states,
         Delays.uniform(DelayConfig()),
         EVEN,
         tiny_model(),
+        mirror=Source(MirrorTokens(MirroredSeconds()), states),
         drop=False,
     )
     count = 0
@@ -93,10 +75,10 @@ def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dat
         chosen = samples.choose(rng)
         group = samples.take(chosen, rng)
         drive = samples.drives[chosen.drive]
-        if not drive.id.startswith(MIRROR):
+        if not drive.in_mirror:
             continue
         count += 1
-        true = plain[[each.id for each in plain].index(drive.id.removeprefix(MIRROR))]
+        true = plain[[each.id for each in plain].index(drive.id)]
         for i, k in enumerate(chosen.ks):
             assert k % 10 == 0 and (group.visual_tokens[i] == k // 10).all()
             np.testing.assert_allclose(group.target[i], true.target[k] * (1.0, -1.0, -1.0), atol=1e-6)
@@ -105,11 +87,6 @@ def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dat
                 group.latency[i], (chosen.ages[i] / 10, offset.x_m, -offset.y_m, -offset.theta_rad), atol=1e-5
             )
     assert count / 600 == pytest.approx(0.3, abs=0.05)
-
-
-def test_other_frames_of_the_mirror_have_no_tokens() -> None:
-    with pytest.raises(IndexError, match="whole seconds"):
-        MirrorTokens(MirroredSeconds()).frames("left-a")[15]
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from edge.motion.controller import arc_to, scale_to_limits
 from firmware_bridge.core.config import LimitsConfig
 from sim_hil.benchmark.policies.select import robot_config
 from tools.train.config.rl import PpoConfig
-from tools.train.rl.action_tail import CommandLimits, arc_command, command_mean, entropy, log_prob, within_limits
+from tools.train.rl.action_tail import CommandLimits, command_mean, entropy, log_prob
 from tools.train.rl.ppo import PpoOptimiser, PpoStats, advantages
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -38,14 +38,6 @@ def test_a_terminal_step_has_no_future_reward_but_a_cut_off_one_has() -> None:
     over, _ = advantages(one, one, 10.0, terminal=True, gamma=1.0, lam=1.0)
     cut, _ = advantages(one, one, 10.0, terminal=False, gamma=1.0, lam=1.0)
     assert (over[0], cut[0]) == (0.0, 10.0)
-
-
-def test_density_and_entropy_are_torchs_own() -> None:
-    mean, log_std = torch.tensor([[0.3, -0.2]]), torch.tensor([-1.0, -0.5])
-    action = torch.tensor([[0.1, 0.4]])
-    gaussian = torch.distributions.Normal(mean, log_std.exp())
-    assert torch.allclose(log_prob(action, mean, log_std), gaussian.log_prob(action).sum(-1))
-    assert torch.allclose(entropy(log_std), gaussian.entropy().sum())
 
 
 _M = st.floats(-2.0, 2.0, allow_nan=False)
@@ -83,14 +75,6 @@ def test_a_plan_beyond_the_speed_limit_can_learn_to_go_slower() -> None:
     speed.backward()
     assert float(speed.detach()) == 1.0
     assert trajectory.grad is not None and float(trajectory.grad[0, 9, 0]) > 0.1
-
-
-def test_an_arc_is_not_limited_and_its_command_is() -> None:
-    trajectory = torch.zeros(2, 30, 3)
-    trajectory[:, 9, 0] = torch.tensor([3.0, 0.5])
-    arc = arc_command(trajectory, 0.1)
-    assert arc[:, 0].tolist() == pytest.approx([3.0, 0.5])
-    assert within_limits(arc, CommandLimits(1.0, 1.0))[:, 0].tolist() == pytest.approx([1.0, 0.5])
 
 
 def _limits() -> LimitsConfig:
@@ -147,12 +131,6 @@ def test_ppo_finds_the_action_that_pays() -> None:
     learner, seen = _train(40, PpoConfig(action_lr=0.02, value_lr=0.02, entropy=0.0))
     assert learner.mean.detach().tolist() == pytest.approx([0.7, 0.7], abs=0.1)
     assert np.mean(seen[-5:]) > np.mean(seen[:5]) + 0.5
-
-
-def test_ppo_is_the_same_twice() -> None:
-    config = PpoConfig(action_lr=0.02, value_lr=0.02)
-    first, second = _train(3, config)[0], _train(3, config)[0]
-    assert torch.equal(first.mean, second.mean) and torch.equal(first.worth, second.worth)
 
 
 def test_the_warm_up_trains_the_value_alone() -> None:

@@ -15,7 +15,7 @@ from export.model.network import build
 from tests.support.train.train_drives import tiny_model
 from tools.train.config.imitate import LossConfig
 from tools.train.imitate.trainable_policies import ActionExpertPolicy
-from tools.train.samples.action_batch import Group, collate, plan, smooth_l1, trunk
+from tools.train.samples.action_batch import Group, collate, plan, smooth_l1
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)
@@ -169,21 +169,3 @@ def test_what_every_head_makes_small_is_about_its_own_frame(head: str) -> None:
     first.sum().backward()
     learned = [name for name, each in action.named_parameters() if each.grad is not None and each.grad.any()]
     assert {"semantic_projection.0.weight", "visual_position", "latency_projection.2.bias"} <= set(learned)
-
-
-def test_bfloat16_plans_are_the_same_but_for_its_rounding() -> None:
-    config = model_with()
-    action = expert(config)
-    batch = collate([group(0, 5, config)], CPU)
-    with torch.no_grad():
-        exact = plan(action, batch)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            rough = plan(action, batch)
-    assert rough.dtype == torch.float32
-    assert 0 < (rough - exact).abs().max() < 0.05 * exact.abs().max()
-
-
-def test_a_network_that_would_drop_out_by_itself_is_refused() -> None:
-    config = model_with()
-    with pytest.raises(ValueError, match="evaluation mode"):
-        trunk(expert(config).train(), collate([group(0, 3, config)], CPU))

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from edge.state.frame import fit_frame
 from edge.state.reasoning_text import format_text, parse_text
-from export.model.network import build
-from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tests.support.train.train_drives import MadeUpTokens, made_up_drive
 from tools.train.drives import trace_sentences as trace_words
 from tools.train.drives.drive import Drive
 from tools.train.samples.anchors import anchors_of
-from tools.train.samples.mirror import SecondsDataset, Views, mirrored, mirrored_reasoning, mirrored_text
-from tools.train.samples.tokens import TokenCache, encode
+from tools.train.samples.mirror import Views, mirrored, mirrored_reasoning, mirrored_text
 
 
 @pytest.mark.parametrize(
@@ -70,22 +66,6 @@ def half_white(drive_id: str, frames: int) -> Drive:
     return dataclasses.replace(
         plain, jpeg=np.concatenate(pieces), jpeg_end=np.cumsum([len(piece) for piece in pieces], dtype=np.int64)
     )
-
-
-def test_tokens_of_the_mirrored_drive_are_of_one_mirrored_picture_a_second(tmp_path: Path) -> None:
-    dataset = write_dataset(tmp_path, [half_white("a", 32)])
-    vision = build(tiny_model(), 1).vision
-    other = SecondsDataset.of(dataset, mirrored=True)
-    drive = other.load("a")
-    assert len(drive) == 4
-    shown = drive.frame(3)
-    np.testing.assert_array_equal(shown, dataset.load("a").frame(30)[:, ::-1])
-    assert shown[0, 0, 0] < 140 and shown[0, -1, 0] > 240
-    cache = TokenCache(other, vision, tmp_path / "mirrored")
-    cache.build()
-    expected = encode(vision, fit_frame(np.ascontiguousarray(dataset.load("a").frame(30)[:, ::-1]), 32))
-    np.testing.assert_allclose(cache.frames("a")[3], expected[0], atol=4e-3)
-    assert cache.frames("a").shape == (4, 4, 32)
 
 
 def test_an_anchors_view_is_of_its_own_frames_on_either_side() -> None:

@@ -29,25 +29,12 @@ def test_the_same_numbers_give_the_same_picture_and_others_another() -> None:
     assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
-def test_the_picture_that_is_given_is_not_touched() -> None:
-    given = picture()
-    for seed in range(10):
-        augmented(given, AugmentConfig(), np.random.default_rng(seed))
-    assert np.array_equal(given, picture())
-
-
 def test_left_stays_left_and_things_stay_where_they_are() -> None:
     for seed in range(40):
         seen = augmented(picture(), AugmentConfig(), np.random.default_rng(seed)).astype(float)
         assert seen[60:90, :40].mean() < seen[60:90, 88:].mean()
         red = seen[..., 0] - seen[..., 1]
         assert red[25:45, 25:45].mean() > 60 and red[60:, 60:].mean() < 30
-
-
-def test_it_is_brighter_and_darker_by_no_more_than_is_allowed() -> None:
-    config = AugmentConfig(brightness=0.2, contrast=0.0, colour=0.0, blur_share=0.0, noise_share=0.0, jpeg_share=0.0)
-    shares = [augmented(picture(), config, np.random.default_rng(seed)).mean() / picture().mean() for seed in range(60)]
-    assert 0.79 < min(shares) < 0.9 and 1.1 < max(shares) < 1.21
 
 
 def test_jpeg_comes_back_as_the_picture_in_the_same_colours() -> None:
@@ -59,12 +46,3 @@ def test_jpeg_comes_back_as_the_picture_in_the_same_colours() -> None:
 def test_what_is_no_jpeg_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a JPEG"):
         decoded(np.zeros(10, np.uint8))
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"brightness": 1.0}, {"noise_share": 1.1}, {"blur_px": 0.0}, {"jpeg_quality_min": 96}, {"noise": 100.0}],
-)
-def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError):
-        AugmentConfig(**wrong)  # type: ignore[arg-type]

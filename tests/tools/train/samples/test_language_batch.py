@@ -13,7 +13,7 @@ from edge.reasoning.decoding_rules import LineConstraint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
-from tools.train.samples.language_batch import IGNORED, Row, buckets, collate, decode, row_losses, run
+from tools.train.samples.language_batch import Row, collate, decode, row_losses, run
 
 IMAGE = 5
 DEVICE = torch.device("cpu")
@@ -98,12 +98,6 @@ def test_gradients_reach_the_merge_layer_through_the_answers_alone(language: Lan
     language.zero_grad()
 
 
-def test_an_answers_last_token_is_not_fed_and_padding_is_no_target() -> None:
-    batch = collate(ROWS, img_context_id=IMAGE, device=DEVICE)
-    assert batch.lengths.tolist() == [len(one.prompt) + max(0, len(one.answer) - 1) for one in ROWS]
-    assert [int((batch.targets[i] != IGNORED).sum()) for i in range(4)] == [9, 4, 1, 0]
-
-
 def test_a_prompt_with_more_image_places_than_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="image places"):
         collate([ROWS[0], Row((IMAGE, 7, IMAGE, IMAGE), (8,), ROWS[2].frames)], img_context_id=IMAGE, device=DEVICE)
@@ -154,12 +148,3 @@ def test_greedy_decoding_ends_at_the_end_token_and_at_the_models_context(languag
     for i, said in enumerate(decode(short, batch, 6)):
         upto = free[i].ids.index(ends) if ends in free[i].ids else 6
         assert said.ids == free[i].ids[:upto]
-
-
-def test_buckets_hold_every_index_once_and_rows_of_about_one_length() -> None:
-    lengths = np.random.default_rng(0).integers(10, 300, 1000).tolist()
-    batches = buckets(lengths, 8, np.random.default_rng(1))
-    assert sorted(i for batch in batches for i in batch) == list(range(1000))
-    padded = sum(len(batch) * max(lengths[i] for i in batch) for batch in batches)
-    assert padded < 1.1 * sum(lengths)
-    assert batches != buckets(lengths, 8, np.random.default_rng(2))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -53,11 +51,6 @@ def test_older_frames_are_near_where_they_should_be_and_in_order(anchors: list[A
             assert max(abs(a - b) for a, b in zip(each.frames, anchor.frames, strict=True)) <= 2
 
 
-def test_words_are_those_of_the_anchor(anchors: list[Anchor]) -> None:
-    for each in drawn(anchors[5], ShowConfig(), 20):
-        assert replace(each.reasoning, waypoints=None) == replace(anchors[5].reasoning, waypoints=None)
-
-
 def test_at_a_drives_ends_there_is_no_frame_beyond(anchors: list[Anchor]) -> None:
     assert all(0 <= min(each.frames) <= each.k for each in drawn(anchors[0], ShowConfig()))
     short = anchors_of(drive(frames=141))[-1]
@@ -69,13 +62,6 @@ def test_a_robot_that_waits_is_shown_as_it_is(anchors: list[Anchor]) -> None:
     assert all(each == still for each in drawn(still, ShowConfig(), 20))
 
 
-def test_nothing_is_disturbed_where_nothing_is_asked_for(anchors: list[Anchor]) -> None:
-    plain = ShowConfig(shift_frames=0, jitter_frames=0, noise=0.0, drop=0.0)
-    assert shifted(anchors[7], plain, np.random.default_rng(1)) == anchors[7]
-    tokens = np.random.default_rng(2).standard_normal((8, 4)).astype(np.float16)
-    assert np.array_equal(disturbed((tokens,), plain, np.random.default_rng(1))[0], tokens)
-
-
 def test_noise_is_in_units_of_the_tokens_and_a_share_is_blank() -> None:
     tokens = (3.0 * np.random.default_rng(2).standard_normal((2000, 8))).astype(np.float16)
     (shown,) = disturbed((tokens,), ShowConfig(noise=0.2, drop=0.25), np.random.default_rng(1))
@@ -83,16 +69,3 @@ def test_noise_is_in_units_of_the_tokens_and_a_share_is_blank() -> None:
     assert blank.mean() == pytest.approx(0.25, abs=0.03)
     off = (shown.astype(np.float64) - tokens)[~blank]
     assert off.std() == pytest.approx(0.6, rel=0.05) and shown.dtype == np.float16
-
-
-def test_the_same_draw_shows_the_same(anchors: list[Anchor]) -> None:
-    one, other = (drawn(anchors[6], ShowConfig(), 5) for _ in range(2))
-    assert one == other
-
-
-@pytest.mark.parametrize(
-    "numbers", [{"shift_frames": AROUND + 1}, {"jitter_frames": -1}, {"noise": 2.0}, {"drop": 1.0}]
-)
-def test_numbers_that_make_no_sense_are_refused(numbers: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        replace(ShowConfig(), **numbers)

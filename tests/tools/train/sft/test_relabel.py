@@ -145,25 +145,6 @@ def test_only_where_nobody_is_near_is_anything_learned(tmp_path: Path) -> None:
     assert relabels.anchors(crowded) == []
 
 
-def test_anchors_are_asked_in_the_other_words_about_the_same_frames() -> None:
-    _, drive, found = _told("office")
-    own = {anchor.k: anchor for anchor in anchors_of(drive)}
-    for each in found:
-        for anchor in anchors_of(each.of(drive)):
-            same = own[anchor.k]
-            assert (anchor.drive_id, anchor.frames, anchor.way) == (same.drive_id, same.frames, same.way)
-            assert not set(anchor.wordings) & set(same.wordings)
-
-
-@pytest.mark.slow
-def test_the_same_numbers_tell_the_same_and_another_seed_other_ways() -> None:
-    scenario, drive, found = _told("office")
-    again = relabel(drive, scenario.site, CONFIG, 1, SPEED_MPS)
-    assert [each.as_json() for each in again] == [each.as_json() for each in found]
-    goals = [{each.goal_xy for each in relabel(drive, scenario.site, CONFIG, seed, SPEED_MPS)} for seed in range(1, 5)]
-    assert any(goal != goals[0] for goal in goals)
-
-
 def test_a_drive_without_traces_or_from_elsewhere_is_left_alone(tmp_path: Path) -> None:
     scenario, drive, _ = _told("corridor")
     elsewhere = replace(drive, about=replace(drive.about, scene="corridor-0"))
@@ -220,12 +201,6 @@ def test_asked_to_stop_it_ends_after_the_drive_and_keeps_what_is_made(tmp_path: 
     assert [path.name for path in relabels.folder.iterdir()] == ["a.json"]
 
 
-def test_other_numbers_have_a_folder_of_their_own(tmp_path: Path) -> None:
-    dataset = write_dataset(tmp_path, [made_up_drive("a")])
-    several = [(config, seed) for config in (CONFIG, RelabelConfig(ways=1)) for seed in (1, 2)]
-    assert len({InstructionRelabels(dataset, *each, SPEED_MPS).folder for each in several}) == 4
-
-
 def test_ranks_share_the_layouts(tmp_path: Path) -> None:
     class Waiting(Ranks):
         """Nobody else is there."""
@@ -244,8 +219,3 @@ def test_ranks_share_the_layouts(tmp_path: Path) -> None:
     assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "c"]
     relabels.build(dataset.ids, ranks=Waiting(0, 1))
     assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "b", "c"]
-
-
-def test_the_numbers_are_checked() -> None:
-    with pytest.raises(ValueError, match="0 to 64 ways"):
-        RelabelConfig(ways=65)
