@@ -20,7 +20,7 @@ from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
-from tests.support.train.training_drives import dataset, drive
+from tests.support.train.train_drives import dataset, drive
 from tools.train.collect import collection
 from tools.train.collect.collection import Collection
 from tools.train.collect.record import CameraSettings, DrivePlan, record

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from tests.support.train.training_drives import about, dataset, drive
+from tests.support.train.train_drives import about, dataset, drive
 from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import LINES, DatasetWriter
 from tools.train.drives.drive import INDEX, Dataset, Drive, Entry

@@ -10,7 +10,7 @@ import pytest
 from edge.core.geometry import SE2
 from sim_hil.benchmark.policies.expert_motion import STEP_S, STEPS, Choice
 from sim_hil.benchmark.policies.expert_route import SPACING_M
-from tests.support.train.training_drives import arc
+from tests.support.train.train_drives import arc
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE
 from tools.train.drives.futures import chosen_future, label_futures, relative
 

@@ -157,19 +157,6 @@ def test_the_floor_is_as_far_away_as_it_looks_down_on_it(twin: IdWorld, grid: Na
     assert nearest == pytest.approx(view.eye[2] / tan(down), rel=0.05)
 
 
-def test_the_wall_behind_the_doorway_is_as_far_away_as_it_is(twin: IdWorld, grid: NavGrid) -> None:
-    found = labelled(twin, grid, state(x=6.0), side=16)
-    middle = found["main"][6, 7:9]
-    assert set(middle) == {CLASSES.index("wall")}
-    assert found["near_m"][6, 7:9] == pytest.approx(12.0 - 0.075 - 6.0 - EYE, rel=0.02)
-
-
-def test_a_pixel_that_misses_an_edge_by_a_hair_is_as_far_away_as_its_neighbours(twin: IdWorld, grid: NavGrid) -> None:
-    for turn in (-0.02, 0.0, 0.01):
-        cells = labelled(twin, grid, state(turn=turn))["near_m"][1:4, SIDE // 2]
-        assert cells.min() > 5.5  # the wall on the right, which begins beside the robot, and the one ahead
-
-
 def test_the_way_ahead_leads_through_the_doorway_into_the_room(twin: IdWorld, grid: NavGrid) -> None:
     found = labelled(twin, grid, state(x=3.0))
     ahead = slice(COLUMNS // 2 - 1, COLUMNS // 2 + 1)

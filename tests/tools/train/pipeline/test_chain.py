@@ -109,20 +109,6 @@ def test_imitation_after_a_round_begins_anew_and_keeps_what_was_before(
     assert is_done(run_dir, Step("imitate")) and is_done(run_dir, again)
 
 
-def test_imitation_after_a_round_that_was_stopped_goes_on_where_it_was(
-    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use(monkeypatch, stage_that("before"))
-    run_step(job(run_dir), Step("imitate"))
-    run_dir.retire("imitate", "imitate-0")
-    (run_dir.stage("imitate") / "checkpoint").touch()
-    again = Step("imitate", 1)
-    assert is_done(run_dir, Step("imitate")) and not is_done(run_dir, again)
-    use(monkeypatch, stage_that("after"))
-    run_step(job(run_dir, resume=True), again)
-    assert run_dir.result("imitate") == {"stage": "imitate", "resumed": True}
-
-
 def test_borrowed_drives_are_not_added_to(run_dir: RunDir, tmp_path: Path) -> None:
     other = RunDir.open(tmp_path / "other", TINY)
     run_dir.finish("collect", {})
@@ -137,15 +123,6 @@ def test_a_round_needs_a_policy(run_dir: RunDir) -> None:
 
 
 # The network between stages
-
-
-def test_an_ablation_keeps_encoder_and_language_model_and_its_action_expert_is_of_the_seed(run_dir: RunDir) -> None:
-    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    other = with_overrides(TINY.model, {"action.layers": "2"})
-    model, seeded = read_network(path, other, 9), build(other, 9)
-    trained = build(TINY.model, 5)
-    assert all(torch.equal(a, b) for a, b in zip(model.vision.parameters(), trained.vision.parameters(), strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), seeded.action.parameters(), strict=True))
 
 
 DEAF = ("action.latency_aware", "action.motion_offset")
@@ -403,36 +380,6 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
     assert shipped_weights(TINY.model, tmp_path / "weights") == path and path.with_suffix(".md").is_file()
     assert shipped_weights(with_overrides(TINY.model, {"action.layers": "2"}), tmp_path / "weights") is None
     assert shipped_weights(TINY.model, tmp_path / "nothing") is None
-
-
-def test_the_card_of_an_ablation_says_that_it_is_one_of_another_run(trained: RunDir, tmp_path: Path) -> None:
-    ablation = RunDir.open(tmp_path / "ablation", TINY)
-    trained.finish("collect", {})
-    ablation.borrow(trained, ("collect",), TINY)
-    assert "--recipe recipe.toml --from RUN`" in card(ablation, TINY, trained.model_path)
-    assert "--from" not in card(trained, TINY, trained.model_path)
-
-
-@pytest.mark.slow
-def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
-    first = ship(trained, TINY, tmp_path / "weights")
-    for number, after in enumerate(("imitate", "imitate-1")):
-        run_dir = RunDir.open(tmp_path / f"more{number}", NEWEST)
-        import_start(run_dir.out, TINY.model, [first], 1)
-        adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
-        run_dir.finish("rl", {"iterations": 20 + number})
-        text = card(run_dir, NEWEST, run_dir.model_path)
-        first = ship(run_dir, NEWEST, tmp_path / f"weights{number}")
-    assert "--checkpoint WEIGHTS --after imitate-1`" in text and "adopted" not in text
-    assert text.count("ab12") == 1 and "No weights of anybody else are in it." in text
-    parts = (
-        "* iterations: 21",
-        "## What it went on from",
-        "* iterations: 20",
-        "### What it went on from",
-        "* loss: 0.25",
-    )
-    assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
 
 
 @pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])

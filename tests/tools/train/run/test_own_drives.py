@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.train.training_drives import dataset, drive
+from tests.support.train.train_drives import dataset, drive
 from tools.train import cli
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import load_recipe

@@ -123,19 +123,6 @@ def test_a_dropped_token_is_one_without_content_and_a_dropped_state_is_not_seen(
     assert not torch.allclose(plans[0], others[0], atol=1e-4)
 
 
-def test_padding_has_no_effect_and_no_gradient() -> None:
-    config = model_with()
-    action = expert(config)
-    batch = collate([group(0, 3, config), group(1, 8, config)], CPU)
-    guidance = batch.guidance.clone()
-    guidance[0, :5] = 50.0
-    spoiled = dataclasses.replace(batch, guidance=guidance.requires_grad_())
-    plans = plan(action, spoiled)
-    torch.testing.assert_close(plans, plan(action, batch), atol=1e-6, rtol=1e-6)
-    plans.square().sum().backward()
-    assert guidance.grad is not None and not guidance.grad[0, :5].any() and guidance.grad[0, 5:].any()
-
-
 def test_the_loss_is_smooth_l1_over_the_known_steps() -> None:
     config = model_with()
     one = group(2, 4, config)

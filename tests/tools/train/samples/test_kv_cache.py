@@ -20,7 +20,6 @@ from tools.train.config.checks import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import Dataset
-from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import Drawn, Prompts, anchors_of
 from tools.train.samples.kv_cache import KvCache, build_kv_cache, cache_key
 
@@ -142,18 +141,6 @@ def test_other_weights_other_words_and_another_drive_are_another_cache(
     assert cache_key(network, CONTENT, CONFIG, 4) != key
     assert cache_key(network, CONTENT, dataclasses.replace(CONFIG, batch=9), 3) == key
     assert cache.has("a", dataset.entries[0].sha256) and not cache.has("a", "0" * 64)
-
-
-def test_ranks_share_the_drives(tmp_path: Path, cache: KvCache, network: TicVla, dataset: Dataset) -> None:
-    class Alone(Ranks):
-        def barrier(self) -> None:
-            """The other rank's turn comes later."""
-
-    for rank in (0, 1):
-        both = build_kv_cache(tmp_path, network, CONTENT, dataset, TOKENS, CONFIG, seed=3, ranks=Alone(rank, 2))
-        assert [(both.folder / f"{name}.npy").exists() for name in ("a", "b")] == [True, rank == 1]
-    for name in ("a.npy", "b.npy", "a.json", "b.json"):
-        assert (both.folder / name).read_bytes() == (cache.folder / name).read_bytes()
 
 
 def test_a_cache_that_is_not_whole_is_refused(tmp_path: Path, cache: KvCache) -> None:

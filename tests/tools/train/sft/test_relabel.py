@@ -25,7 +25,6 @@ from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import Drive
 from tools.train.drives.progress_labels import RouteProgress
 from tools.train.drives.scenarios import Scenario
-from tools.train.run.distributed import Ranks
 from tools.train.samples.anchors import anchors_of
 from tools.train.sft.relabel import InstructionRelabel, InstructionRelabels, relabel, relabel_along
 
@@ -199,23 +198,3 @@ def test_asked_to_stop_it_ends_after_the_drive_and_keeps_what_is_made(tmp_path: 
     with pytest.raises(KeyboardInterrupt):
         relabels.build(dataset.ids, stopped=lambda: (relabels.folder / "a.json").exists())
     assert [path.name for path in relabels.folder.iterdir()] == ["a.json"]
-
-
-def test_ranks_share_the_layouts(tmp_path: Path) -> None:
-    class Waiting(Ranks):
-        """Nobody else is there."""
-
-        def barrier(self) -> None:
-            """Does not wait."""
-
-        def any(self, flag: bool) -> bool:
-            """Here."""
-            return flag
-
-    drives = [made_up_drive(name, kind="recorded", layout_seed=seed) for name, seed in (("a", 1), ("b", 2), ("c", 1))]
-    dataset = write_dataset(tmp_path, drives)
-    relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
-    relabels.build(dataset.ids, ranks=Waiting(0, 2))
-    assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "c"]
-    relabels.build(dataset.ids, ranks=Waiting(0, 1))
-    assert sorted(path.stem for path in relabels.folder.iterdir()) == ["a", "b", "c"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,10 @@ from safetensors.torch import load_file
 from tests.support.train.train_drives import made_up_drive, small_dataset, write_dataset
 from tests.support.train.train_sft_rank import CONFIG, sft_job, trained
 from tests.support.train.train_stage_contract import Run, StageContract
-from tests.support.train.training_scenarios import drive_along, scenarios
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.config.recipe import load_recipe
-from tools.train.config.sft import RelabelConfig, SftConfig
+from tools.train.config.sft import SftConfig
 from tools.train.drives.drive import Dataset
 from tools.train.pipeline.chain import Step, budget_of, run_step
 from tools.train.run.job import StageJob
@@ -109,17 +107,6 @@ def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> 
     before, after = (load_file(stage_weights(tmp_path, name)) for name in ("sft-0", "sft"))
     name = "language.layers.0.down.weight"
     assert 0 < (after[name] - before[name]).abs().max() < steps * CONFIG.optim.lr * 0.1
-
-
-@pytest.mark.slow
-def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "collect", [drive_along(scenarios("corridor")[0]), made_up_drive("b")])
-    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
-    config = dataclasses.replace(CONFIG, epochs=1, evaluate=silent)
-    plain = run(sft_job(tmp_path, config))
-    shutil.rmtree(tmp_path / "sft")
-    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RelabelConfig(ways=2, tries=24))))
-    assert plain["more_anchors"] == 0 < more["more_anchors"] == more["anchors"] - plain["anchors"]
 
 
 @pytest.mark.slow
