@@ -129,15 +129,9 @@ TURN_RADPS, SPEED_MPS = 0.2, 0.8
 def about(name: str = "a", frames: int = 60, **changed: Any) -> About:
     """What holds for a made-up drive; a trace a second."""
     aspects = {"situation": "in a corridor", "objects": "none", "motion": "nobody near"}
-    traces = tuple(
-        {
-            "k": k,
-            **aspects,
-            "progress": {"step": 1, "steps": 1, "passed": k // 20},
-            "plan": "turn left into the room now",
-        }
-        for k in range(0, frames, 10)
-    )
+    aspects["plan"] = "turn left into the room now"
+    ks = range(0, frames, TRACE_EVERY)
+    traces = tuple({"k": k, **aspects, "progress": {"step": 1, "steps": 1, "passed": k // 20}} for k in ks)
     values: dict[str, Any] = {
         "id": name, "kind": "office", "layout_seed": 100, "scene": "office-100", "robot": "go2", "people": 3, "seed": 7,
         "driver": "expert", "drift": "none", "goal_xy": (4.0, 0.0), "threshold_m": 1.5, "outcome": "reached",

@@ -1,4 +1,4 @@
-"""Only the end of the action expert is trained, its frozen prefix gives the same commands, and PPO's arithmetic is right."""
+"""Only the end of the action expert is trained, with the same commands as the whole; and the arithmetic of PPO."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import load_recipe
-from tools.train.run.distributed import BatchOrder, autocast, computes_bf16
+from tools.train.run.distributed import autocast, computes_bf16
 from tools.train.run.loop import (
     Optimiser,
     learning_rate,
@@ -233,12 +233,6 @@ def test_gains_and_biases_do_not_decay() -> None:
 
 
 # Ranks
-
-
-def test_every_epoch_shows_every_sample_once_in_an_order_of_its_own() -> None:
-    order = BatchOrder(count=23, batch=8, epochs=2, seed=1)
-    epochs = [np.concatenate([order.indices(e * 3 + s) for s in range(3)]) for e in range(2)]
-    assert all(sorted(epoch) == list(range(23)) for epoch in epochs) and list(epochs[0]) != list(epochs[1])
 
 
 def two_ranks(module: str, *arguments: str) -> list[tuple[int, str]]:

@@ -263,31 +263,6 @@ def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset)
     assert config.undisturbed() == PLAIN
 
 
-def test_a_state_is_cut_or_its_prompt_or_its_text_alone_or_whole(dataset: Dataset) -> None:
-    states = SideStates(dataset)
-
-    def kinds(config: SampleConfig) -> list[str]:
-        samples, found = of(dataset, config), []
-        for chosen, group in drawn(samples, 400):
-            state = states.at(samples.drives[chosen.drive].id, chosen.anchor)
-            kept, whole = group.keep_guidance[0], group.guidance.shape[1] == len(state.kv)
-            if not kept[: state.prompt_tokens].any():
-                assert whole and kept[state.prompt_tokens :].all()
-                found.append("text alone")
-            else:
-                assert kept.all()
-                found.append("whole" if whole else "shorter")
-        return found
-
-    found = kinds(dataclasses.replace(PLAIN, prompt_only=0.3, text_only=0.7))
-    assert found.count("text alone") == pytest.approx(280, abs=30)
-    assert found.count("shorter") == 400 - found.count("text alone")
-    found = kinds(dataclasses.replace(PLAIN, cut_text=0.3, text_only=0.2))
-    assert found.count("text alone") == pytest.approx(80, abs=25)
-    silent = kinds(dataclasses.replace(PLAIN, reasoning=False, text_only=1.0))
-    assert set(silent) == {"shorter"}
-
-
 def test_odometry_noise_grows_with_the_way_and_leaves_the_age(dataset: Dataset) -> None:
     samples = of(dataset, dataclasses.replace(PLAIN, offset_noise_m_per_m=0.05, offset_noise_deg_per_m=3.0))
     by_way: dict[bool, list[float]] = {False: [], True: []}
