@@ -7,7 +7,7 @@ from math import inf
 from typing import Annotated, TypeAlias, get_args, get_type_hints
 
 
-class TrainError(ValueError):
+class TrainError(Exception):
     """Arguments, files, weights or data that cannot be used; one line: what, expected, found, what to do."""
 
 

@@ -222,8 +222,6 @@ def _about(path: Path, text: str) -> About:
         x, y = content["goal_xy"]
         tuples = {key: tuple(content[key]) for key in ("wordings", "told", "traces")}
         return About(**{**content, **tuples, "goal_xy": (float(x), float(y))})
-    except TrainError:
-        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrainError(f"{path}: the header is not a drive's") from error
 

@@ -93,8 +93,6 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"{path}: not JSON ({error})") from error
 
 
@@ -177,8 +175,6 @@ def _rows(path: Path) -> list[tuple[int, float, float, float]]:
     except OSError as error:
         raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, csv.Error) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"{path}: a row is not of numbers ({error})") from error
     return sorted(rows)
 
@@ -199,8 +195,6 @@ def read_gnd(folder: Path) -> Recording:
         frames = sorted((_float(each["stamp_s"]), _below(folder, each["file"])) for each in content["frames"])
         poses = sorted(_pose(path, each) for each in content["poses"])
     except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"{path}: a frame or pose lacks or misshapes a key ({error!r})") from error
     if not frames or not poses:
         raise TrainError(f"{path}: expected frames and poses")

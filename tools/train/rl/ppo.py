@@ -22,7 +22,7 @@ from export.model.action import ActionExpert
 from export.model.network import TicVla
 from tools.train.config.rl import LOG_STD_RANGE, PpoConfig
 from tools.train.imitate.trainable_policies import PointGoalNet
-from tools.train.rl.action_tail import (
+from tools.train.rl.policies import (
     CommandLimits,
     arc_command,
     entropy,

@@ -31,7 +31,7 @@ from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.config.rl import LOG_STD_RANGE, RlConfig
 from tools.train.drives.scenarios import KEPT_SEEDS
 from tools.train.imitate.trainable_policies import build_point_goal, save_point_goal
-from tools.train.rl.action_tail import CommandLimits, check_tail
+from tools.train.rl.policies import CommandLimits, check_tail
 from tools.train.rl.ppo import Learner, PointGoalLearner, PpoOptimiser, TailLearner
 from tools.train.rl.rollout import Rollout
 from tools.train.rl.worker import RolloutOrder, drive

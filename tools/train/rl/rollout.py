@@ -189,8 +189,6 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], list[EpisodeEnd]]:
             ends = [EpisodeEnd(**end) for end in json.loads(header["ends"])]
             return {name: file.get_tensor(name) for name in file.keys()}, ends  # noqa: SIM118 — not a mapping
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"rollout {path}: not readable ({error})") from error
 
 

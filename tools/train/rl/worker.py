@@ -38,8 +38,15 @@ from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.drives.scenarios import FIRST_SEED, Scenario, training_episodes
 from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl import rollout
-from tools.train.rl.action_tail import CommandLimits, check_tail, load_tail
-from tools.train.rl.policies import Models, PointGoalRolloutPolicy, RolloutPolicy, TailPolicy
+from tools.train.rl.policies import (
+    CommandLimits,
+    Models,
+    PointGoalRolloutPolicy,
+    RolloutPolicy,
+    TailPolicy,
+    check_tail,
+    load_tail,
+)
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, Rollout, goal_features, read
 from tools.train.run.job import StageFailedError
 from tools.train.run.loop import (

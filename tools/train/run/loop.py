@@ -54,8 +54,6 @@ def load_checkpoint(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 — not a mapping
         return tensors, json.loads(header["meta"])
     except (SafetensorError, KeyError, ValueError) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"checkpoint {path}: damaged ({error}); delete it to start again") from error
 
 

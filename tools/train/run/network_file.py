@@ -132,8 +132,6 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
                 raise TrainError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
     except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError) as error:
-        if isinstance(error, TrainError):
-            raise
         raise TrainError(f"{path}: not weights of edge-train ({error})") from error
     wanted = {name for name in model.state_dict() if name.split(".")[0] in same}
     if set(tensors) != wanted:

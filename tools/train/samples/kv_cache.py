@@ -93,8 +93,6 @@ class KvCache:
             self.draws: int = content["draws"]
             """Number of states of each anchor, with different wordings and previous progress."""
         except (OSError, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, TrainError):
-                raise
             raise TrainError(f"{folder}: no cache of keys and values ({error!r}); build it first") from error
         self._indices: dict[str, dict[tuple[int, int], _Place]] = {}
         self._maps: OrderedDict[str, Halves] = OrderedDict()

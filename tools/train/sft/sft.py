@@ -115,10 +115,7 @@ class Samples:
 
 
 def run(job: StageJob) -> dict[str, Any]:
-    """Train on the run's data set and write the network with its new language model.
-
-    Raises TrainError.
-    """
+    """Train on the run's data set and write the network with its new language model. Raises TrainError."""
     config = job.recipe.sft
     dataset = drives_after(job.run_dir, job.recipe, STAGE)
     network, epochs, optim = _start(job, config)

@@ -24,7 +24,7 @@ from tests.support.train.train_drives import tiny_model
 from tools.train.config.checks import TrainError
 from tools.train.config.rl import PpoConfig
 from tools.train.rl import rollout
-from tools.train.rl.action_tail import (
+from tools.train.rl.policies import (
     CommandLimits,
     check_tail,
     command_mean,
