@@ -229,15 +229,16 @@ def drive_episode(
             _, reward, ended, timed_out, _ = env.step(np.array(limiter.limit(*action, scale), np.float32))
             total += reward
             if chosen is not None:
-                steps.add(visual[0], state, goal_features(*goal_m), action, reward, chosen)
+                goal = goal_features(*goal_m)
+                steps.add(chosen, visual=visual[0], state=state, goal=goal, action=action, reward=reward)
             here = env.world.pose()
             recent_xy.append((here.x_m, here.y_m))
             cut = "no-reasoning" if policy.failure is not None else "stuck" if _is_stuck(recent_xy) else ""
         if not env.world.done:
             env.world.stop()
-        time_s, image, steps.after_state, T_odom_base = _observation(env.world)
-        steps.after_visual = policy.observe(time_s, image, T_odom_base)[0]
-        steps.after_goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
+        time_s, image, state, T_odom_base = _observation(env.world)
+        goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
+        steps.after = {"visual": policy.observe(time_s, image, T_odom_base)[0], "state": state, "goal": goal}
         steps.semantic = list(policy.semantic)
         outcome = env.world.outcome()
     finally:

@@ -39,7 +39,7 @@ from tools.train.rl.policies import (
     within_limits,
 )
 from tools.train.rl.ppo import PpoOptimiser, PpoStats, TailLearner, advantages
-from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps
+from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, PolicyOutput
 
 LIMITS = CommandLimits(1.0, 1.0)
 
@@ -108,14 +108,11 @@ def tiny_episode(network: TicVla, steps: int, seed: int, *, reward: float = 0.1)
         visual = _random(1, c.vision.tokens, c.vision.token_dim, seed=1000 * seed + step)
         state, latency, number = (0.5, 0.0, 0.1), (1.0, 0.2, 0.0, 0.1), int(step >= steps // 2)
         now = now_of(expert, visual, torch.tensor([state]), torch.tensor([latency]))
-        kept.visual.append(visual[0].numpy())
-        kept.queries.append(prefix(expert, now, torch.from_numpy(kept.semantic[number])[None])[0].numpy())
-        kept.state.append(state)
-        kept.latency.append(latency)
-        kept.goal.append((0.5, 0.1))
-        kept.action.append((0.4, 0.05 * step))
-        kept.reward.append(reward * step)
-        kept.generation.append(number)
+        queries = prefix(expert, now, torch.from_numpy(kept.semantic[number])[None])[0].numpy()
+        chosen = PolicyOutput((0.0, 0.0), queries, latency, number)
+        tokens, action = visual[0].numpy(), (0.4, 0.05 * step)
+        kept.add(chosen, visual=tokens, state=state, goal=(0.5, 0.1), action=action, reward=reward * step)
+    kept.after = {"visual": tokens, "state": (0.0, 0.0, 0.0), "goal": (0.0, 0.0)}
     end = EpisodeEnd(f"e{seed}", "office", 0, steps, "timeout", False, False, False, 1.0, 0.0, 0.1 * steps)
     return kept, end
 
@@ -134,7 +131,7 @@ def test_a_rollout_is_read_as_it_was_driven(tmp_path: Path) -> None:
     assert [(steps.start, steps.stop, number) for steps, number, _ in found.episodes()] == [(0, 6, 0), (6, 10, 1)]
     assert found.arrays["generation"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3]
     assert [len(each) for each in found.semantic] == [4, 7, 4, 7]
-    assert np.array_equal(found.arrays["visual"][6], tiny_episode(network, 4, 2)[0].visual[0])
+    assert np.array_equal(found.arrays["visual"][6], tiny_episode(network, 4, 2)[0].rows["visual"][0])
 
 
 def test_a_torn_rollout_is_named(tmp_path: Path) -> None:
