@@ -231,16 +231,14 @@ class _Tour:
         if not self._planner.reachable(*episode.start[:2]):
             raise NothingToLearnError("the expert finds no path")
         self._tracer = Tracer(scenario)
-        self.body = KinematicBase(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
+        paced = replace(self._driving, speed_mps=collect.speed_mps)
+        self.body = KinematicBase(SE2(*episode.start), paced, site.robot_grid(episode.robot), rng)
         self._route = np.array([episode.start[:2]])
         self._ticks, self._blocked_s = 0, 0.0
         self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
         self._detour, self._detour_route = self._drawn_detour(), self._route
         self._linger_s: float | None = None
         self.plan: list[Vec2] = []
-
-    def _paced(self) -> Driving:
-        return replace(self._driving, speed_mps=self._speed_mps)
 
     def _planner_to(self, goal: Vec2, near_m: float, described: tuple[Vec2, ...] = ()) -> RoutePlanner:
         robot = self._robot

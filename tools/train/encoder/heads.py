@@ -260,7 +260,7 @@ class Score:
 
     def result(self) -> dict[str, Any]:
         """Return shares from 0 to 1 and distances in m; None for scores without cases."""
-        found: dict[str, Any] = {name: _mean(counts) for name, counts in sorted(self._shares.items())}
+        found: dict[str, Any] = {name: _ratio(*counts) for name, counts in sorted(self._shares.items())}
         found["landmarks"] = self._shares.get("landmark_bearing", [0, 0])[1]
         found["pictures"] = self._pictures
         found["person_recall"] = _ratio(self._confusion[PERSON, PERSON], self._confusion[PERSON].sum())
@@ -325,10 +325,6 @@ def _most_common_of(values: NDArray[Any], count: int) -> int:
 
 def _middle(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
     return float(np.median(values[where].astype(np.float32))) if where.any() else 1.0
-
-
-def _mean(counts: list[int]) -> float | None:
-    return _ratio(counts[0], counts[1])
 
 
 def _ratio(part: Any, whole: Any) -> float | None:

@@ -193,7 +193,10 @@ def render(folder: Path, shard: Shard) -> Iterator[int]:
             pose = poses.draw(crowd.present)
             crowd.robot = pose
             state[:7] = body_state(scene, shard.robot, pose, rng)
-            sharp, quality = rng.uniform() < shard.sharp_share, rng.integers(*_span(shard))
+            sharp, quality = (
+                rng.uniform() < shard.sharp_share,
+                rng.integers(shard.jpeg_quality_min, shard.jpeg_quality_max + 1),
+            )
             px = 2 * PICTURE_PX if sharp else PICTURE_PX
             picture = camera.render(state, px, px, ASPECT)
             if sharp:
@@ -255,10 +258,6 @@ def _site(shard: Shard) -> Site:
         except LayoutError as error:
             why = str(error)
     raise LayoutError(f"{shard.name}: no sound layout in {_LAYOUT_TRIES}; the last: {why}")
-
-
-def _span(shard: Shard) -> tuple[int, int]:
-    return (shard.jpeg_quality_min, shard.jpeg_quality_max + 1)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ Inputs come from frame k and earlier; only the label lies in the future.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -272,13 +272,15 @@ class Samples:
         latency = [(delay_s, *offset.as_tuple()) for delay_s, offset in zip(delays_s, offsets, strict=True)]
         guidance: NDArray[np.floating]
         if self._by_waypoints:
-            guidance = self._waypoints(state, offsets)
+            assert state.waypoints is not None  # `_anchors` excludes states without waypoints
+            guidance = np.concatenate([waypoints_now(state.waypoints, offset) for offset in offsets])
             keep = np.ones(guidance.shape[:2], bool)
         else:
             rows = state.kv[: self._length(state, cut, end)]
             guidance = np.array(rows)[None]
             keep = rng.uniform(size=guidance.shape[:2]) >= self._drop_kv
-            if self.config.reasoning and self._text_alone(cut):
+            # The same random number as in `_length`: a state is shortened, or its prompt is masked, or it is whole.
+            if self.config.reasoning and self.config.cut_text <= cut < self.config.cut_text + self.config.text_only:
                 keep[:, : state.prompt_tokens] = False
         frames = source.tokens.frames(drive.id)
         visual = np.stack([frames[k] for k in ks])
@@ -321,20 +323,11 @@ class Samples:
             return state.prompt_tokens
         return state.prompt_tokens + (int(end * (decoded + 1)) if cut < self.config.cut_text else decoded)
 
-    def _text_alone(self, cut: float) -> bool:
-        """Return whether a state's prompt is masked; `cut` is the random number that `_length` uses."""
-        return self.config.cut_text <= cut < self.config.cut_text + self.config.text_only
-
     def _offset(self, drive: DriveFrames, anchor: int, k: int, noise: Array) -> SE2:
         way_m = float(drive.way_m[k] - drive.way_m[anchor])
         shift, turn = self.config.offset_noise_m_per_m * way_m, radians(self.config.offset_noise_deg_per_m) * way_m
         exact = drive.offset(anchor, k)
         return SE2(exact.x_m + shift * noise[0], exact.y_m + shift * noise[1], exact.theta_rad + turn * noise[2])
-
-    def _waypoints(self, state: CachedState, offsets: Sequence[SE2]) -> NDArray[np.float32]:
-        points = state.waypoints
-        assert points is not None  # `_anchors` excludes states without waypoints
-        return np.concatenate([waypoints_now(points, offset) for offset in offsets])
 
 
 def _pick(upto: Array, uniform: float) -> int:

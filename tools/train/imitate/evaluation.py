@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to, target_of
-from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from edge.state.semantic import waypoints_now
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import ImitateEvalConfig
@@ -200,10 +199,7 @@ def _score(
                 scores.add(name, age_s, arrays[row], target, known)
             scores.add(KEEP, age_s, kept[i], target, known)
             if points is not None:
-                straight = _straight(points, drive.offset(one.anchor, k), (k - one.anchor) / RATE_HZ, steps)
+                now = waypoints_now(points, drive.offset(one.anchor, k))[0].astype(np.float64)
+                straight = to_waypoints(now, (k - one.anchor) / RATE_HZ, steps)
                 scores.add(WAYPOINTS, age_s, straight, target, known)
             row += 1
-
-
-def _straight(points: Waypoints, offset: SE2, since_s: float, steps: int) -> Array:
-    return to_waypoints(waypoints_now(points, offset)[0].astype(np.float64), since_s, steps)

@@ -53,7 +53,8 @@ class Ranks:
         if self.world == 1:
             return weight
         total = self.sum(weight)
-        flat = torch.cat([_gradient(each).reshape(-1).float() for each in parameters]) * (weight / max(total, 1e-12))
+        own = [each.grad if each.grad is not None else torch.zeros_like(each) for each in parameters]
+        flat = torch.cat([each.reshape(-1).float() for each in own]) * (weight / max(total, 1e-12))
         dist.all_reduce(flat)
         start = 0
         for each in parameters:
@@ -65,7 +66,7 @@ class Ranks:
         """Return the sum of a value over the ranks."""
         if self.world == 1:
             return value
-        whole = torch.tensor([value], dtype=torch.float64, device=_device())
+        whole = torch.tensor([value], dtype=torch.float64, device="cuda" if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(whole)
         return float(whole.item())
 
@@ -171,14 +172,6 @@ class BatchOrder:
         epoch, within = divmod(step, self.steps_per_epoch)
         order = np.random.default_rng((self.seed, 0xBA7C, epoch)).permutation(self.count)
         return order[within * self.batch : (within + 1) * self.batch].astype(np.int64)
-
-
-def _gradient(parameter: torch.nn.Parameter) -> torch.Tensor:
-    return parameter.grad if parameter.grad is not None else torch.zeros_like(parameter)
-
-
-def _device() -> str:
-    return "cuda" if dist.get_backend() == "nccl" else "cpu"
 
 
 def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:

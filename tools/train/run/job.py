@@ -108,7 +108,8 @@ class StageJob:
 
     def rng(self, *tags: int | str) -> np.random.Generator:
         """Return a numpy generator for this stage's seed and `tags`."""
-        return np.random.default_rng((self.seed, *map(_number, tags)))
+        numbers = (tag if isinstance(tag, int) else crc32(tag.encode()) for tag in tags)
+        return np.random.default_rng((self.seed, *numbers))
 
     def generator(self, *tags: int | str) -> torch.Generator:
         """Return a torch generator on the CPU for this stage's seed and `tags`."""
@@ -121,10 +122,6 @@ class StageJob:
         Every rank must call this function.
         """
         return self.ranks.any(self.stop.asked)
-
-
-def _number(tag: int | str) -> int:
-    return tag if isinstance(tag, int) else crc32(tag.encode())
 
 
 class StageBar(AbstractContextManager["StageBar"]):

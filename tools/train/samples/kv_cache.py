@@ -32,22 +32,11 @@ from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts, anchors_of, draw
 from tools.train.samples.language_batch import FrameTokens, Halves, Row, collate, decode, frames_of, run
+from tools.train.samples.tokens import tensors_sha256
 
 FORMAT: Final = 1
 INDEX: Final = "kv.json"
 _MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descriptors
-
-
-@dataclass(frozen=True)
-class Made:
-    """A computed state before it is written; `kv` f16 [T, kv_dim]."""
-
-    k: int
-    draw: int
-    kv: Halves
-    prompt_tokens: int
-    own: bool
-    text: str
 
 
 @dataclass(frozen=True)
@@ -65,6 +54,10 @@ class CachedState:
     def waypoints(self) -> Waypoints | None:
         """(x m, y m) at 3, 6, 9 s in the robot frame at the anchor; None if the text has no valid waypoints."""
         return parse_waypoints(self.text)
+
+
+Made = tuple[int, int, CachedState]
+"""Frame, number of the draw, and the state."""
 
 
 @dataclass(frozen=True)
@@ -160,15 +153,15 @@ def _read(folder: Path, drive_id: str) -> Mapping[str, Any]:
 
 def write_states(folder: Path, drive_id: str, sha256: str, states: Sequence[Made], kv_dim: int) -> None:
     """Write a drive's states: first the array, then the JSON file that marks it as complete."""
-    rows = np.concatenate([state.kv for state in states] or [np.zeros((0, kv_dim), np.float16)])
+    rows = np.concatenate([state.kv for _, _, state in states] or [np.zeros((0, kv_dim), np.float16)])
     partial = folder / f"{drive_id}.{os.getpid()}.partial"
     with partial.open("wb") as file:
         np.save(file, rows, allow_pickle=False)
     partial.replace(_npy(folder, drive_id))
     places: list[dict[str, Any]] = []
     start = 0
-    for state in states:
-        place = _Place(state.k, state.draw, start, len(state.kv), state.prompt_tokens, state.own, state.text)
+    for k, number, state in states:
+        place = _Place(k, number, start, len(state.kv), state.prompt_tokens, state.own, state.text)
         places.append(asdict(place))
         start += len(state.kv)
     write_whole(
@@ -183,13 +176,8 @@ _TAG: Final = 0x5EE
 
 def parts_sha256(network: TicVla, parts: Iterable[str] = SEEN_PARTS) -> str:
     """Hash the weights of some parts of a network."""
-    digest = hashlib.sha256()
     wanted = tuple(parts)
-    for name, tensor in sorted(network.state_dict().items()):
-        if name.split(".")[0] in wanted:
-            digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
-            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
+    return tensors_sha256({name: each for name, each in network.state_dict().items() if name.split(".")[0] in wanted})
 
 
 def cache_key(network: TicVla, tokenizer: bytes, config: KvConfig, seed: int) -> str:
@@ -277,7 +265,7 @@ def _states(
         some = sorted((each for each in wanted if each.own is own), key=lambda each: each.tokens)
         for start in range(0, len(some), config.batch):
             made += _batch(network, prompts, tokens, some[start : start + config.batch], config.max_new_tokens)
-    return sorted(made, key=lambda state: (state.k, state.draw))
+    return sorted(made, key=lambda state: state[:2])
 
 
 def _wanted(prompts: Prompts, anchor: Anchor, number: int, words: DrawConfig, own_share: float, seed: int) -> _Wanted:
@@ -315,5 +303,5 @@ def _batch(
             where = f"drive {each.anchor.drive_id}, frame {each.anchor.k}"
             raise TrainError(f"{where}: keys or values exceed float16; train the language model again")
         text = (WAYPOINTS_START if each.drawn.waypoints_only else "") + prompts.text(ids)
-        made.append(Made(each.anchor.k, each.number, half, len(each.prompt), each.own, text))
+        made.append((each.anchor.k, each.number, CachedState(half, len(each.prompt), text, each.own)))
     return made

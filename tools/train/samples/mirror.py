@@ -7,7 +7,6 @@ at whole seconds alone. In all wordings `left` and `right` are sides, except in 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -154,7 +153,9 @@ def mirrored_drive(drive: Drive) -> Drive:
             about,
             goal_xy=(x_m, 0.0 - y_m),
             wordings=tuple(mirrored_text(wording) for wording in about.wordings),
-            traces=tuple(_mirrored_trace(trace) for trace in about.traces),
+            traces=tuple(
+                {**trace, **aspects_json(mirrored_reasoning(aspects_of_json(trace)))} for trace in about.traces
+            ),
         ),
         jpeg=np.zeros(0, np.uint8),
         pose=_flipped(drive.pose, 1, 2),
@@ -171,10 +172,6 @@ def _flipped(array: NDArray[Any], *axes: int) -> NDArray[Any]:
     for axis in axes:
         array[..., axis] = 0.0 - array[..., axis]
     return array
-
-
-def _mirrored_trace(trace: Mapping[str, object]) -> dict[str, Any]:
-    return {**trace, **aspects_json(mirrored_reasoning(aspects_of_json(trace)))}
 
 
 class MirroredDrives(Dataset):

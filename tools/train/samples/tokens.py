@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -35,13 +35,18 @@ _MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descri
 Halves = NDArray[np.float16]
 
 
-def encoder_sha256(vision: VisionEncoder) -> str:
-    """Hash an encoder's configuration and weights; it does not depend on the weights' file."""
-    digest = hashlib.sha256(repr(vision.config).encode())
-    for name, tensor in sorted(vision.state_dict().items()):
+def tensors_sha256(tensors: Mapping[str, torch.Tensor], head: str = "") -> str:
+    """Hash tensors by name, after `head`."""
+    digest = hashlib.sha256(head.encode())
+    for name, tensor in sorted(tensors.items()):
         digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
         digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
     return digest.hexdigest()
+
+
+def encoder_sha256(vision: VisionEncoder) -> str:
+    """Hash an encoder's configuration and weights; it does not depend on the weights' file."""
+    return tensors_sha256(vision.state_dict(), repr(vision.config))
 
 
 class TokenCache:
