@@ -21,9 +21,10 @@ from safetensors.numpy import save_file
 from export.core.typed import build
 from sim_hil.benchmark.language.openings import LINEAR, bounds_of
 from sim_hil.benchmark.language.visibility import ASPECT
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.crowd.people import UPDATE_HZ, People, appearances
 from sim_hil.layouts import LayoutError
+from sim_hil.processes.child_process import Message
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, SceneObject
 from sim_hil.simulation.camera import CameraWorld

@@ -20,21 +20,23 @@ from torch import Tensor
 
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
+from edge.inference.graph import Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, TURN_IN_PLACE_M
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.assembly import semantic_config
-from edge.run.reasoning_loop import Mode
 from edge.safety.monitors.semantic import SemanticMonitor
 from edge.state.frame import fit_frame
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import Context, SemanticSlot, SemanticState
+from edge.state.semantic import Context, SemanticSlot, SemanticState, SharedState
 from export.model.action import ActionExpert
 from export.model.heads import integrated
 from export.model.vision import VisionEncoder
 from sim_hil.benchmark.conditions.latency import Timing
 from sim_hil.benchmark.policies.artifacts_policy import CONTROL_PERIOD_NS, RING_S
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from tools.train.config.checks import TrainError
 from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl.rollout import PolicyOutput
@@ -222,7 +224,7 @@ class _NoContextPolicy:
 
     guided_by_waypoints = False
 
-    def semantic_context(self, last_layer_kv: npt.NDArray[np.float32]) -> Context:
+    def semantic_context(self, last_layer_kv: npt.NDArray[np.float32], interrupt: Interrupt | None = None) -> Context:
         """Return an empty context."""
         return {}
 
@@ -245,7 +247,7 @@ class Models:
 class TailPolicy:
     """The action expert acting on the last released generation (Algorithm 2, lines 4 to 9), for one episode.
 
-    `LockstepReasoner` runs the generations in virtual time, as in the benchmark; `draw` returns their latencies.
+    `VirtualTimeReasoner` runs the generations, as in the benchmark; `draw` returns their latencies.
     """
 
     def __init__(
@@ -257,16 +259,12 @@ class TailPolicy:
         self.slot = SemanticSlot()
         self._ring = TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, models.policy.tokens_shape)
         stand_in: Any = _NoContextPolicy()
-        self._reasoner = LockstepReasoner(
-            language=models.language,
-            policy=stand_in,
-            ring=self._ring,
-            slot=self.slot,
-            instruction=instruction,
-            frame_offsets_s=runtime.frame_offsets_s,
-            max_new_tokens=runtime.max_new_tokens,
-            draw=draw,
-            mode=Mode.ASYNC,
+        self._reasoner = VirtualTimeReasoner(
+            GenerationModels(models.language, stand_in),
+            SharedState(self._ring, self.slot),
+            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens),
+            instruction,
+            draw,
         )
         self._number: int | None = None
         self._tokens = torch.empty(0)
@@ -275,7 +273,7 @@ class TailPolicy:
     @property
     def failure(self) -> str | None:
         """Why reasoning has ended for good; None while it continues."""
-        return self._reasoner.failure
+        return self._reasoner.cycle.failure
 
     def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> Floats:
         """Release the generation that is due and encode the frame; return a copy of its visual tokens."""
@@ -311,8 +309,9 @@ class TailPolicy:
 
     def latency(self, semantic: SemanticState, time_s: float, T_odom_base: SE2) -> tuple[float, float, float, float]:
         """Return (Δt s, Δx m, Δy m, Δθ rad) of a state now; as in the runner, Δt is clipped to the longest delay."""
-        delay_s = semantic.delay_s(START_NS + round(time_s * 1e9))
-        return (self._models.ages.given_delay_s(delay_s), *semantic.motion_offset(T_odom_base).as_tuple())
+        now_ns = START_NS + round(time_s * 1e9)
+        latency = semantic.latency_input(now_ns, T_odom_base, self._models.ages.trained_delay_s)
+        return (latency.delay_s, *latency.offset.as_tuple())
 
     def speed_scale(self, time_s: float) -> float:
         """Return the share of the speed limits, 0 to 1, that the robot's monitor leaves at the semantic state's age."""

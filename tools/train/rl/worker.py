@@ -10,11 +10,11 @@ exactly.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,8 +32,9 @@ from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.gym_env import DynaNavEnv
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
-from sim_hil.benchmark.workers.worker_pool import Workers
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_pool import WorkerJob, Workers
+from sim_hil.benchmark.workers.worker_process import worker_main
+from sim_hil.processes.child_process import Message
 from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.drives.scenarios import FIRST_SEED, Scenario, training_episodes
 from tools.train.imitate.trainable_policies import PointGoalNet
@@ -49,9 +50,7 @@ from tools.train.rl.policies import (
 )
 from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, Rollout, goal_features, read
 from tools.train.run.job import StageFailedError
-from tools.train.run.loop import (
-    load_checkpoint,
-)
+from tools.train.run.loop import load_checkpoint
 from tools.train.run.network_file import read_network
 
 MODULE: Final = "tools.train.rl.worker"
@@ -310,7 +309,6 @@ def _is_stuck(recent_xy: deque[tuple[float, float]]) -> bool:
 
 
 COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
-_POLL_S: Final = 0.5
 
 
 def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
@@ -346,23 +344,16 @@ def drive(
     folder = Path(order.out)
     folder.mkdir(parents=True, exist_ok=True)
     orders = split(order, per_job)
-    waiting = [part for part in orders if not Path(part.out).is_file()]
-    workers = Workers(command, jobs or len(os.sched_getaffinity(0)))
-    try:
-        while waiting or workers.running():
-            if stopped():
-                raise KeyboardInterrupt
-            while waiting and workers.free():
-                part = waiting.pop(0)
-                stem = Path(part.out).stem
-                workers.start(stem, part.to_json(), folder / f"{stem}.log")
-            for line in workers.wait(_POLL_S):
-                if line.message is not None:
-                    finished(bool(line.message["success"]))
-                elif line.why:
-                    raise StageFailedError(f"rollout {line.key}: {line.why}")
-    finally:
-        workers.close()
+    missing = [part for part in orders if not Path(part.out).is_file()]
+    waiting = deque(
+        WorkerJob(Path(part.out).stem, part.to_json(), Path(part.out).with_suffix(".log")) for part in missing
+    )
+    with Workers(command, jobs) as workers:
+        for event in chain.from_iterable(workers.run(waiting, stopped)):
+            if event.message is not None:
+                finished(bool(event.message["success"]))
+            elif event.failure:
+                raise StageFailedError(f"rollout {event.key}: {event.failure}")
     return read([Path(part.out) for part in orders])
 
 

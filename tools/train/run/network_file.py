@@ -20,6 +20,7 @@ from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaC
 from export.model.config_file import config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
+from sim_hil.processes.child_process import last_lines
 from tools.train.config.checks import TrainError
 from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
@@ -154,7 +155,6 @@ def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
 
 TARGET: Final = "cpu"
 COMMAND: Final[Sequence[str]] = (sys.executable, "-m", "export.cli")
-_TAIL_CHARS: Final = 500
 
 
 class ExportError(RuntimeError):
@@ -183,8 +183,8 @@ def export_artifacts(
     if code.returncode == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     if code.returncode != EXIT_DONE:
-        said = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:].strip().splitlines()
-        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {said[-1] if said else f'see {log}'}")
+        lines = last_lines(log) or [f"see {log}"]
+        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {lines[-1]}")
     write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
     return out
 
