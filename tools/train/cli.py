@@ -304,7 +304,8 @@ def _step(
                 ranks=ranks,
                 stop=stop,
             )
-            if asks_bf16(recipe, step) and not computes_bf16(args.device):
+            optim = getattr(getattr(recipe, step.stage, None), "optim", None)
+            if getattr(optim, "bf16", False) and not computes_bf16(args.device):
                 progress.say("using float32: this processor has no bfloat16 instructions")
             result = run_step(job, step) if step.stage in chain.DISTRIBUTED else _alone(job, step)
     finally:
@@ -332,12 +333,6 @@ def _alone(job: StageJob, step: Step) -> dict[str, Any]:
             finally:
                 torch.set_num_threads(threads)
     return job.run_dir.result(step.name if step.stage == "dagger" else step.stage) or {}
-
-
-def asks_bf16(recipe: Recipe, step: Step) -> bool:
-    """Return whether a stage's configuration requests bfloat16."""
-    optim = getattr(getattr(recipe, step.stage, None), "optim", None)
-    return bool(getattr(optim, "bf16", False))
 
 
 @contextmanager

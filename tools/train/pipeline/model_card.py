@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +24,9 @@ from tools.train.pipeline.chain import ADOPTED, GO_ON
 from tools.train.run.network_file import CARD, START, START_CARD, read_network, stage_weights
 from tools.train.run.run_dir import IMPORTED, VERSIONS, RunDir
 
+_PART_NAMES: Final = dict(
+    zip(PARTS, ("vision encoder", "language model", "action expert", "value network"), strict=True)
+)
 _HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # Markdown has six levels
 _THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
 _BEFORE: Final = "## What it went on from"
@@ -132,23 +136,13 @@ def parameters(weights: Path) -> dict[str, int]:
     counts = dict.fromkeys(PARTS, 0)
     with safe_open(str(weights), framework="pt") as file:
         for name in file.keys():  # noqa: SIM118 — not a mapping
-            shape = file.get_slice(name).get_shape()
-            count = 1
-            for size in shape:
-                count *= size
-            counts[name.split(".")[0]] += count
+            counts[name.split(".")[0]] += prod(file.get_slice(name).get_shape())
     return counts
 
 
 def _network(weights: Path, recipe: Recipe, licence: str) -> str:
     counts, size = parameters(weights), weights.stat().st_size
-    named = {
-        "vision": "vision encoder",
-        "language": "language model",
-        "action": "action expert",
-        "value": "value network",
-    }
-    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
+    rows = "\n".join(f"| {_PART_NAMES[part]} | {count:,} |" for part, count in counts.items() if count)
     return (
         f"Network `{recipe.model.name}`: maps camera images, odometry and an English instruction to motion.\n"
         f"{licence}\n\n"
@@ -193,12 +187,8 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
         lines += [*(_OUR_DRIVES if own else ()), "The expert's drives were not collected by this run."]
     for number, result in enumerate(rounds, 1):
         if result is not None and ADOPTED not in result:
-            lines += [
-                "",
-                f"DAgger round {number}, driven by the policy, relabelled by the expert:",
-                "",
-                *_facts(result),
-            ]
+            title = f"DAgger round {number}, driven by the policy, relabelled by the expert:"
+            lines += ["", title, "", *_facts(result)]
     return "\n".join(lines) + "\n"
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -90,16 +90,11 @@ class State:
         self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
         numbers = asdict(config)
         numbers.pop("jobs")
-        content = {
-            "rl": numbers,
-            "seed": job.seed,
-            "before": weights_sha256(learner.network),
-        }
+        content = {"rl": numbers, "seed": job.seed, "before": weights_sha256(learner.network)}
         self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
         self.iteration = 0
         self.steps = 0
-        self.first: Score | None = None
-        self.best: Score | None = None
+        self.first = self.best = Score(0.0, 0.0, 0.0)  # until the first evaluation
         self.improved = False
         """Whether the best policy differs from the first one."""
         self._kept: dict[str, dict[str, torch.Tensor]] = {}
@@ -120,7 +115,6 @@ class State:
 
     def judge(self, score: Score) -> bool:
         """Keep a better policy as the best, or reset a much worse one to the best; return whether it was reset."""
-        assert self.best is not None
         if score.success - self.best.success > self._config.keep_margin + _ROUNDING:
             self.best, self.improved = score, True
             self._kept["best"] = self._learner.policy_tensors()
@@ -144,8 +138,8 @@ class State:
             **with_prefix("critic", optimiser_tensors(optimiser.critic)),
             "log_std": learner.log_std.detach(),
         }
-        scores = {name: asdict(score) for name in ("first", "best") if (score := getattr(self, name)) is not None}
-        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved, **scores}
+        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved}
+        meta |= {"first": asdict(self.first), "best": asdict(self.best)}
         save_checkpoint(self._path, tensors, meta)
 
     def load(self) -> None:
@@ -165,12 +159,8 @@ class State:
         restore_optimiser(optimiser.critic, under("critic", tensors))
         learner.log_std.data.copy_(tensors["log_std"])
         self.iteration, self.steps, self.improved = int(meta["iteration"]), int(meta["steps"]), bool(meta["improved"])
-        self.first, self.best = _score(meta.get("first")), _score(meta.get("best"))
+        self.first, self.best = Score(**meta["first"]), Score(**meta["best"])
         self._job.run_dir.rewind(STAGE, self.iteration)
-
-
-def _score(content: Mapping[str, float] | None) -> Score | None:
-    return None if content is None else Score(**content)
 
 
 def run(job: StageJob) -> dict[str, Any]:
@@ -240,7 +230,6 @@ def improve(
         job.progress.update(state.iteration, config.iterations, **numbers)
         state.save()
     final = _choose(job, config, orders, state, drive)
-    assert state.first is not None and state.best is not None
     return {
         "iterations": config.iterations,
         "steps": state.steps,

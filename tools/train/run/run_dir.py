@@ -228,8 +228,8 @@ def drives_after(run_dir: RunDir, recipe: Recipe, stage: str) -> Dataset:
 def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
     """Import the data set in `folder` as the result of the run's stage `collect`; files are hard-linked if possible.
 
-    An interrupted call leaves no drives. Returns the stage's result. Raises TrainError for a damaged data set,
-    TrainError if the run has other drives.
+    An interrupted call leaves no drives. Returns the stage's result. Raises TrainError for a damaged data set
+    or if the run has other drives.
     """
     dataset = Dataset.open(folder)
     done = run_dir.result("collect")

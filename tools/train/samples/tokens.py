@@ -108,7 +108,7 @@ class TokenCache:
         """Encode missing drives (of `ids`), `batch` frames at a time; return how many this rank encoded.
 
         The encoder is moved to `device` and back. Ranks share the drives; all must call this function. Raises
-        TrainError for values beyond float16, TrainError for a damaged drive, OSError.
+        TrainError for values beyond float16 or a damaged drive, OSError.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()

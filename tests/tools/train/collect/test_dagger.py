@@ -162,8 +162,3 @@ def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
     dataset(tmp_path / "collect", drive("e0", frames=20))
     with pytest.raises(TrainError, match="d1- or n1-"):
         drives_after(job.run_dir, job.recipe, "sft")
-
-
-def test_options_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ValueError, match="beta"):
-        PolicyOptions("a", "b", 1.5, 2.0)

@@ -163,14 +163,6 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
         drive.frame(7)
 
 
-def test_only_a_tour_may_lack_pictures() -> None:
-    drive = made_up_drive("a", 30)
-    ends = drive.jpeg_end.copy()
-    ends[5] = ends[4]
-    with pytest.raises(TrainError, match="increasing values"):
-        replace(drive, jpeg_end=ends)
-
-
 def test_seconds_in_which_somebody_is_in_the_way_are_left_out(tmp_path: Path) -> None:
     def says(motion: str) -> int:
         drive = made_up_drive(f"w{len(motion)}", 40)

