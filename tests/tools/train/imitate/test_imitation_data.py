@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
+from edge.inference.latency_profile import LatencyError, LatencyProfile
 from edge.motion.controller import arc_to
 from edge.state.semantic import waypoints_now
 from export.model.config import TicVlaConfig
@@ -16,14 +18,13 @@ from export.model.network import build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, tiny_model, write_dataset
 from tests.support.train.train_imitate_rank import FRAMES, SideStates, side_dataset, side_drive
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import DelayConfig, KvConfig, SampleConfig, WeightConfig
 from tools.train.drives.drive import NOISE, Dataset, Drive
-from tools.train.imitate.data import NoStates, SampleChoice, SampleError, Samples, States
+from tools.train.imitate.data import Delays, SampleChoice, SampleError, Samples, States
 from tools.train.samples.action_batch import Group
-from tools.train.samples.delays import Delays
-from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames, DriveFramesError
-from tools.train.samples.kv_build import build_kv_cache
-from tools.train.samples.kv_cache import CachedState
+from tools.train.samples.drive_frames import LEAST_KNOWN, DriveFrames
+from tools.train.samples.kv_cache import CachedState, build_kv_cache
 
 TEN_S = Delays.uniform(DelayConfig())
 PLAIN = SampleConfig().undisturbed()
@@ -74,14 +75,6 @@ def test_age_and_motion_offset_are_exactly_those_between_state_and_frame(dataset
             assert latency[0] == np.float32((k - chosen.anchor) / 10)
             anchor, now = (SE2(*map(float, drive.pose_odom[i])) for i in (chosen.anchor, k))
             np.testing.assert_allclose(latency[1:], (anchor.inverse() @ now).as_tuple(), atol=1e-6)
-
-
-def test_an_age_beyond_what_the_robot_tells_is_told_as_the_robot_tells_it(dataset: Dataset) -> None:
-    samples = of(dataset, dataclasses.replace(PLAIN, longest_told_s=2.0))
-    ages = [age for chosen, _ in drawn(samples, 60) for age in chosen.ages]
-    told_s = [row[0] for _, group in drawn(samples, 60) for row in group.latency]
-    assert max(ages) > 20
-    np.testing.assert_allclose(told_s, np.minimum(np.array(ages) / 10, 2.0), atol=1e-6)
 
 
 def test_picture_state_and_label_are_those_of_the_frame(dataset: Dataset) -> None:
@@ -153,20 +146,6 @@ def test_nothing_after_the_frame_reaches_the_inputs_of_its_sample(tmp_path: Path
             np.testing.assert_allclose(
                 getattr(true, field.name), getattr(other, field.name), rtol=0, atol=close, err_msg=field.name
             )
-
-
-def test_a_spoiled_past_does_reach_them(tmp_path: Path) -> None:
-    drive, k = side_drive("left-a"), 64
-    dataset = write_dataset(tmp_path, [drive])
-    choice = SampleChoice(0, 60, (k,), (4,))
-    taken = []
-    for each in (drive, spoiled(drive, k - 1)):
-        samples = Samples(
-            [DriveFrames.of(each, 30, EVEN)], SpoiledTokens(k - 1), SideStates(dataset), TEN_S, PLAIN, tiny_model()
-        )
-        taken.append(samples.take(choice, np.random.default_rng(0)))
-    assert not np.allclose(taken[0].state, taken[1].state)
-    assert not np.allclose(taken[0].latency, taken[1].latency)
 
 
 def test_headings_of_a_label_are_not_wrapped() -> None:
@@ -255,12 +234,6 @@ def test_one_that_moves_there_has_not(tmp_path: Path) -> None:
         assert all(age == k - chosen.anchor for k, age in zip(chosen.ks, chosen.ages, strict=True))
 
 
-def test_ages_are_those_of_the_distribution(dataset: Dataset) -> None:
-    delays = Delays.uniform(DelayConfig(low_s=1.0, high_s=2.0))
-    ages = [age for chosen, _ in drawn(of(dataset, delays=delays), 300) for age in chosen.ages]
-    assert min(ages) == 10 and max(ages) == 20 and np.mean(ages) == pytest.approx(15, abs=0.5)
-
-
 def test_without_injected_delay_every_state_is_of_its_frame(dataset: Dataset) -> None:
     samples = of(dataset, SampleConfig(group=4), Delays.none())
     assert samples.group == 1
@@ -290,84 +263,6 @@ def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset)
     assert np.mean(hidden) == pytest.approx(0.3, abs=0.05)
     assert all(group.visual_tokens.any(axis=(1, 2)).all() for _, group in drawn(plain, 50))
     assert config.undisturbed() == PLAIN
-
-
-def test_some_states_are_given_without_their_prompt_and_all_others_whole(dataset: Dataset) -> None:
-    config = dataclasses.replace(PLAIN, text_only=0.4)
-    states, alone = SideStates(dataset), []
-    samples = of(dataset, config)
-    for chosen, group in drawn(samples, 300):
-        state = states.at(samples.drives[chosen.drive].id, chosen.anchor)
-        kept = group.keep_guidance[0]
-        alone.append(not kept[: state.prompt_tokens].any())
-        assert kept[state.prompt_tokens :].all() and len(kept) == len(state.kv)
-        assert alone[-1] or kept.all()
-    assert np.mean(alone) == pytest.approx(0.4, abs=0.08)
-    assert config.undisturbed() == PLAIN
-
-
-def test_a_state_is_cut_or_its_prompt_or_its_text_alone_or_whole(dataset: Dataset) -> None:
-    states = SideStates(dataset)
-
-    def kinds(config: SampleConfig) -> list[str]:
-        samples, found = of(dataset, config), []
-        for chosen, group in drawn(samples, 400):
-            state = states.at(samples.drives[chosen.drive].id, chosen.anchor)
-            kept, whole = group.keep_guidance[0], group.guidance.shape[1] == len(state.kv)
-            if not kept[: state.prompt_tokens].any():
-                assert whole and kept[state.prompt_tokens :].all()
-                found.append("text alone")
-            else:
-                assert kept.all()
-                found.append("whole" if whole else "shorter")
-        return found
-
-    found = kinds(dataclasses.replace(PLAIN, prompt_only=0.3, text_only=0.7))
-    assert found.count("text alone") == pytest.approx(280, abs=30)
-    assert found.count("shorter") == 400 - found.count("text alone")
-    found = kinds(dataclasses.replace(PLAIN, cut_text=0.3, text_only=0.2))
-    assert found.count("text alone") == pytest.approx(80, abs=25)
-    silent = kinds(dataclasses.replace(PLAIN, reasoning=False, text_only=1.0))
-    assert set(silent) == {"shorter"}
-
-
-def test_shares_of_states_that_are_not_whole_are_together_one_at_most() -> None:
-    with pytest.raises(ValueError, match="together 1 at most"):
-        SampleConfig(cut_text=0.4, prompt_only=0.2, text_only=0.5)
-
-
-def test_texts_are_cut_anywhere_and_a_model_that_says_nothing_leaves_its_prompt(dataset: Dataset) -> None:
-    states = SideStates(dataset)
-
-    def lengths(config: SampleConfig) -> list[tuple[int, int]]:
-        samples = of(dataset, config)
-        return [
-            (group.guidance.shape[1], len(states.at(samples.drives[chosen.drive].id, chosen.anchor).kv))
-            for chosen, group in drawn(samples, 200)
-        ]
-
-    assert all(length == whole for length, whole in lengths(PLAIN))
-    assert {length for length, _ in lengths(dataclasses.replace(PLAIN, reasoning=False))} == {3}
-    cut = lengths(dataclasses.replace(PLAIN, cut_text=1.0))
-    assert {length for length, whole in cut if whole == 8} == set(range(3, 9))
-    some = lengths(dataclasses.replace(PLAIN, cut_text=0.3))
-    assert 0.1 < np.mean([length < whole for length, whole in some]) < 0.4
-
-
-def test_some_states_are_of_the_prompt_alone(dataset: Dataset) -> None:
-    states = SideStates(dataset)
-
-    def silent(config: SampleConfig) -> float:
-        samples = of(dataset, config)
-        told = [
-            group.guidance.shape[1] == states.at(samples.drives[chosen.drive].id, chosen.anchor).prompt_tokens
-            for chosen, group in drawn(samples, 400)
-        ]
-        return float(np.mean(told))
-
-    beside = silent(PLAIN)
-    assert silent(dataclasses.replace(PLAIN, prompt_only=1.0)) == 1.0
-    assert 0.1 < silent(dataclasses.replace(PLAIN, prompt_only=0.2)) - beside < 0.3
 
 
 def test_odometry_noise_grows_with_the_way_and_leaves_the_age(dataset: Dataset) -> None:
@@ -408,22 +303,6 @@ def test_states_without_waypoints_cannot_guide_by_them(dataset: Dataset) -> None
     assert {chosen.anchor % 20 for chosen, _ in drawn(samples, 60)} == {0}
 
 
-def test_every_draw_is_a_function_of_its_generator(dataset: Dataset) -> None:
-    config = SampleConfig()
-    first, again = (drawn(of(dataset, config, drop=True), 5, seed=8) for _ in range(2))
-    for (_, one), (_, other) in zip(first, again, strict=True):
-        for field in dataclasses.fields(Group):
-            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
-    assert first[0][0] != first[1][0]
-
-
-def test_without_states_every_frame_can_be_drawn(dataset: Dataset) -> None:
-    states = NoStates({entry.id: entry.frames for entry in dataset.entries}, 32)
-    samples = of(dataset, PLAIN, Delays.none(), states=states)
-    ks = {chosen.ks[0] % 10 for chosen, _ in drawn(samples, 100)}
-    assert ks == set(range(10))
-
-
 def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
     class Nobody(SideStates):
         def anchors(self, drive_id: str) -> tuple[int, ...]:
@@ -434,7 +313,7 @@ def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
     late = Delays.uniform(DelayConfig(low_s=40.0, high_s=50.0))
     with pytest.raises(SampleError, match="no frame"):
         of(dataset, delays=late)
-    with pytest.raises(DriveFramesError, match="10 to 50"):
+    with pytest.raises(TrainError, match="10 to 50"):
         DriveFrames.of(dataset.load("left-a", pictures=False), 51, EVEN)
 
 
@@ -448,3 +327,66 @@ def test_a_label_that_backs_off_stands_and_turns_as_the_expert_does() -> None:
     np.testing.assert_allclose(target[8], future[8, :30])
     command = arc_to(SE2(*map(float, target[7, 9])), 1.0)
     assert command[0] == 0.0 and command[1] == pytest.approx(0.4)
+
+
+# -- delays: of the paper, or those that a device's runner acts on ---------------------------------------------------
+
+
+def test_the_papers_delays_are_uniform_from_0_to_10_s() -> None:
+    mass = Delays.of(DelayConfig()).mass
+    assert len(mass) == 101
+    np.testing.assert_allclose(mass[1:100], 0.01)
+    # Half of what rounds to 0.0 s would be below 0, half of what rounds to 10.0 s beyond 10.
+    assert mass[0] == pytest.approx(0.005) and mass[100] == pytest.approx(0.005)
+    assert Delays.of(DelayConfig()).mean_s == pytest.approx(5.0)
+
+
+def test_a_share_of_the_ages_can_be_near_without_the_others_going() -> None:
+    config = DelayConfig(near_share=0.6, near_s=4.0)
+    mass = Delays.of(config).mass
+    np.testing.assert_allclose(mass[1:40], 0.4 * 0.01 + 0.6 * 0.025)
+    np.testing.assert_allclose(mass[41:100], 0.4 * 0.01)
+    assert Delays.of(config).mean_s == pytest.approx(0.4 * 5.0 + 0.6 * 2.0)
+
+
+@pytest.mark.parametrize("seconds", [0.4, 2.0, 7.0])
+def test_generations_that_all_take_as_long_are_between_one_and_two_of_their_times_old(seconds: float) -> None:
+    delays = Delays.of_profile(LatencyProfile.constant(seconds))
+    tenths = round(10 * seconds)
+    assert set(np.flatnonzero(delays.mass)) == set(range(tenths, 2 * tenths + 1))
+    np.testing.assert_allclose(delays.mass[tenths + 1 : 2 * tenths], 0.1 / seconds)
+    assert delays.mean_s == pytest.approx(1.5 * seconds)
+
+
+@pytest.mark.parametrize("late_anchor", [False, True])
+def test_a_profiles_ages_are_those_that_a_run_with_its_times_has(late_anchor: bool) -> None:
+    rng = np.random.default_rng(1)
+    times = rng.gamma(4.0, 0.5, 60).clip(0.3, 8.0)
+    anchors = 0.4 * times if late_anchor else 0.0 * times
+    profile = LatencyProfile("p", "drawn", tuple(times), tuple(anchors))
+    # The runner: a generation starts when the one before it is released, and is acted on until its own successor is.
+    taken = rng.integers(len(times), size=40_000)
+    released = np.cumsum(times[taken])
+    anchored = released - times[taken] + anchors[taken]
+    ticks = np.arange(released[0], released[-1], 0.1)
+    ages = ticks - anchored[np.searchsorted(released, ticks, side="right") - 1]
+    seen = np.bincount(np.round(10 * ages).astype(int)) / len(ticks)
+    mass = Delays.of_profile(profile).mass
+    longest = max(len(seen), len(mass))
+    difference = np.pad(seen, (0, longest - len(seen))) - np.pad(mass, (0, longest - len(mass)))
+    assert np.abs(np.cumsum(difference)).max() < 0.01
+
+
+def test_a_profile_of_no_time_at_all_is_no_delay() -> None:
+    assert Delays.of_profile(LatencyProfile.constant(0.0)).mass.tolist() == [1.0]
+    assert Delays.none().mean_s == 0.0 and Delays.none().beyond.tolist() == [0.0]
+
+
+def test_a_profile_is_read_from_the_file_that_the_recipe_names(tmp_path: Path) -> None:
+    path = tmp_path / "orin.json"
+    path.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
+    np.testing.assert_allclose(
+        Delays.of(DelayConfig(profile=str(path))).mass, Delays.of_profile(LatencyProfile.constant(2.0)).mass
+    )
+    with pytest.raises(LatencyError, match="cannot be read"):
+        Delays.of(DelayConfig(profile=str(tmp_path / "none.json")))

@@ -32,9 +32,9 @@ from sim_hil.benchmark.language.task_checks import MIN_PIXELS, RANGE_INDOORS_M, 
 from sim_hil.benchmark.language.visibility import EYE_M, HFOV_RAD
 from sim_hil.scene.scene import SceneObject, Vec2, Vec3
 from sim_hil.simulation.camera import MOUNTS
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.trace_sentences import (
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario
+from tools.train.drives.trace_sentences import (
     MAX_OBJECTS,
     MAX_PEOPLE,
     five_aspects,
@@ -127,14 +127,10 @@ class Tracer:
             for index, gap in crowd[:MAX_PEOPLE]
         ]
         bodies = [_body(people[index]) for index, _ in crowd]
-        return five_aspects(
-            self._situation(pose, len(crowd)), self._objects(pose, step, bodies), near, progress, plan
-        )  # fmt: skip
-
-    def _situation(self, pose: SE2, near: int) -> Situation:
         area = self._scene.area_at(pose.x_m, pose.y_m)
         kind = area.kind if area is not None and area.kind in AREAS else OPEN_AREA
-        return Situation(kind, sum(near >= least for least in _MANY))
+        situation = Situation(kind, sum(len(crowd) >= least for least in _MANY))
+        return five_aspects(situation, self._objects(pose, step, bodies), near, progress, plan)
 
     def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
         """Return indices and distances, m, of people in view within PEOPLE_M, nearest first."""

@@ -21,7 +21,7 @@ from sim_hil.benchmark.language.openings import Frame
 from sim_hil.benchmark.language.route import Step
 from sim_hil.scene.nav_grid import NavGrid, links
 from sim_hil.scene.scene import Vec2
-from tools.train.scenes.scenarios import Scenario
+from tools.train.drives.scenarios import Scenario
 
 Array = NDArray[np.float64]
 

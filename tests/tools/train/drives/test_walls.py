@@ -16,15 +16,13 @@ from tests.support.train.train_drives import VAL_LAYOUT, MadeUpTokens, tiny_mode
 from tests.support.train.train_imitate_rank import CONFIG, SideStates, imitate_job, side_dataset, side_drive, trained
 from tools.train.config.imitate import DelayConfig, LossConfig, SampleConfig
 from tools.train.drives.drive import Drive
-from tools.train.imitate.data import Samples
+from tools.train.drives.scenarios import Site
+from tools.train.drives.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
+from tools.train.imitate.data import Delays, Samples
 from tools.train.imitate.evaluation import plans_into_walls
-from tools.train.imitate.mirror_drives import mirrored_drive
-from tools.train.imitate.trainable_policies import plan_loss
 from tools.train.samples.action_batch import Group, collate
-from tools.train.samples.delays import Delays
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.scenes.sites import Site
-from tools.train.scenes.walls import OPEN_M, SHAPE, Scenes, Walls, nothing_near, room, too_near
+from tools.train.samples.mirror import mirrored_drive
 
 SCENES = Scenes()
 CPU = torch.device("cpu")
@@ -103,27 +101,12 @@ def test_what_the_expert_does_costs_nothing(walls: Walls, heading: float, metres
     assert too_near(plan, plan, KNOWN, *around(walls), 0.2).item() == 0
 
 
-def test_a_plan_with_room_enough_costs_nothing(walls: Walls) -> None:
-    along = -0.3  # the corridor's own direction
-    assert room(straight(along), *around(walls)).min() > 0.2
-    assert too_near(straight(along), straight(0.0, 0.2), KNOWN, *around(walls), 0.2).item() == 0
-
-
 def test_steps_whose_label_is_not_known_cost_nothing(walls: Walls) -> None:
     known = KNOWN.clone()
     known[:, 5:] = False
     plan = straight(0.8)
     assert too_near(plan, straight(-0.3), KNOWN, *around(walls), 0.2) > 0
     assert too_near(plan, straight(-0.3), known, *around(walls), 0.2) == 0
-
-
-def test_a_label_that_is_in_a_wall_where_it_is_not_known_excuses_nothing(walls: Walls) -> None:
-    label, known = straight(-0.3), KNOWN.clone()
-    label[:, 20:], known[:, 20:] = straight(0.8)[:, 20:], False
-    short = straight(0.8)
-    short[:, 20:] = label[:, 20:]
-    assert room(label, *around(walls)).min() < 0
-    assert too_near(short, label, known, *around(walls), 0.2) > 0
 
 
 def test_the_far_side_of_a_wall_does_not_draw_a_plan_on(walls: Walls) -> None:
@@ -166,16 +149,6 @@ def test_samples_carry_walls_where_these_are_looked_at(tmp_path: Path) -> None:
     assert given_.around.patches.shape == (4, *SHAPE)
     with pytest.raises(ValueError, match="around all groups"):
         collate([without, given_], CPU)
-
-
-def test_walls_are_added_to_equation_4(tmp_path: Path, walls: Walls) -> None:
-    batch = collate([drawn(DriveFrames.of(in_corridor(), 30, SampleConfig().weights, walls), tmp_path)], CPU)
-    plan = straight(1.2).expand(len(batch), -1, -1)
-    plain, more = LossConfig(), LossConfig(walls=3.0, room_m=0.1)
-    assert batch.around is not None
-    near = too_near(plan, batch.target, batch.known, *batch.around, 0.1)
-    assert near.max() > 0
-    torch.testing.assert_close(plan_loss(more, plan, batch), plan_loss(plain, plan, batch) + 3.0 * near)
 
 
 def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:

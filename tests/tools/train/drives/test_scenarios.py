@@ -11,20 +11,21 @@ import pytest
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import is_held_out, pattern
 from sim_hil.benchmark.suite.episode import load_suite
-from sim_hil.layouts import BENCHMARK_SEEDS, LayoutError
+from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import Scene, load_scene
-from tests.support.train.training_scenarios import EACH, SEED, all_scenarios, scenarios
+from tests.support.train.training_scenarios import SEED, all_scenarios, scenarios
 from tools.demo import INSTRUCTION
-from tools.train.config.scenes import CORRIDOR, KINDS, SHARES, TASKS_PER_SCENE
-from tools.train.scenes.scenarios import (
+from tools.train.config.collect import CORRIDOR, KINDS, SHARES
+from tools.train.drives.scenarios import (
     FIRST_SEED,
     LEAST_WORDINGS,
     ScenarioError,
+    Site,
+    SiteError,
+    corridor,
     kind_of_group,
-    scenario_group,
     training_episodes,
 )
-from tools.train.scenes.sites import Site, SiteError, corridor
 
 SUITE = load_suite("dynanav")
 
@@ -43,29 +44,11 @@ def test_no_training_scene_has_the_content_of_a_benchmark_scene() -> None:
     assert not held & {_content(scenario.scene) for scenario in all_scenarios()}
 
 
-def test_a_scene_of_other_content_but_the_same_walls_would_be_noticed() -> None:
-    hospital = load_scene("hospital")
-    assert _content(hospital) == _content(replace(hospital, name="other", start=(20.8, 25.1, 0.0)))
-    assert _content(hospital) != _content(replace(hospital, objects=hospital.objects[1:]))
-
-
-@pytest.mark.slow
-def test_no_layout_seed_is_reserved_for_the_benchmark() -> None:
-    assert all(scenario.layout_seed >= 100 for scenario in all_scenarios())
-    assert not {scenario.layout_seed for scenario in all_scenarios()} & set(BENCHMARK_SEEDS.values())
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 3, 99])
 def test_a_reserved_layout_is_refused(kind: str, seed: int) -> None:
     with pytest.raises((SiteError, LayoutError), match="benchmark"):
         Site(kind, seed)
-
-
-def test_the_suites_own_scenes_are_no_kind_of_training() -> None:
-    assert {episode.scene for episode in SUITE} & set(KINDS) == set(KINDS) - {CORRIDOR}
-    for scenario in all_scenarios():
-        assert scenario.scene.name == scenario.episode.scene == f"{scenario.kind}-{scenario.layout_seed}"
 
 
 def test_no_seed_of_a_crowd_is_the_benchmarks() -> None:
@@ -92,15 +75,11 @@ def test_the_demos_sentence_is_none_of_trainings() -> None:
     assert INSTRUCTION.lower() not in {text.lower().rstrip(".") for s in scenarios(CORRIDOR) for text in s.wordings}
 
 
-def test_a_scenario_with_a_wording_of_the_benchmark_is_refused() -> None:
+def test_a_scenario_with_a_wording_or_a_crowd_of_the_benchmark_is_refused() -> None:
     scenario = scenarios("office")[0]
     taken = (*scenario.wordings[:-1], SUITE[0].instructions[0])
     with pytest.raises(ScenarioError, match="patterns"):
         replace(scenario, episode=replace(scenario.episode, instructions=taken))
-
-
-def test_a_scenario_with_a_crowd_of_the_benchmark_is_refused() -> None:
-    scenario = scenarios("office")[0]
     with pytest.raises(ScenarioError, match="seed"):
         replace(scenario, episode=replace(scenario.episode, seed=SUITE[0].seed))
 
@@ -124,13 +103,6 @@ def test_a_task_can_be_done_by_its_robot_and_ends_before_its_landmark() -> None:
         assert gap < max(thing.size_m[:2]) / 2 + 2.0
 
 
-def test_steps_are_written_down_with_their_side_and_count() -> None:
-    for scenario in all_scenarios():
-        written = scenario.told_json()
-        assert [row["ordinal"] for row in written] == [step.ordinal for step in scenario.told.steps]
-        assert all(row["side"] in ("left", "right", "straight") for row in written)
-
-
 def test_the_demos_corridor_is_itself_for_even_seeds_and_rearranged_for_odd_ones() -> None:
     def places(scene: Scene) -> list[tuple[float, ...]]:
         return [thing.position_m for thing in scene.objects]
@@ -151,29 +123,12 @@ def test_the_same_seed_gives_the_same_scenarios_whichever_of_them_are_drawn() ->
     assert [s.episode for s in training_episodes(SEED, 1, kinds, start=1, tasks_per_scene=2)] == together[1:2]
 
 
-def test_another_seed_has_other_layouts() -> None:
-    kind = "warehouse"
-    other = scenario_group(SEED + 1, KINDS.index(kind), {kind: 1.0}, 1)[0]
-    assert other.layout_seed != scenarios(kind)[0].layout_seed
-    assert other.scene.objects != scenarios(kind)[0].scene.objects
-
-
-def test_ids_and_seeds_of_episodes_are_unique() -> None:
-    episodes = [scenario.episode for scenario in all_scenarios()]
-    assert len({episode.id for episode in episodes}) == len(episodes) == sum(EACH.values())
-
-
 def test_kinds_come_in_their_shares_even_in_a_short_run() -> None:
     count = 60
     kinds = [kind_of_group(0, group, SHARES) for group in range(count)]
     total = sum(SHARES.values())
     for kind, share in SHARES.items():
         assert abs(kinds.count(kind) - count * share / total) <= 3
-
-
-def test_a_share_of_nothing_is_never_drawn() -> None:
-    shares = {"office": 1.0, "sidewalk": 0.0}
-    assert {kind_of_group(0, group, shares) for group in range(30)} == {"office"}
 
 
 @pytest.mark.parametrize("kinds", [{"castle": 1.0}, {"office": -1.0}, {"office": 0.0}, {}, {"office": float("nan")}])
@@ -188,10 +143,3 @@ def test_shares_that_make_no_sense_are_refused(kinds: dict[str, float]) -> None:
 def test_numbers_out_of_range_are_refused(seed: int, count: int, start: int) -> None:
     with pytest.raises(ScenarioError):
         next(training_episodes(seed, count, {"office": 1.0}, start=start), None)
-
-
-def test_validation_by_layout_is_possible() -> None:
-    """Layouts of neighbouring groups have neighbouring seeds: whatever splits by them finds every remainder."""
-    seeds = [scenarios(kind)[0].layout_seed for kind in KINDS]
-    assert len({seed % 8 for seed in seeds}) > 2
-    assert TASKS_PER_SCENE >= 4

@@ -27,14 +27,14 @@ from edge.state.reasoning_text import (
     format_text,
     parse_text,
 )
-from sim_hil.crowd.people import RENDER_FIELDS, People
+from sim_hil.crowd.people import RENDER_FIELDS
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
-from tools.train.config.scenes import CORRIDOR, KINDS
-from tools.train.scenes import trace_sentences as trace_words
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.traces import PEOPLE_M, Tracer
+from tools.train.config.collect import CORRIDOR, KINDS
+from tools.train.drives import trace_sentences as trace_words
+from tools.train.drives.scenarios import Scenario
+from tools.train.drives.traces import PEOPLE_M, Tracer
 
 NOBODY = (np.zeros((0, 3)), np.zeros((0, 2)))
 AHEAD = [(2.0, 0.0)]
@@ -90,19 +90,6 @@ def test_the_corpus_holds_every_name_area_and_motion() -> None:
     assert [phrase for phrase in phrases if phrase not in text] == []
 
 
-def test_the_corpus_is_always_the_same() -> None:
-    assert list(trace_words.corpus()) == list(trace_words.corpus())
-
-
-def test_the_texts_of_scenarios_are_made_of_the_corpus_words() -> None:
-    known = {word.strip(".,") for text in trace_words.corpus() for word in text.split()}
-    for scenario in all_scenarios():
-        tracer = _tracer(scenario)
-        for pose in _poses(scenario, 6.0):
-            text = format_text(tracer.trace(pose, *NOBODY))
-            assert {word.strip(".,") for word in text.split()} <= known, text
-
-
 CORRIDOR_HERE, STOP = Situation("corridor"), Plan(Stop(3))
 
 
@@ -111,18 +98,6 @@ def test_objects_for_which_there_is_no_room_are_left_out_last_ones_first() -> No
     people = [SeenPerson("ahead", 2, "crossing left")] * 2
     text = trace_words.five_aspects(CORRIDOR_HERE, objects, people, Progress(1, 2, 0), STOP)
     assert text.objects == (objects[0],)
-
-
-def test_a_text_that_is_too_long_without_objects_is_refused() -> None:
-    people = [SeenPerson("ahead", 2, "crossing left")] * 6
-    with pytest.raises(ValueError, match="45 words"):
-        trace_words.five_aspects(CORRIDOR_HERE, [], people, Progress(1, 1, 0), STOP)
-
-
-@pytest.mark.parametrize(("metres", "whole"), [(0.2, 1), (1.4, 1), (1.6, 2), (29.7, 30), (80.0, 30)])
-def test_distances_are_whole_metres_within_what_the_corpus_holds(metres: float, whole: int) -> None:
-    assert trace_words.whole_metres(metres) == whole
-    assert trace_words.plan_metres(metres) == (0 if metres < 1 else whole)
 
 
 def test_the_five_aspects_survive_a_drives_header() -> None:
@@ -158,12 +133,6 @@ def test_the_plan_is_the_next_told_step_or_to_stop(kind: str) -> None:
                 step = steps[trace.progress.step - 1]
                 assert isinstance(action, Turn)
                 assert (action.side, action.area) == ("ahead" if step.side == "straight" else step.side, step.kind)
-
-
-def test_on_the_way_nobody_turns_back() -> None:
-    for scenario in all_scenarios():
-        tracer = _tracer(scenario)
-        assert not [p for p in _poses(scenario, 5.0) if tracer.trace(p, *NOBODY, AHEAD).plan == Plan(TurnBack())]
 
 
 def test_whoever_means_to_be_behind_itself_turns_back() -> None:
@@ -220,13 +189,6 @@ def test_people_are_told_by_where_they_are_and_how_they_walk(
     trace = _tracer(scenario).trace(pose, _person(pose, *place), np.array((velocity,)))
     assert format_people(trace.people or ()) == said
     assert trace.situation == Situation("corridor", crowd=1)
-
-
-def test_directions_are_the_robots_not_the_worlds() -> None:
-    scenario = scenarios(CORRIDOR)[0]
-    pose = SE2(13.0, 0.0, pi)
-    trace = _tracer(scenario).trace(pose, _person(pose, 3.0, 0.0), np.array(((0.0, 1.0),)))
-    assert trace.people == (SeenPerson("ahead", 3, "crossing right"),)
 
 
 @pytest.mark.parametrize("place", [(-2.0, 0.0), (0.0, 1.5), (PEOPLE_M + 0.2, 0.0)])
@@ -329,18 +291,3 @@ def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scen
         assert seen >= 2 and unseen >= 1
     finally:
         bare.close()
-
-
-@pytest.mark.slow
-def test_a_whole_walk_through_people_can_be_told() -> None:
-    scenario = scenarios("hospital")[0]
-    tracer, people = _tracer(scenario), People(replace(scenario.scene, start=scenario.task.start), 20, 1)
-    texts = []
-    for pose in _poses(scenario, 2.0):
-        texts.append(format_text(tracer.trace(pose, people.poses(), people.velocities(), AHEAD)))
-        for _ in range(30):
-            people.step(*pose.as_tuple())
-    assert all(format_text(parse_text(text)) == text for text in texts)
-    assert any("person" in text for text in texts)
-    again = _tracer(scenario).trace(_poses(scenario, 2.0)[0], *NOBODY, AHEAD)
-    assert again == tracer.trace(_poses(scenario, 2.0)[0], *NOBODY, AHEAD)

@@ -21,7 +21,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from sim_hil.benchmark.policies.expert import driving_of
 from sim_hil.layouts import LayoutError
 from tools.train.drives.drive import Drive
-from tools.train.scenes.sites import Site, SiteError
+from tools.train.drives.scenarios import Site, SiteError
 
 CELL_M: Final = 0.1
 X_M: Final = (-0.6, 5.4)
