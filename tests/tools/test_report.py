@@ -89,18 +89,6 @@ def test_the_models_text_cannot_act_on_the_page(html: str) -> None:
     assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left⟨U+0007⟩ & <b>go</b> \U0001f916' in shown
 
 
-@given(st.text(st.characters(), max_size=200))
-def test_any_text_is_one_inert_run_of_characters(text: str) -> None:
-    escaped = page.text_html(text)
-    parser = _parse(f"<pre>{escaped}</pre>")
-    assert [tag for tag, _ in parser.tags] == ["pre"]
-    escaped.encode("utf-8")
-
-
-def test_long_text_is_cut_and_says_so() -> None:
-    assert page.text_html("x" * 1000, limit=10) == "xxxxxxxxxx … (1000 characters in all)"
-
-
 def test_every_picture_decodes(html: str) -> None:
     pictures = [attributes["src"] for tag, attributes in _parse(html).tags if tag == "img"]
     assert len(pictures) == 4 + len(synthetic_run.generations(12.0))

@@ -19,7 +19,6 @@ from reporting.plot_style import (
     PERSON,
     TRUTH,
     WALL,
-    delay_histogram,
     legend_above,
     new_figure,
     percentile,
@@ -27,8 +26,6 @@ from reporting.plot_style import (
     tidy,
 )
 from tools.report.run_data import Array, Record, RunData, odometry_in_world
-
-__all__ = ["close_up", "delay_histogram", "tick_histogram", "time_line", "top_down"]
 
 OVERHEAD_KINDS = frozenset({"light", "sign"})  # nobody meets them on the floor
 FLAT_KINDS = frozenset({"door", "window", "notice_board"})  # on a wall
