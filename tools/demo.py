@@ -16,17 +16,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
 from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.shipped import shipped_weights
 from export.model.config import PRESETS
-from reporting.progress_line import Progress, TraceTail
+from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
-from tools.report.run_data import Record, ReportError
+from tools.report.run_data import Array, Record, ReportError
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
@@ -96,6 +98,45 @@ class DemoOptions:
         return RunFiles(self.out, self.artifacts)
 
 
+class TraceTail:
+    """Follows edge-hil's trace while it is written: Move requests received and metres walked so far."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._last_xy: Array | None = None
+        self._last_ns = 0
+        self.moves = 0
+        self.walked_m = 0.0
+
+    def update(self) -> None:
+        """Read what was added since; an unfinished last line is left for the next time."""
+        try:
+            with self._path.open("rb") as stream:
+                stream.seek(self._offset)
+                added = stream.read()
+        except OSError:
+            return
+        whole = added[: added.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        for line in whole.splitlines():
+            self._take(line)
+
+    def _take(self, line: bytes) -> None:
+        try:
+            record = json.loads(line)
+            if record["kind"] == "wire" and record["name"] == "Move":
+                self.moves += 1
+            elif record["kind"] == "pose" and record["t_ns"] - self._last_ns >= 1_000_000_000:
+                # One-second steps, so that a body swaying in place does not add up to a walk.
+                xy = np.array([record["x"], record["y"]], float)
+                if self._last_xy is not None:
+                    self.walked_m += float(np.linalg.norm(xy - self._last_xy))
+                self._last_xy, self._last_ns = xy, record["t_ns"]
+        except (ValueError, KeyError, TypeError):
+            return  # only a progress line: the report reads the same file strictly
+
+
 def _say(line: str) -> None:
     sys.stderr.write(f"demo: {line}\n")
     sys.stderr.flush()
@@ -154,8 +195,14 @@ def trained(artifacts: Path) -> bool:
         return False
 
 
+def _progress(describe: Callable[[float], str]) -> Progress:
+    """Show `describe(elapsed_s)` while a step runs."""
+    started_ns = time.monotonic_ns()
+    return Progress("demo: ", lambda: describe((time.monotonic_ns() - started_ns) / 1e9))
+
+
 def _run_to_end(children: Children, child: Child, what: str) -> int:
-    with Progress(lambda elapsed_s: f"demo: {what}, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"{what}, {elapsed_s:.0f} s") as progress:
         code = children.wait(child, EXPORT_TIMEOUT_S, progress.tick)
     children.forget(child)
     return code
@@ -167,11 +214,11 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     robot = ROBOT_FILE if trained(options.artifacts) else slow_robot(options.out, UNTRAINED_SPEED_MPS)
     common = ["--robot", str(robot), "--socket", str(socket), *domain]
     hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
-    with Progress(lambda elapsed_s: f"demo: starting the simulated robot, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
     bridge_result = ["--json", str(files.result("edge-bridge"))]
     bridge = children.start("edge-bridge", [*commands["edge-bridge"], *common, *bridge_result])
-    with Progress(lambda elapsed_s: f"demo: starting the bridge, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"starting the bridge, {elapsed_s:.0f} s") as progress:
         children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", progress.tick)
     run = children.start("edge-run", [*commands["edge-run"], *common, *_run_arguments(options)])
     trace = TraceTail(files.trace)
@@ -179,11 +226,11 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     def describe(elapsed_s: float) -> str:
         trace.update()
         return (
-            f"demo: driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
+            f"driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
             f"{trace.moves} commands · {trace.walked_m:.1f} m walked"
         )
 
-    with Progress(describe) as progress:
+    with _progress(describe) as progress:
         code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
     if code == EXIT_CHECK_FAILED and files.result("edge-run").exists():
         # A fault ended the run early. Its report is the way to find out why, and fails by its checks.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +23,7 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
+from reporting.progress import Progress
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
@@ -38,7 +38,7 @@ from sim_hil.soak.verdict.measures import names
 from sim_hil.soak.verdict.moments import keep_moments
 
 MODES: Final = ("async", "sync", "no-reasoning")
-PLAIN_S: Final = 30.0
+STATUS_PERIOD_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
 """Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
 not end the run, so that the growth of the runner can be measured."""
@@ -134,15 +134,15 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
             f"speed limit {options.speed_mps:g} m/s"
         )
     with stop_signals() as stop:
-        progress, failure = _Progress(), ""
+        failure = ""
         try:
-            finished = run_legs(
-                soak, options, menu, stopped=lambda: bool(stop), show_status=progress.status, log=progress.log,
-                keep_logs=args.keep_logs, commands=commands, after_leg=keep_moments,
-            )  # fmt: skip
+            with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
+                finished = run_legs(
+                    soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.say,
+                    keep_logs=args.keep_logs, commands=commands, after_leg=keep_moments,
+                )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
-        progress.end()
         result = soak_result(soak, options, budget, finished=finished)
         _write(args, soak, options, result, budget)
     if failure:
@@ -231,31 +231,6 @@ def summary_lines(result: Mapping[str, Any]) -> str:
 
 def _why(line: Mapping[str, object]) -> str:
     return f"  ({line['why']})" if "why" in line else ""
-
-
-class _Progress:
-    """Status line on stderr: redrawn on a terminal, otherwise printed every PLAIN_S seconds."""
-
-    def __init__(self) -> None:
-        self._printed_ns = 0
-        self._terminal = sys.stderr.isatty()
-
-    def status(self, line: str) -> None:
-        now_ns = time.monotonic_ns()
-        if self._terminal:
-            sys.stderr.write(f"\r\x1b[Kedge-soak: {line}")
-            sys.stderr.flush()
-        elif now_ns - self._printed_ns >= PLAIN_S * 1e9:
-            self._printed_ns = now_ns
-            _print(line)
-
-    def log(self, line: str) -> None:
-        self.end()
-        _print(line)
-
-    def end(self) -> None:
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
 
 
 def _print(line: str) -> None:

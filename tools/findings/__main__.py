@@ -23,7 +23,7 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
-from reporting.build_progress import duration
+from reporting.progress import duration
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.language.instructions import is_held_out

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from reporting.build_progress import duration
+from reporting.progress import duration
 from tools.train.collect import collect
 from tools.train.config.collect import OF_TOURS
 from tools.train.config.recipe import Recipe

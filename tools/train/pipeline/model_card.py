@@ -15,7 +15,7 @@ from safetensors import safe_open
 from edge.core.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
-from reporting.build_progress import duration
+from reporting.progress import duration
 from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.pipeline.chain import ADOPTED, GO_ON

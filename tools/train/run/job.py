@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from dataclasses import dataclass, field
 from typing import Protocol
 from zlib import crc32
@@ -11,7 +9,6 @@ from zlib import crc32
 import numpy as np
 import torch
 
-from reporting.build_progress import duration
 from tools.train.config.recipe import Recipe
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.run_dir import RunDir
@@ -39,37 +36,6 @@ class QuietProgress:
 
     def say(self, line: str) -> None:
         """Nothing to do."""
-
-
-class PlainProgress:
-    """Progress as lines on standard error, at most one per `period_s`."""
-
-    def __init__(self, stage: str, period_s: float = 15.0) -> None:
-        self._stage = stage
-        self._period_s = period_s
-        self._shown_ns = time.monotonic_ns()
-        self._began: tuple[int, int, int] | None = None
-        """Total, first count and start of the current work, ns: a stage may have several parts."""
-        self._last = 0
-
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        """Write a line if the last one is at least `period_s` old, or if the work is done."""
-        now_ns = time.monotonic_ns()
-        if self._began is None or self._began[0] != total or done < self._last:
-            self._began, self._last = (total, done, now_ns), -1
-        due = (now_ns - self._shown_ns) / 1e9 >= self._period_s
-        if done == self._last or not (due or done >= total):
-            return
-        self._shown_ns, self._last = now_ns, done
-        _, first, since_ns = self._began
-        rate = (done - first) / max((now_ns - since_ns) / 1e9, 1e-9)
-        values = "".join(f", {name} {value:.4g}" for name, value in numbers.items())
-        left = f", {duration((total - done) / rate)} to go" if rate > 0 and done < total else ""
-        self.say(f"{done} of {total} ({rate:.3g} /s{left}){values}")
-
-    def say(self, line: str) -> None:
-        """Write one line."""
-        sys.stderr.write(f"edge-train: {self._stage}: {line}\n")
 
 
 class StopFlag:

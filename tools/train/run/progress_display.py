@@ -2,76 +2,20 @@
 
 from __future__ import annotations
 
-import sys
-from contextlib import AbstractContextManager
-from typing import TextIO
+from contextlib import AbstractContextManager, nullcontext
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
-from tools.train.run.job import PlainProgress, QuietProgress, StageProgress
+from reporting.progress import Progress
+from tools.train.run.job import QuietProgress, StageProgress
 
 
-class StageBar(AbstractContextManager["StageBar"]):
-    """A progress bar with the newest values; a `StageProgress`."""
-
-    def __init__(self, stage: str, console: Console) -> None:
-        self._stage, self._console = stage, console
-        self._bar = Progress(
-            TextColumn(f"[bold]edge-train[/bold] {stage}"), BarColumn(bar_width=24), MofNCompleteColumn(),
-            TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False), console=console,
-        )  # fmt: skip
-        self._task: TaskID | None = None
-        self._total = 0
-
-    def __enter__(self) -> StageBar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+class StageDisplay(Progress):
+    """Progress with the newest values; a `StageProgress`."""
 
     def update(self, done: int, total: int, **numbers: float) -> None:
-        """Move the bar."""
-        if self._task is None:
-            self._task, self._total = self._bar.add_task("", total=total, completed=done), total
-        if total != self._total:  # a stage may have several parts
-            self._bar.reset(self._task, total=total)
-            self._total = total
-        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
-        self._bar.update(self._task, completed=done, total=total, description=values)
-
-    def say(self, line: str) -> None:
-        """Write a line above the bar."""
-        self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
+        """Report `done` of `total` units of work, with values to show."""
+        self.show(", ".join(f"{name} {value:.4g}" for name, value in numbers.items()), done, total)
 
 
-class _Lines(AbstractContextManager[StageProgress]):
-    """Context manager around a progress that needs no cleanup."""
-
-    def __init__(self, progress: StageProgress) -> None:
-        self._progress = progress
-
-    def __enter__(self) -> StageProgress:
-        return self._progress
-
-    def __exit__(self, *_: object) -> None:
-        return
-
-
-def progress_for(
-    stage: str, *, quiet: bool = False, stream: TextIO | None = None
-) -> AbstractContextManager[StageProgress]:
-    """Return the progress display for a stage: a bar, lines, or with `quiet` nothing."""
-    if quiet:
-        return _Lines(QuietProgress())
-    console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)
-    return StageBar(stage, console) if console.is_terminal else _Lines(PlainProgress(stage))
+def progress_for(stage: str, *, quiet: bool = False) -> AbstractContextManager[StageProgress]:
+    """Return the progress display of a stage; with `quiet` one that shows nothing."""
+    return nullcontext(QuietProgress()) if quiet else StageDisplay(f"edge-train: {stage}: ", bar=True)
