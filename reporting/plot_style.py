@@ -31,9 +31,9 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG."""
+    """The figure as PNG; the bytes depend on what is drawn alone."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 

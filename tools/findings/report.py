@@ -7,17 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from edge.core.cli import write_whole
+from reporting.plot_style import BAD, COMMAND, GOOD, INK, MUTED, TRUTH, new_figure, png, tidy
 from sim_hil.benchmark.results.summary import interval_of, summarise
 from tools.findings.rows import SWEEP_S
-from tools.findings.verdict import FAILS, HOLDS, Judged, Results
+from tools.findings.verdict import FAILS, HOLDS, OPEN, Judged, Results
 
 SCHEMA: Final = 1
-COLOURS: Final = {HOLDS: "#2c8c4a", FAILS: "#b3261e"}
-OPEN_COLOUR: Final = "#5b6774"
+COLOURS: Final = {HOLDS: GOOD, FAILS: BAD, OPEN: MUTED}
 NAMES: Final = {"sr": "SR", "spl": "SPL", "cr": "CR", "ne_m": "NE"}
 HOW: Final = """\
 Each run drives the same episodes; a difference is taken episode by episode. Intervals are of 95 %, percentile
@@ -129,29 +126,27 @@ def _mean(run: Mapping[str, Any], key: str) -> str:
 
 def draw_findings(judged: Sequence[Judged], path: Path) -> Path:
     """Every claim's number with its interval and its bound, one row each."""
-    figure = Figure(figsize=(9.0, 1.0 + 0.42 * len(judged)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 1.0 + 0.42 * len(judged))
     axis = figure.subplots()
     for row, each in enumerate(reversed(judged)):
-        colour = COLOURS.get(each.verdict, OPEN_COLOUR)
+        colour = COLOURS[each.verdict]
         low, high = each.ci95 or (each.value, each.value)
         axis.plot((low, high), (row, row), color=colour, linewidth=2.5, solid_capstyle="butt")
         axis.plot((each.value,), (row,), "o", color=colour, markersize=6)
-        axis.plot((each.least, each.least), (row - 0.35, row + 0.35), color="#1d2733", linewidth=1.2, linestyle=":")
+        axis.plot((each.least, each.least), (row - 0.35, row + 0.35), color=INK, linewidth=1.2, linestyle=":")
+    tidy(axis)
     axis.set_yticks(range(len(judged)), [f"{each.claim} (n {each.n})" for each in reversed(judged)], fontsize=8)
     axis.set_xlabel("points, with the interval of 95 %; dotted: the bound")
-    axis.axvline(0.0, color="#1d2733", linewidth=0.8)
-    axis.grid(axis="x", color="#dfe4e9", linewidth=0.6)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    axis.axvline(0.0, color=INK, linewidth=0.8)
+    path.write_bytes(png(figure))
     return path
 
 
 def draw_latency(results: Results, path: Path) -> Path:
     """SR and CR over latency, before and after PPO (the paper's Figure 5)."""
-    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.0, 3.4)
     for axis, metric in zip(figure.subplots(1, 2), ("sr", "cr"), strict=True):
-        for prefix, label, colour in (("no-rl", "before PPO", "#d1603d"), ("rl", "after PPO", "#1f6f8b")):
+        for prefix, label, colour in (("no-rl", "before PPO", COMMAND), ("rl", "after PPO", TRUTH)):
             seconds = [s for s in SWEEP_S if results.get(f"{prefix}-{s}s")]
             means = [summarise(results[f"{prefix}-{s}s"])[metric] for s in seconds]
             intervals = [
@@ -163,7 +158,7 @@ def draw_latency(results: Results, path: Path) -> Path:
         axis.set_xlabel("latency of reasoning, s")
         axis.set_ylabel(f"{NAMES[metric]}, %")
         axis.set_ylim(0, 100)
-        axis.grid(color="#dfe4e9", linewidth=0.6)
+        tidy(axis)
         axis.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    path.write_bytes(png(figure))
     return path

@@ -14,8 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,6 +21,7 @@ from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to, target_of
 from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints
 from edge.state.semantic import waypoints_now
+from reporting.plot_style import new_figure, png, tidy
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import ImitateEvalConfig
 from tools.train.imitate.data import SampleChoice, Samples
@@ -218,8 +217,7 @@ def _straight(points: Waypoints, offset: SE2, since_s: float, steps: int) -> Arr
 def draw_errors(result: Mapping[str, Any], path: Path) -> None:
     """Plot the errors by delay as a PNG file. Raises OSError."""
     bins = result["by_delay"]
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2)
     ages = [(each["from_s"] + each["to_s"]) / 2 for each in bins]
     for name in sorted(result["all"]):
@@ -238,7 +236,7 @@ def draw_errors(result: Mapping[str, Any], path: Path) -> None:
     for axis in (left, right):
         axis.set_xlabel("age of the semantic state, s")
         axis.set_ylim(bottom=0)
-        axis.grid(color="#dfe4e9", linewidth=0.6)
+        tidy(axis)
     right.legend(loc="best", fontsize=8, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    path.write_bytes(png(figure))
