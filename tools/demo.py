@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import signal
 import sys
@@ -15,8 +16,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
@@ -26,9 +25,10 @@ from export.model.config import PRESETS
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir
+from sim_hil.realtime.truth import LineTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
-from tools.report.run_data import Array, Record, ReportError
+from tools.report.run_data import Record, ReportError
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
@@ -43,7 +43,7 @@ EXPORT_TIMEOUT_S = 1800.0
 READY_TIMEOUT_S = 90.0
 BRIDGE_TIMEOUT_S = 30.0
 STARTUP_TIMEOUT_S = 120.0
-LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last words are in the trace
+LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last commands are in the trace
 
 EXAMPLES = """examples:
   python -m tools.demo --out out/demo
@@ -98,46 +98,29 @@ class DemoOptions:
         return RunFiles(self.out, self.artifacts)
 
 
-class TraceTail:
+class TraceTail(LineTail):
     """Follows edge-hil's trace while it is written: Move requests received and metres walked so far."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._offset = 0
-        self._last_xy: Array | None = None
+        super().__init__(path)
+        self._last: tuple[float, float] | None = None
         self._last_ns = 0
         self.moves = 0
         self.walked_m = 0.0
 
     def update(self) -> None:
-        """Read what was added since; an unfinished last line is left for the next time."""
-        try:
-            with self._path.open("rb") as stream:
-                stream.seek(self._offset)
-                added = stream.read()
-        except OSError:
-            return
-        whole = added[: added.rfind(b"\n") + 1]
-        self._offset += len(whole)
-        for line in whole.splitlines():
-            self._take(line)
-
-    def _take(self, line: bytes) -> None:
-        try:
-            record = json.loads(line)
-            if record["kind"] == "wire" and record["name"] == "Move":
+        """Count what was added since the last call."""
+        for line in self.lines():
+            if line["kind"] == "wire" and line["name"] == "Move":
                 self.moves += 1
-            elif record["kind"] == "pose" and record["t_ns"] - self._last_ns >= 1_000_000_000:
+            elif line["kind"] == "pose" and line["t_ns"] - self._last_ns >= 1_000_000_000:
                 # One-second steps, so that a body swaying in place does not add up to a walk.
-                xy = np.array([record["x"], record["y"]], float)
-                if self._last_xy is not None:
-                    self.walked_m += float(np.linalg.norm(xy - self._last_xy))
-                self._last_xy, self._last_ns = xy, record["t_ns"]
-        except (ValueError, KeyError, TypeError):
-            return  # only a progress line: the report reads the same file strictly
+                position = (line["x"], line["y"])
+                self.walked_m += 0.0 if self._last is None else math.dist(position, self._last)
+                self._last, self._last_ns = position, line["t_ns"]
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stderr.write(f"demo: {line}\n")
     sys.stderr.flush()
 
@@ -160,7 +143,7 @@ def run_demo(
     with socket_dir() as socket_folder, Children(options.log_dir) as children:
         _export(options, commands["edge-export"], children)
         _drive(options, commands, children, socket_folder / "bridge.sock")
-    _say("writing the report")
+    _print("writing the report")
     return report(options.files, wall_s=(time.monotonic_ns() - started_ns) / 1e9)
 
 
@@ -173,10 +156,10 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
         else:
             child = children.start("edge-export-verify", [*command, "verify", artifacts])
             if _run_to_end(children, child, f"checking the artifacts in {artifacts}") == 0:
-                _say(f"artifacts in {artifacts} verified, not exported again")
+                _print(f"artifacts in {artifacts} verified, not exported again")
                 return
             why = f"do not verify (see {child.log})"
-        _say(f"artifacts in {artifacts} {why}, exporting again")
+        _print(f"artifacts in {artifacts} {why}, exporting again")
         if ours:
             shutil.rmtree(options.artifacts)  # edge-export itself decides about any other directory
     result = str(options.files.result("edge-export"))
@@ -234,7 +217,7 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
         code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
     if code == EXIT_CHECK_FAILED and files.result("edge-run").exists():
         # A fault ended the run early. Its report is the way to find out why, and fails by its checks.
-        _say(str(run.failure("a fault ended the run")))
+        _print(str(run.failure("a fault ended the run")))
     elif code != 0:
         raise run.failure(f"exit code {code}")
     children.forget(run)
@@ -302,7 +285,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain)
         _make_folder(options.log_dir)
     except (ValueError, OSError) as error:
-        _say(str(error))
+        _print(str(error))
         return EXIT_BAD_INPUT
     # SIGINT too: a shell starts background jobs with it ignored, and the children would inherit that.
     before = {number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -310,17 +293,17 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         summary = run_demo(options, commands)
         write_result(args.json, summary)
     except KeyboardInterrupt:
-        _say("interrupted, all processes ended")
+        _print("interrupted, all processes ended")
         return EXIT_INTERRUPTED
     except (StepError, ReportError, CheckpointError, OSError) as error:
-        _say(str(error))
+        _print(str(error))
         return EXIT_CHECK_FAILED
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     failed = [name for name, check in summary["checks"].items() if not check["pass"]]
     for name in failed:
-        _say(f"check {name} failed: {json.dumps(summary['checks'][name])}")
+        _print(f"check {name} failed: {json.dumps(summary['checks'][name])}")
     (sys.stderr if args.json == "-" else sys.stdout).write(f"{options.files.report}\n")
     return EXIT_CHECK_FAILED if failed else EXIT_DONE
 

@@ -1,4 +1,4 @@
-"""Whether the paper's findings hold for our models: paired runs of the benchmark, differences, intervals, one page."""
+"""Test the paper's findings on our models: paired runs of the benchmark, differences, intervals, one page."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _main(args: argparse.Namespace) -> int:
         raise ConditionsError(next(iter(plan.missing.values()), "--rows: nothing to run"))
     if args.dry_run:
         for line in plan_lines(plan, len(episodes)):
-            _say(line)
+            _print(line)
         return EXIT_DONE
     args.out.mkdir(parents=True, exist_ok=True)
     broken: list[RunsError] = []
@@ -126,12 +126,12 @@ def _main(args: argparse.Namespace) -> int:
             for name in dict.fromkeys(plan.folders.values()):
                 try:
                     _run(args, name, plan.conditions[name], episodes, stop)
-                except RunsError as error:  # the other runs still tell
+                except RunsError as error:  # the other runs are still useful
                     broken.append(error)
-                    _say(str(error))
+                    _print(str(error))
                 except ConditionsError as error:  # not of this suite, or not by this model
                     unfit[name] = str(error)
-                    _say(f"{name}: {error}")
+                    _print(f"{name}: {error}")
     except KeyboardInterrupt:
         _report(args, plan, base, len(episodes), unfit)
         raise
@@ -142,7 +142,7 @@ def _main(args: argparse.Namespace) -> int:
             sys.stdout.write(
                 f"{each['verdict']:<14} {each['claim']}: {each['value']:+.1f} {each['ci95'] or ''} n {each['n']}\n"
             )
-    _say(f"{args.out / 'findings.md'}")
+    _print(f"{args.out / 'findings.md'}")
     if not result["findings"]:
         return _fail(EXIT_CHECK_FAILED, "no claim could be judged: no run has a result")
     return EXIT_CHECK_FAILED if broken else EXIT_DONE
@@ -193,7 +193,7 @@ def _run(
 ) -> None:  # fmt: skip
     folder = args.out / "runs" / name
     done = len(read_results(folder)) if folder.is_dir() else 0
-    _say(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are there")
+    _print(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are there")
     started_ns = time.monotonic_ns()
     with BenchProgress(len(episodes), done) as progress:
         run_episodes(
@@ -205,7 +205,7 @@ def _run(
             stopped=lambda: bool(stop),
             watcher=progress.watcher,
         )
-    _say(f"{name}: done in {duration((time.monotonic_ns() - started_ns) / 1e9)}")
+    _print(f"{name}: done in {duration((time.monotonic_ns() - started_ns) / 1e9)}")
 
 
 def _report(
@@ -217,12 +217,12 @@ def _report(
     for name, folder in plan.folders.items():
         path = args.out / "runs" / folder
         found = read_results(path) if path.is_dir() else []
-        told = read_result(path) if (path / RESULT).is_file() else {"summary": {"finished": False}}
-        if not found or not told["summary"]["finished"]:
+        result = read_result(path) if (path / RESULT).is_file() else {"summary": {"finished": False}}
+        if not found or not result["summary"]["finished"]:
             missing[name] = unfit.get(folder, f"{len(found)} of {asked} episodes so far")
             continue
         results[name] = found
-        trained = trained and bool(told["trained"])
+        trained = trained and bool(result["trained"])
     about = {
         "suite": args.suite,
         "asked": asked,
@@ -235,12 +235,12 @@ def _report(
     return write_findings(args.out, about, judge_all(results, plan.claims), results, described, missing)
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stderr.write(f"{COMMAND}: {line}\n")
 
 
 def _fail(code: int, line: str) -> int:
-    _say(line)
+    _print(line)
     return code
 
 

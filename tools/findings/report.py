@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,24 +32,6 @@ beside it; with five of them one may hold by chance.
 """
 
 
-def findings_json(
-    about: Mapping[str, object],
-    judged: Sequence[Judged],
-    results: Results,
-    described: Mapping[str, str],
-    missing: Mapping[str, str],
-) -> dict[str, Any]:
-    """What findings.json holds; `described` and `missing` say of each run its conditions, or why it is not there."""
-    return {
-        "schema": SCHEMA,
-        **about,
-        "findings": [each.as_json() for each in judged],
-        "runs": {name: {"conditions": described[name], **summarise(results[name])} for name in results},
-        "not_run": dict(missing),
-        "tagged": "measured",
-    }
-
-
 def write_findings(
     out: Path,
     about: Mapping[str, object],
@@ -57,8 +40,18 @@ def write_findings(
     described: Mapping[str, str],
     missing: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Write findings.md, findings.json and the pictures; returns the JSON."""
-    content = findings_json(about, judged, results, described, missing)
+    """Write findings.md, findings.json and the pictures; return the JSON.
+
+    `described` and `missing`: the conditions of each run, or why it is not there.
+    """
+    content = {
+        "schema": SCHEMA,
+        **about,
+        "findings": [asdict(each) for each in judged],
+        "runs": {name: {"conditions": described[name], **summarise(results[name])} for name in results},
+        "not_run": dict(missing),
+        "tagged": "measured",
+    }
     write_whole(out / "findings.json", json.dumps(content, indent=1) + "\n")
     pictures = []
     if judged:
@@ -114,9 +107,10 @@ def _row(each: Judged) -> str:
     )
 
 
-def _change(told: Mapping[str, Any]) -> str:
-    interval = told["ci95"]
-    return f"{told['difference']:+.1f}" + ("" if interval is None else f" ({interval[0]:+.1f} to {interval[1]:+.1f})")
+def _change(difference: Mapping[str, Any]) -> str:
+    interval = difference["ci95"]
+    span = "" if interval is None else f" ({interval[0]:+.1f} to {interval[1]:+.1f})"
+    return f"{difference['difference']:+.1f}{span}"
 
 
 def _mean(run: Mapping[str, Any], key: str) -> str:

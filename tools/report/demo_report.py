@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -39,37 +38,16 @@ SHEET_FRAMES = 12
 _FRAME_WIDTH_PX = 480
 
 
-@dataclass(frozen=True)
 class RunFiles:
-    """Where the files of one demo run lie."""
+    """Paths of the files of one demo run."""
 
-    out: Path
-    artifacts: Path
-
-    @property
-    def settings(self) -> Path:
-        """What the demo was asked for, written before it starts."""
-        return self.out / "settings.json"
-
-    @property
-    def flight_log(self) -> Path:
-        """Recorded by edge-run."""
-        return self.out / "flight.mcap"
-
-    @property
-    def trace(self) -> Path:
-        """Written by edge-hil."""
-        return self.out / "hil_trace.jsonl"
-
-    @property
-    def report(self) -> Path:
-        """The page."""
-        return self.out / "report.html"
-
-    @property
-    def summary(self) -> Path:
-        """The acceptance numbers."""
-        return self.out / "demo.json"
+    def __init__(self, out: Path, artifacts: Path) -> None:
+        self.out, self.artifacts = out, artifacts
+        self.settings = out / "settings.json"
+        self.flight_log = out / "flight.mcap"
+        self.trace = out / "hil_trace.jsonl"
+        self.report = out / "report.html"
+        self.summary = out / "demo.json"
 
     def result(self, command: str) -> Path:
         """JSON result of one command (`edge-run` → run.json)."""
