@@ -18,7 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edge.artifacts.files import MANIFEST_NAME
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    command_line,
+    messages,
+    write_result,
+)
 from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.shipped import shipped_weights
 from export.model.config import PRESETS
@@ -44,6 +52,8 @@ READY_TIMEOUT_S = 90.0
 BRIDGE_TIMEOUT_S = 30.0
 STARTUP_TIMEOUT_S = 120.0
 LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last commands are in the trace
+
+_print = messages("demo")
 
 EXAMPLES = """examples:
   python -m tools.demo --out out/demo
@@ -118,11 +128,6 @@ class TraceTail(LineTail):
                 position = (line["x"], line["y"])
                 self.walked_m += 0.0 if self._last is None else math.dist(position, self._last)
                 self._last, self._last_ns = position, line["t_ns"]
-
-
-def _print(line: str) -> None:
-    sys.stderr.write(f"demo: {line}\n")
-    sys.stderr.flush()
 
 
 def run_demo(

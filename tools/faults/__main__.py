@@ -25,6 +25,7 @@ from edge.core.cli import (
     EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.flightlog.recorder import space_refusal
@@ -37,6 +38,8 @@ from tools.faults.report import RowResult, result, show
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row, rows
 from tools.report.machine import machine_facts
+
+_print = messages("faults")
 
 EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
@@ -116,11 +119,6 @@ def _show(row: Row, which: str, sample: Sample) -> None:
     latency = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
     wrong = "; ".join(sample.wrong + sample.hindered)
     _print(f"{row.name} {which}: {latency} of {row.bound_ms:.0f} ms{wrong and f' ({wrong})'}")
-
-
-def _print(line: str) -> None:
-    sys.stderr.write(f"faults: {line}\n")
-    sys.stderr.flush()
 
 
 def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:

@@ -31,13 +31,12 @@ def main(argv: list[str] | None = None) -> int:
     """Listen until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domain", type=int, required=True)
-    parser.add_argument("--interface", default="lo")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.jsonl")
     args = parser.parse_args(argv)
     ended: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _frame: ended.append(number))
-    bus = Bus(DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ()))
+    bus = Bus(DdsConfig(args.domain, "lo", ("127.0.0.1",)))
     reader = bus.reader(ids.request_topic(ids.SPORT_SERVICE), Request_, depth=_DEPTH, reliable=True)
     waitset = bus.waitset(reader)
     sources: dict[int, int] = {}

@@ -20,6 +20,7 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    messages,
     stop_signals,
     write_result,
 )
@@ -53,6 +54,7 @@ it again to go on where it stopped.
 exit codes: 0 done (whatever holds), 1 an episode has no result, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
+_print = messages(COMMAND)
 _BAD_INPUT = (ConditionsError, LatencyError, SuiteError, SceneError, StoreError, ResultError, OSError)
 
 
@@ -87,20 +89,18 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-@command_line("findings")
+@command_line(COMMAND, {ArtifactError: EXIT_REFUSED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     try:
         return _main(args)
-    except ArtifactError as error:
-        return _fail(EXIT_REFUSED, str(error))
     except RefusedRunError as error:
-        return _fail(error.code, str(error))
-    except _BAD_INPUT as error:
-        return _fail(EXIT_BAD_INPUT, str(error))
+        _print(str(error))
+        return error.code
     except KeyboardInterrupt:
-        return _fail(EXIT_INTERRUPTED, f"interrupted; run it again to go on, {args.out}/findings.md has what is there")
+        _print(f"interrupted; run it again to go on, {args.out}/findings.md has what is there")
+        return EXIT_INTERRUPTED
 
 
 def _main(args: argparse.Namespace) -> int:
@@ -144,8 +144,8 @@ def _main(args: argparse.Namespace) -> int:
             )
     _print(f"{args.out / 'findings.md'}")
     if not result["findings"]:
-        return _fail(EXIT_CHECK_FAILED, "no claim could be judged: no run has a result")
-    return EXIT_CHECK_FAILED if broken else EXIT_DONE
+        _print("no claim could be judged: no run has a result")
+    return EXIT_CHECK_FAILED if broken or not result["findings"] else EXIT_DONE
 
 
 def rows_of(text: str | None) -> list[str]:
@@ -233,15 +233,6 @@ def _report(
     }
     described = {name: plan.conditions[name].describe() for name in results}
     return write_findings(args.out, about, judge_all(results, plan.claims), results, described, missing)
-
-
-def _print(line: str) -> None:
-    sys.stderr.write(f"{COMMAND}: {line}\n")
-
-
-def _fail(code: int, line: str) -> int:
-    _print(line)
-    return code
 
 
 if __name__ == "__main__":
