@@ -5,9 +5,9 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TextIO
+from typing import TextIO, TypeVar
 
 from rich import progress as rich
 from rich.console import Console
@@ -32,7 +32,10 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-class Progress(AbstractContextManager["Progress"]):
+_P = TypeVar("_P", bound="Progress")
+
+
+class Progress:
     """Progress display, used as a context manager around the work.
 
     `prefix` begins every line. `describe` returns the status, which a terminal shows at every redraw; without it the
@@ -50,8 +53,9 @@ class Progress(AbstractContextManager["Progress"]):
         stream: TextIO | None = None,
     ) -> None:
         self._prefix, self._period_s = prefix, period_s
+        self._status = ""
+        self._done = self._total = self._first = 0
         self._describe = describe if describe is not None else lambda: self._status
-        self._status, self._done, self._total, self._first = "", 0, 0, 0
         self._since_ns = time.monotonic_ns()
         self._printed_ns = self._since_ns if bar else None
         # Without a stream, rich looks up sys.stderr at every print.
@@ -68,7 +72,7 @@ class Progress(AbstractContextManager["Progress"]):
             )  # fmt: skip
             self._task = self._live.add_task("", total=None)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self: _P) -> _P:
         if self._live is not None:
             self._live.start()
         self.tick()
@@ -146,7 +150,7 @@ class StageWatch:
         self.cached = True
 
 
-class BuildProgress(AbstractContextManager["BuildProgress"]):
+class BuildProgress:
     """Stage i of n with elapsed time, remaining time and peak memory.
 
     Used as a context manager around the whole build, with `stage` around each step in the order of `stages`.
