@@ -138,15 +138,6 @@ def test_a_profile_keeps_its_shape_at_every_latency(tmp_path: Path) -> None:
     assert latency is not None and latency.generation_s == pytest.approx((2.0, 6.0)) and latency.tagged == "modelled"
 
 
-def test_the_conditions_are_those_that_the_claims_are_about(tmp_path: Path) -> None:
-    found = plan_of(models(tmp_path, "rl"), ROWS, TWO_S).conditions
-    assert found["rl-sync"].mode == "sync" and found["rl-typical-drift"].drift == "typical"
-    assert found["rl-swapped"].swap_instructions is not None and found["rl-training-words"].wordings == "training"
-    reasoning = found["rl-no-reasoning"]
-    assert reasoning.mode == "no-reasoning" and reasoning.latency == LatencyProfile.constant(0.25)
-    assert found["expert"].policy.kind == "expert"
-
-
 def test_reasoning_is_judged_by_a_model_trained_without_it_where_there_is_one(tmp_path: Path) -> None:
     both = plan_of(models(tmp_path / "both", "rl", "full", "no-reasoning"), ["reasoning"], TWO_S)
     assert set(both.conditions) == {"no-reasoning", "full"} and both.conditions["no-reasoning"].mode == "no-reasoning"

@@ -41,9 +41,16 @@ def html(run_dir: Path, summary: dict[str, Any]) -> str:
     return (run_dir / "report.html").read_text(encoding="utf-8")
 
 
-def _checks_of(tmp_path: Path, **parts: Any) -> dict[str, checks.Check]:
-    synthetic_run.write_run(tmp_path, **parts)
-    return {check.name: check for check in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
+def _load(out: Path) -> run_data.RunData:
+    return load_run(RunFiles(out, out / "artifacts"))
+
+
+def _checks_of(out: Path, *, asked_s: float | None = None, **parts: Any) -> dict[str, checks.Check]:
+    """The checks of a synthetic run; `asked_s`: another duration in settings.json than it has."""
+    synthetic_run.write_run(out, **parts)
+    if asked_s is not None:
+        (out / "settings.json").write_text(json.dumps({"duration_s": asked_s}))
+    return {check.name: check for check in checks.acceptance(_load(out))}
 
 
 def _failed(found: dict[str, checks.Check]) -> set[str]:
@@ -147,9 +154,8 @@ def test_spread_takes_the_first_the_last_and_no_more_than_asked(items: int, coun
 # ---- the checks
 
 
-def test_a_good_run_passes_every_check(run_dir: Path) -> None:
-    data = load_run(RunFiles(run_dir, run_dir / "artifacts"))
-    found = {check.name: check for check in checks.acceptance(data)}
+def test_a_good_run_passes_every_check(tmp_path: Path) -> None:
+    found = _checks_of(tmp_path)
     assert _failed(found) <= {"generations"}  # 12 s at 2.9 s a generation cannot hold ten a minute's share
     assert found["control_ticks"].limit == 118
     assert found["moved_under_command_m"].limit == pytest.approx(0.2)
@@ -174,20 +180,23 @@ def test_delay_is_checked_against_the_frame_not_the_recorded_anchor(tmp_path: Pa
     assert not found["delay_error_ms"].passed
 
 
-def test_an_anchor_frame_missing_from_the_log_fails_the_delay_check(tmp_path: Path) -> None:
-    semantics = synthetic_run.generations(12.0)
+def _without_anchor_frame(ticks: list[dict[str, Any]], semantics: list[dict[str, Any]]) -> None:
     semantics[1]["frames_ns"] = [semantics[1]["anchor_ns"] + 1]
-    found = _checks_of(tmp_path, semantics=semantics)
-    assert not found["delay_error_ms"].passed
-    assert "is not in the log" in found["delay_error_ms"].note
 
 
-def test_a_now_outside_its_tick_fails_the_delay_check(tmp_path: Path) -> None:
-    ticks = synthetic_run.tick_records(12.0)
+def _outside_its_tick(ticks: list[dict[str, Any]], semantics: list[dict[str, Any]]) -> None:
     ticks[-1]["now_ns"] += 60_000_000  # and a Δt that agrees with it
     ticks[-1]["delay_s"] += 0.06
-    found = _checks_of(tmp_path, ticks=ticks)
-    assert not found["delay_error_ms"].passed and "outside the tick" in found["delay_error_ms"].note
+
+
+@pytest.mark.parametrize(
+    ("spoil", "note"), [(_without_anchor_frame, "is not in the log"), (_outside_its_tick, "outside the tick")]
+)
+def test_a_tick_that_cannot_be_checked_fails_the_delay_check(tmp_path: Path, spoil: Any, note: str) -> None:
+    ticks, semantics = synthetic_run.tick_records(12.0), synthetic_run.generations(12.0)
+    spoil(ticks, semantics)
+    found = _checks_of(tmp_path, ticks=ticks, semantics=semantics)["delay_error_ms"]
+    assert not found.passed and note in found.note
 
 
 @pytest.mark.parametrize(
@@ -233,10 +242,7 @@ def test_bad_ticks_fail_their_check(tmp_path: Path, spoil: Callable[[list[dict[s
 
 
 def test_a_runner_that_gave_up_early_is_held_to_the_time_it_was_asked_for(tmp_path: Path) -> None:
-    synthetic_run.write_run(tmp_path)
-    (tmp_path / "settings.json").write_text('{"duration_s": 60.0}')
-    data = load_run(RunFiles(tmp_path, tmp_path / "artifacts"))
-    found = {check.name: check for check in checks.acceptance(data)}
+    found = _checks_of(tmp_path, asked_s=60.0)
     assert found["control_ticks"].limit == 590 and not found["control_ticks"].passed
 
 
@@ -249,18 +255,13 @@ def test_trained_weights_are_asked_to_reach_the_goal(
     poses = [line for line in lines if line["kind"] == "pose"]
     where = poses[round(share * (len(poses) - 1))]
     lines[0] = {**lines[0], "goal": [where["x"], where["y"] + (1 if where["y"] > 0 else -1) * beside_m]}
-    synthetic_run.write_run(tmp_path, trace=lines, trained=True)
-    (tmp_path / "settings.json").write_text('{"duration_s": 60.0}')
-    found = {c.name: c for c in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))}
+    found = _checks_of(tmp_path, asked_s=60.0, trace=lines, trained=True)
     assert found["goal_nearest_m"].passed is reached and found["goal_nearest_m"].limit == 1.5
 
 
 @pytest.mark.parametrize(("trained", "duration_s"), [(False, 60.0), (True, 59.0)])
 def test_the_goal_is_not_asked_of_those_that_cannot_reach_it(tmp_path: Path, trained: bool, duration_s: float) -> None:
-    synthetic_run.write_run(tmp_path, trained=trained)
-    (tmp_path / "settings.json").write_text(json.dumps({"duration_s": duration_s}))
-    names = [check.name for check in checks.acceptance(load_run(RunFiles(tmp_path, tmp_path / "artifacts")))]
-    assert "goal_nearest_m" not in names
+    assert "goal_nearest_m" not in _checks_of(tmp_path, asked_s=duration_s, trained=trained)
 
 
 def test_a_path_without_commands_does_not_count_as_walking(tmp_path: Path) -> None:
@@ -294,7 +295,7 @@ def test_last_command_is_read_from_the_wire(tmp_path: Path, last: tuple[str, Any
 
 
 def test_odometry_is_laid_on_the_world_at_the_first_tick(run_dir: Path) -> None:
-    data = load_run(RunFiles(run_dir, run_dir / "artifacts"))
+    data = _load(run_dir)
     stamps_ns, odometry = run_data.odometry_in_world(data)
     truth = run_data.truth_at(data.trace, stamps_ns)
     assert odometry[0] == pytest.approx(truth[0])
