@@ -19,7 +19,7 @@ encoding is found by distance, after about 0.25 m or 12° of motion. What is don
 
 * **nothing**: control must not change; the fault is dropped or counted.
 * **limit**: the speed limit is lowered to the share that is given, the arc is kept; `semantic-old` lowers it with age;
-  without a share the fault is only reported to the operator.
+  without a share the operator is told and nothing else.
 * **zero**: zero velocity until the fault has been gone for its clear time.
 * **stop**: zero velocity until the robot is armed again.
 
