@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import tomli_w
 
 from edge.core.cli import (
     EXIT_BAD_INPUT,
@@ -331,6 +332,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
 
+def calibration_text(calibration: OdometryCalibration, source: str) -> str:
+    """Return a calibration file with six digits a value; `source` is one line of text for its first comment."""
+    values = {name: float(f"{value:.6g}") for name, value in asdict(calibration).items()}
+    return f"# Odometry of one robot, by {source}.\n{tomli_w.dumps(values)}"
+
+
 def run(args: argparse.Namespace) -> int:
     """Fit and write; returns the exit code."""
     try:
@@ -341,10 +348,8 @@ def run(args: argparse.Namespace) -> int:
         prior = OdometryCalibration()
         fitted = fit(drive, _references(args, drive), prior)
         if fitted.good and args.out is not None:
-            comment = (
-                f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
-            )
-            write_named(args.out, fitted.calibration.to_toml(comment))
+            source = f"edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven"
+            write_named(args.out, calibration_text(fitted.calibration, source))
         write_result(args.json, {"good": fitted.good, **asdict(fitted)})
     except NoFitError as error:
         sys.stderr.write(f"edge-calib odometry: {error}\n")

@@ -22,7 +22,19 @@ FOLDERS: dict[str, list[str]] = FLOORS["folders"]
 MOST_ENTRIES = 16
 """Modules and sub-packages in one folder, its `__init__.py` not counted."""
 
-WORKSHOP = {"torch", "pybullet", "transformers", "matplotlib", "reporting", "export", "calib", "sim_hil", "tools"}
+WORKSHOP = {
+    "torch",
+    "pybullet",
+    "transformers",
+    "matplotlib",
+    "jinja2",
+    "tomli_w",
+    "reporting",
+    "export",
+    "calib",
+    "sim_hil",
+    "tools",
+}
 ONBOARD = sorted([*(ROOT / "edge").rglob("*.py"), *(ROOT / "firmware_bridge").rglob("*.py")])
 PYTHON = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PACKAGE_FOLDERS = sorted({path.parent for path in PYTHON})

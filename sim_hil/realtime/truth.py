@@ -20,35 +20,41 @@ class TruePose:
     touching: tuple[str, ...]
 
 
-class TruthTail:
-    """Reader of a growing trace; an unfinished last line is left for the next call."""
+class LineTail:
+    """Reads each line of a growing file of JSON lines once; an unfinished last line is read later."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = 0
-        self.newest: TruePose | None = None
 
-    def update(self) -> list[TruePose]:
-        """Return the poses since the last call, in order."""
-        poses = [
-            TruePose(int(line["t_ns"]), line["x"], line["y"], line["theta"], tuple(line["touching"]))
-            for line in self._lines()
-            if line.get("kind") == "pose"
-        ]
-        if poses:
-            self.newest = poses[-1]
-        return poses
-
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def lines(self) -> list[dict[str, Any]]:
+        """Return the lines added since the last call; none while there is no file."""
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._offset)
                 added = stream.read()
         except FileNotFoundError:
-            return
+            return []
         whole = added[: added.rfind(b"\n") + 1]
         self._offset += len(whole)
-        yield from parsed(whole)
+        return list(parsed(whole))
+
+
+class TruthTail(LineTail):
+    """Reads the poses that were added to a trace."""
+
+    newest: TruePose | None = None
+
+    def update(self) -> list[TruePose]:
+        """Return the poses since the last call, in order."""
+        poses = [
+            TruePose(int(line["t_ns"]), line["x"], line["y"], line["theta"], tuple(line["touching"]))
+            for line in self.lines()
+            if line.get("kind") == "pose"
+        ]
+        if poses:
+            self.newest = poses[-1]
+        return poses
 
 
 def parsed(text: bytes) -> Iterator[dict[str, Any]]:

@@ -23,7 +23,7 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
-from reporting.progress_line import Progress
+from reporting.progress import Progress
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
@@ -34,6 +34,7 @@ from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 MODES: Final = ("async", "sync", "no-reasoning")
+STATUS_PERIOD_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
 """Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
 not end the run, so that the growth of the runner can be measured."""
@@ -129,21 +130,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"speed limit {options.speed_mps:g} m/s"
         )
     with stop_signals() as stop:
-        status, failure = "starting", ""
-
-        def show_status(line: str) -> None:
-            nonlocal status
-            status = line
-            progress.tick()
-
-        with Progress(lambda _elapsed_s: f"edge-soak: {status}") as progress:
-            try:
+        failure = ""
+        try:
+            with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
                 finished = run_legs(
-                    soak, options, menu, stopped=lambda: bool(stop), show_status=show_status, log=_print,
+                    soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.say,
                     keep_logs=args.keep_logs,
                 )  # fmt: skip
-            except (StepError, ValueError) as error:
-                finished, failure = False, str(error)
+        except (StepError, ValueError) as error:
+            finished, failure = False, str(error)
         result = soak_result(soak, options, budget, finished=finished)
         write_result(str(soak.path / "result.json"), result)
         write_result(args.json, result)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import signal
@@ -15,7 +14,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from reporting.progress_line import Progress, TraceTail
 from sim_hil.processes.child_process import last_lines
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.stack import free_domain, socket_dir
@@ -304,19 +302,9 @@ def test_only_a_free_domain_is_chosen(tmp_path: Path, free: int | None) -> None:
         free_domain([tmp_path / "udp"])
 
 
-def test_off_a_terminal_the_progress_is_plain_lines_a_few_times_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream, now_ns = io.StringIO(), [0]
-    monkeypatch.setattr("reporting.progress_line.time.monotonic_ns", lambda: now_ns[0])
-    with Progress(lambda elapsed_s: f"{elapsed_s:.0f} s", stream) as progress:
-        for second in range(61):
-            now_ns[0] = second * 1_000_000_000
-            progress.tick()
-    assert stream.getvalue().splitlines() == ["0 s", "15 s", "30 s", "45 s", "60 s"]
-
-
 def test_the_trace_is_followed_while_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
-    followed = TraceTail(path)
+    followed = demo.TraceTail(path)
     followed.update()
     pose = '{"t_ns": %d, "kind": "pose", "x": %f, "y": 0.0}\n'
     path.write_text(pose % (1_000_000_000, 0.0) + '{"t_ns": 2, "kind": "wire", "name": "Move"}\n{"t_ns": 3, "ki')

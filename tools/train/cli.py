@@ -30,7 +30,7 @@ from edge.core.cli import (
     write_whole,
 )
 from edge.inference.latency_profile import load_profile
-from reporting.build_progress import duration, peak_rss_bytes
+from reporting.progress import duration, peak_rss_bytes
 from sim_hil.benchmark.runs import RunsError
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import VARIANTS, Recipe, load_recipe, recipe_names, stage_seed

@@ -11,12 +11,12 @@ from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
+import tomli_w
 
 from export.core.settings import MODEL_PREFIX, model_settings
 from export.core.typed import FieldError, build, field_types, from_text, near, plain
 from export.model.config import ModelConfigError, TicVlaConfig
 from export.model.config_file import config_for, config_from_dict, with_overrides
-from reporting.toml_text import toml_text
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
 from tools.train.config.imitate import ImitateConfig
@@ -102,7 +102,7 @@ class Recipe:
 
     def to_toml(self) -> str:
         """Return the tables as TOML; `load_recipe` reads it."""
-        return toml_text(self.to_tables())
+        return tomli_w.dumps(self.to_tables())
 
 
 def recipe_names() -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from reporting.build_progress import duration
+from reporting.progress import duration
 from tools.train.collect.collection import collect, run_round
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ

@@ -16,7 +16,7 @@ from safetensors import safe_open
 from edge.core.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
-from reporting.build_progress import duration
+from reporting.progress import duration
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256

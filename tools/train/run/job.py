@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Protocol, TextIO
+from typing import Protocol
 from zlib import crc32
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from reporting.build_progress import duration
+from reporting.progress import Progress
 from tools.train.config.recipe import Recipe
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.run_dir import RunDir
@@ -50,37 +38,6 @@ class QuietProgress:
 
     def say(self, line: str) -> None:
         """Nothing to do."""
-
-
-class PlainProgress:
-    """Progress as lines on standard error, at most one per `period_s`."""
-
-    def __init__(self, stage: str, period_s: float = 15.0) -> None:
-        self._stage = stage
-        self._period_s = period_s
-        self._shown_ns = time.monotonic_ns()
-        self._began: tuple[int, int, int] | None = None
-        """Total, first count and start of the current work, ns: a stage may have several parts."""
-        self._last = 0
-
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        """Write a line if the last one is at least `period_s` old, or if the work is done."""
-        now_ns = time.monotonic_ns()
-        if self._began is None or self._began[0] != total or done < self._last:
-            self._began, self._last = (total, done, now_ns), -1
-        due = (now_ns - self._shown_ns) / 1e9 >= self._period_s
-        if done == self._last or not (due or done >= total):
-            return
-        self._shown_ns, self._last = now_ns, done
-        _, first, since_ns = self._began
-        rate = (done - first) / max((now_ns - since_ns) / 1e9, 1e-9)
-        values = "".join(f", {name} {value:.4g}" for name, value in numbers.items())
-        left = f", {duration((total - done) / rate)} to go" if rate > 0 and done < total else ""
-        self.say(f"{done} of {total} ({rate:.3g} /s{left}){values}")
-
-    def say(self, line: str) -> None:
-        """Write one line."""
-        sys.stderr.write(f"edge-train: {self._stage}: {line}\n")
 
 
 @dataclass
@@ -124,45 +81,14 @@ class StageJob:
         return self.ranks.any(self.stop.asked)
 
 
-class StageBar(AbstractContextManager["StageBar"]):
-    """A progress bar with the newest values; a `StageProgress`."""
-
-    def __init__(self, stage: str, console: Console) -> None:
-        self._stage, self._console = stage, console
-        self._bar = Progress(
-            TextColumn(f"[bold]edge-train[/bold] {stage}"), BarColumn(bar_width=24), MofNCompleteColumn(),
-            TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False), console=console,
-        )  # fmt: skip
-        self._task: TaskID | None = None
-        self._total = 0
-
-    def __enter__(self) -> StageBar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+class StageDisplay(Progress):
+    """Progress with the newest values; a `StageProgress`."""
 
     def update(self, done: int, total: int, **numbers: float) -> None:
-        """Move the bar."""
-        if self._task is None:
-            self._task, self._total = self._bar.add_task("", total=total, completed=done), total
-        if total != self._total:  # a stage may have several parts
-            self._bar.reset(self._task, total=total)
-            self._total = total
-        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
-        self._bar.update(self._task, completed=done, total=total, description=values)
-
-    def say(self, line: str) -> None:
-        """Write a line above the bar."""
-        self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
+        """Report `done` of `total` units of work, with values to show."""
+        self.show(", ".join(f"{name} {value:.4g}" for name, value in numbers.items()), done, total)
 
 
-def progress_for(
-    stage: str, *, quiet: bool = False, stream: TextIO | None = None
-) -> AbstractContextManager[StageProgress]:
-    """Return the progress display for a stage: a bar, lines, or with `quiet` nothing."""
-    if quiet:
-        return nullcontext(QuietProgress())
-    console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)
-    return StageBar(stage, console) if console.is_terminal else nullcontext(PlainProgress(stage))
+def progress_for(stage: str, *, quiet: bool = False) -> AbstractContextManager[StageProgress]:
+    """Return the progress display of a stage; with `quiet` one that shows nothing."""
+    return nullcontext(QuietProgress()) if quiet else StageDisplay(f"edge-train: {stage}: ", bar=True)
