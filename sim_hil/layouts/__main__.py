@@ -9,8 +9,7 @@ from pathlib import Path
 from edge.core.cli import check_result_target, command_line, write_named, write_result
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
 from sim_hil.scene.map import draw_map
-from sim_hil.scene.scene import Scene
-from sim_hil.scene.writer import scene_to_toml
+from sim_hil.scene.scene import Scene, scene_to_toml
 from sim_hil.world.drawing.textures import png_bytes
 
 _EXAMPLES = f"""examples:

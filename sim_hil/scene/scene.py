@@ -1,10 +1,14 @@
-"""A scene as data: floor, walls, objects, terrain, routes and places of people; read from a TOML file and checked."""
+"""A scene as data: floor, walls, objects, terrain, routes and places of people; reads, checks and writes TOML files."""
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, fields, replace
+from math import degrees, radians
 from pathlib import Path
+from typing import Any
 
 from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
 from sim_hil.scene.parts import (
@@ -24,7 +28,6 @@ from sim_hil.scene.parts import (
     Wall,
     check_choice,
 )
-from sim_hil.scene.reader import read_area, read_floor, read_object, read_place, read_route, read_terrain, read_wall
 from sim_hil.scene.table import SceneError, Table
 from sim_hil.scene.terrain import ConvexPiece, Terrain
 
@@ -36,11 +39,22 @@ else:
 __all__ = [
     "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
     "WALL_TEXTURES", "Area", "Box", "ConvexPiece", "Floor", "Footprint", "Place", "Route", "Scene", "SceneError",
-    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names",
+    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names", "scene_to_toml",
 ]  # fmt: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
 SKY: Vec3 = (0.60, 0.76, 0.92)
+# Sections of a scene file in the order in which they are written; the keys are the fields of their class.
+_SECTIONS: dict[str, type[Any]] = {
+    "floors": Floor, "terrain": Terrain, "walls": Wall, "objects": SceneObject, "areas": Area, "places": Place,
+    "routes": Route,
+}  # fmt: skip
+# Defaults of a file, in addition to those of the classes; an object's size and colour default to those of its kind.
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "walls": {"thickness_m": 0.15, "height_m": 2.6, "texture": "wall_wainscot"},
+    "objects": {"text": ""},
+}
+_OMITTED_IF_EMPTY = ("text", "landmark")
 
 
 @dataclass(frozen=True)
@@ -142,13 +156,7 @@ def parse_scene(text: str, source: str) -> Scene:
             ceiling_height_m=table.number("ceiling_height_m", 0.0),
             ceiling_texture=table.text("ceiling_texture", "ceiling_panels"),
             sky=table.vector("sky", 3, SKY),
-            walls=tuple(read_wall(item) for item in table.tables("walls")),
-            objects=tuple(read_object(item) for item in table.tables("objects")),
-            routes=tuple(read_route(item) for item in table.tables("routes")),
-            floors=tuple(read_floor(item) for item in table.tables("floors")),
-            terrain=tuple(read_terrain(item) for item in table.tables("terrain")),
-            areas=tuple(read_area(item) for item in table.tables("areas")),
-            places=tuple(read_place(item) for item in table.tables("places")),
+            **{name: tuple(_read(name, item) for item in table.tables(name)) for name in _SECTIONS},
         )
         floor.done()
         table.done()
@@ -177,3 +185,80 @@ def load_scene(name_or_path: str | Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read as a scene file: {error}") from error
     return parse_scene(text, path.name)
+
+
+def _read(section: str, table: Table) -> Any:
+    """Read one part of a scene from a table of its section. Raises SceneError."""
+    values: dict[str, Any] = {}
+    defaults = _DEFAULTS.get(section, {})
+    scalars: dict[str, Callable[..., Any]] = {"str": table.text, "float": table.number, "int": table.whole}
+    for key, kind, default in _fields(section):
+        default = defaults.get(key, default)
+        if section == "objects" and key in ("size_m", "colour"):
+            check_choice(f"{table.what}: {values['label']}", "kind", values["kind"], KINDS)
+            default = getattr(KINDS[values["kind"]], key)
+        if key == "heading_rad":
+            values[key] = table.heading(default)
+        elif section == "floors" and key == "polygon":
+            values[key] = _floor_polygon(table)
+        elif kind == "tuple[Vec2, ...]":
+            values[key] = table.points(key)
+        elif kind in ("Vec2", "Vec3"):
+            values[key] = table.vector(key, int(kind[-1]), default)
+        else:
+            values[key] = scalars[kind](key, default)
+    part = _SECTIONS[section](**values)
+    table.done()
+    return part
+
+
+def _fields(section: str) -> list[tuple[str, str, Any]]:
+    """Return name, type and default (None: required) of a section's fields, in the order of the file."""
+    found = [(f.name, str(f.type), None if f.default is MISSING else f.default) for f in fields(_SECTIONS[section])]
+    return sorted(found, key=lambda entry: entry[0] not in ("label", "kind", "name"))
+
+
+def _floor_polygon(table: Table) -> tuple[Vec2, ...]:
+    """Read the outline of a floor patch: `polygon`, or the corners `min_m` and `max_m`."""
+    if "polygon" in table:
+        return table.points("polygon")
+    if "min_m" not in table:
+        raise SceneError(f"{table.what}: expected polygon, or min_m and max_m, found neither")
+    (x0, y0), (x1, y1) = table.vector("min_m", 2), table.vector("max_m", 2)
+    return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+
+def scene_to_toml(scene: Scene) -> str:
+    """Return the text of a scene file; `parse_scene` of it gives an equal scene."""
+    lines = [f"{key} = {_toml(getattr(scene, key))}" for key in
+             ("name", "start", "goal_xy", "ceiling_height_m", "ceiling_texture", "sky")]  # fmt: skip
+    lines += ["", "[floor]", *(f"{key} = {_toml(getattr(scene, 'floor_' + key))}" for key in ("min_m", "max_m"))]
+    lines.append(f"texture = {_toml(scene.floor_texture)}")
+    for section in _SECTIONS:
+        for part in getattr(scene, section):
+            lines += ["", f"[[{section}]]"]
+            for key, _, _ in _fields(section):
+                value = getattr(part, key)
+                if key == "heading_rad":
+                    lines.append(_heading(value))
+                elif value or key not in _OMITTED_IF_EMPTY:
+                    lines.append(f"{key} = {_toml(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, str):
+        # TOML's basic strings escape as JSON's do, except for DEL, which JSON leaves as it is.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Iterable):
+        return "[" + ", ".join(_toml(item if isinstance(item, Iterable) else float(item)) for item in value) + "]"
+    return repr(value)
+
+
+def _heading(heading_rad: float) -> str:
+    """Return the heading in degrees where that is exact to the last bit, in radians otherwise."""
+    exact = degrees(heading_rad)
+    for value in (round(exact, 3), exact):
+        if radians(value) == heading_rad:
+            return f"heading_deg = {value!r}"
+    return f"heading_rad = {heading_rad!r}"

@@ -17,8 +17,7 @@ from sim_hil.layouts.check import overlaps, problems
 from sim_hil.layouts.plan import LayoutError
 from sim_hil.scene.map import draw_map, map_view
 from sim_hil.scene.nav_grid import NavGrid
-from sim_hil.scene.scene import Scene, load_scene, parse_scene
-from sim_hil.scene.writer import scene_to_toml
+from sim_hil.scene.scene import Scene, load_scene, parse_scene, scene_to_toml
 
 SEED = 4711
 HOLDS = {

@@ -27,9 +27,9 @@ from sim_hil.scene.scene import (
     Wall,
     load_scene,
     parse_scene,
+    scene_to_toml,
 )
 from sim_hil.scene.terrain import TERRAIN_KINDS
-from sim_hil.scene.writer import scene_to_toml
 
 PLAIN = Scene("plain", (0.0, 0.0, 0.0), (1.0, 1.0), (-9.0, -9.0), (9.0, 9.0), "paving", 0.0, (), (), ())
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))

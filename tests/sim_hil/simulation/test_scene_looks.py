@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import hypot, pi
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,10 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_hil.scene.scene import KINDS, TEXTURES, Box, Floor, Scene, SceneObject, Terrain, Wall
-from sim_hil.simulation.contact_sheet import kinds_sheet, main
 from sim_hil.simulation.renderer import Renderer
 from sim_hil.world.drawing.mesh import MeshBuilder
-from sim_hil.world.drawing.surfaces import SURFACES, surface_picture
+from sim_hil.world.drawing.surfaces import SURFACES
 from sim_hil.world.pieces import counter_clockwise, split
 from sim_hil.world.scene_meshes import BUILDERS, add_object, build_scene
 
@@ -181,24 +179,3 @@ def test_cutting_a_polygon_keeps_its_area(first: Corners, second: Corners) -> No
     inside, outside = split(subject, cutter)
     parts = [*outside, *([inside] if inside else [])]
     assert sum(cv2.contourArea(np.array(part, np.float32)) for part in parts) == pytest.approx(areas[0], abs=1e-2)
-
-
-def test_pictures_of_surfaces_repeat_without_being_drawn_again() -> None:
-    assert surface_picture("paving") is surface_picture("paving")
-
-
-def test_a_sheet_shows_each_kind_in_a_tile_of_its_own(tmp_path: Path) -> None:
-    sheet = kinds_sheet(["forklift", "traffic_cone", "door"], 2, 96, 54)
-    assert sheet.shape == (2 * (54 + 22 + 4), 2 * 100, 3)
-    tiles = [sheet[0:54, 0:96], sheet[0:54, 100:196], sheet[80:134, 0:96]]
-    assert all(np.abs(a.astype(int) - b).mean() > 3 for a, b in zip(tiles, tiles[1:] + tiles[:1], strict=True))
-
-
-def test_the_sheet_command_writes_a_picture_and_refuses_a_scene_it_does_not_know(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "sheet.png"
-    assert main(["--kind", "bench", "--size", "64x36", "--out", str(out)]) == 0
-    assert cv2.imread(str(out)).shape[1] > 64
-    assert main(["--scene", "nowhere", "--out", str(out)]) == 2
-    assert "corridor" in capsys.readouterr().err
