@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sim_hil.robots.battery import BatteryReading
 from sim_hil.robots.carter.battery import CarterBattery, load_w
-from sim_hil.robots.carter.drive import DriveController, DriveLimits
-from sim_hil.robots.carter.urdf import BODY_COM_M, LENGTH_M, LINKS, RADIUS_M, write_carter_urdf
+from sim_hil.robots.carter.drive import DriveController
+from sim_hil.robots.carter.urdf import BODY_COM_M, LINKS, RADIUS_M, write_carter_urdf
 from sim_hil.robots.carter.wheel_odometry import OdometrySample, WheelCalibration, WheelOdometry
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.interface import BaseTruth
@@ -118,8 +118,6 @@ class Carter:
     """The robot's body in one physics client (a `sim_hil.robots.interface.Robot`)."""
 
     radius_m = RADIUS_M
-    half_length_m = LENGTH_M / 2
-    render_fields = RENDER_FIELDS
 
     def __init__(
         self,
@@ -128,20 +126,15 @@ class Carter:
         start: tuple[float, float, float],
         dt_s: float,
         *,
-        ground_m: float = 0.0,
-        limits: DriveLimits | None = None,
         calibration: WheelCalibration | None = None,
-        soc: float = 1.0,
     ) -> None:
-        """Load the robot. `start`: x m, y m, heading rad; `ground_m`: height of the ground there; `calibration`:
-        wheel dimensions assumed by odometry; `soc`: the battery's charge, 0 to 1.
-        """
+        """Load the robot. `start`: x m, y m, heading rad; `calibration`: wheel dimensions assumed by odometry."""
         self._client = client
         self._dt_s = dt_s
-        self.body, self._wheels = load_carter(client, folder, (start[0], start[1], ground_m), start[2])
-        self.controller = DriveController(dt_s, limits)
+        self.body, self._wheels = load_carter(client, folder, (start[0], start[1], 0.0), start[2])
+        self.controller = DriveController(dt_s)
         self._odometry = WheelOdometry(calibration)
-        self._battery = CarterBattery(soc)
+        self._battery = CarterBattery()
         pybullet.setJointMotorControlArray(
             self.body, self._wheels, pybullet.VELOCITY_CONTROL, forces=[WHEEL_FRICTION_NM] * 2, physicsClientId=client
         )

@@ -6,7 +6,6 @@ track it. The motors' torque limit decreases near their top speed. A command is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
@@ -21,23 +20,13 @@ NO_LOAD_RADPS: Final = 3.3 / WHEEL_RADIUS_M
 _KP_NMS_PER_RAD: Final = 8.0
 _KI_NM_PER_RAD: Final = 30.0
 _TURN_INERTIA_KGM2: Final = 3.0
-
-
-@dataclass(frozen=True)
-class DriveLimits:
-    """Limits of commands and of the reference's acceleration; braking has its own limit."""
-
-    v_max_mps: float = 1.5
-    w_max_radps: float = 2.0
-    accel_mps2: float = 1.0
-    brake_mps2: float = 2.0
-    estop_mps2: float = 2.5
-    alpha_radps2: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (isfinite(value) and value > 0):
-                raise ValueError(f"drive limits: {name}: expected a number above 0, found {value}")
+# Limits of commands, and of the reference's acceleration and braking.
+V_MAX_MPS: Final = 1.5
+W_MAX_RADPS: Final = 2.0
+ACCEL_MPS2: Final = 1.0
+BRAKE_MPS2: Final = 2.0
+ESTOP_MPS2: Final = 2.5
+ALPHA_RADPS2: Final = 4.0
 
 
 def _towards(now: float, target: float, up: float, down: float) -> float:
@@ -50,11 +39,9 @@ def _towards(now: float, target: float, up: float, down: float) -> float:
 
 
 class DriveController:
-    """Controller of both wheels; call `step` once per physics step."""
+    """Controller of both wheels; call `step` once per physics step, every `dt_s`."""
 
-    def __init__(self, dt_s: float, limits: DriveLimits | None = None) -> None:
-        """`dt_s`: time between two calls of `step`."""
-        self.limits = limits or DriveLimits()
+    def __init__(self, dt_s: float) -> None:
         self.powered = False
         self.estop = False
         self._dt_s = dt_s
@@ -71,8 +58,7 @@ class DriveController:
             raise ValueError(f"drive: expected finite velocities, found {v_mps}, {w_radps}")
         if not self.ready:
             return
-        v, w = self.limits.v_max_mps, self.limits.w_max_radps
-        self._target = (max(-v, min(v, v_mps)), max(-w, min(w, w_radps)))
+        self._target = (max(-V_MAX_MPS, min(V_MAX_MPS, v_mps)), max(-W_MAX_RADPS, min(W_MAX_RADPS, w_radps)))
         self._left_steps = self._hold
 
     @property
@@ -95,10 +81,10 @@ class DriveController:
         v_target, w_target = self.commanded
         if self._left_steps > 0:
             self._left_steps -= 1
-        dt, limits = self._dt_s, self.limits
-        brake = limits.estop_mps2 if self.estop else limits.brake_mps2
-        v = _towards(self._v, v_target, limits.accel_mps2 * dt, brake * dt)
-        w = _towards(self._w, w_target, limits.alpha_radps2 * dt, limits.alpha_radps2 * dt)
+        dt = self._dt_s
+        brake = ESTOP_MPS2 if self.estop else BRAKE_MPS2
+        v = _towards(self._v, v_target, ACCEL_MPS2 * dt, brake * dt)
+        w = _towards(self._w, w_target, ALPHA_RADPS2 * dt, ALPHA_RADPS2 * dt)
         a, alpha = (v - self._v) / dt, (w - self._w) / dt
         if v == 0.0 == w and (self._v != 0.0 or self._w != 0.0):
             # Come to rest: a wheel that was pushing something must let go of it. The integral starts anew and holds the

@@ -86,8 +86,6 @@ class Go2:
     """
 
     radius_m = RADIUS_M
-    half_length_m = HALF_LENGTH_M
-    render_fields = RENDER_FIELDS
     _forward: Vec3  # the base's x and z axes in the world
     _upward: Vec3
 
@@ -108,7 +106,7 @@ class Go2:
         for link in range(-1, links):
             grip = FOOT_GRIP if link in self._feet else SHELL_GRIP
             pybullet.changeDynamics(self.body, link, lateralFriction=grip, physicsClientId=client)
-        self._torques: tuple[float, ...] = (0.0,) * 12
+        self.torques_nm: tuple[float, ...] = (0.0,) * 12  # of the latest step
         self._accel: Vec3 = (0.0, 0.0, GRAVITY_MPS2)
         self._accel_blend = 1.0 - exp(-2.0 * pi * ACCEL_CUTOFF_HZ * dt_s)
         self._read()
@@ -176,15 +174,10 @@ class Go2:
         self._measured = Measured(self._q, self._dq, body, up)
         return self._measured
 
-    @property
-    def torques_nm(self) -> tuple[float, ...]:
-        """The 12 joint torques of the latest step."""
-        return self._torques
-
     def drive(self) -> None:
         """Apply the sport controller's torques for this step."""
         sport = self.sport
-        self._torques = forces = sport.step(self.measured())
+        self.torques_nm = forces = sport.step(self.measured())
         if sport.trotting != self._trotting:
             self._trotting = sport.trotting
             self._set_friction(0.0 if self._trotting else JOINT_FRICTION_NM)
@@ -278,7 +271,7 @@ class Go2:
             accel_mps2=np.array(self._accel),
             joint_q_rad=np.array(self._q),
             joint_dq_radps=np.array(self._dq),
-            joint_tau_nm=np.array(self._torques),
+            joint_tau_nm=np.array(self.torques_nm),
             foot_force_n=np.array(forces),
             foot_position_body_m=np.array([foot_position(leg, q) for leg, q, _ in legs]),
             foot_velocity_body_mps=np.array([foot_velocity(leg, q, dq) for leg, q, dq in legs]),

@@ -122,11 +122,6 @@ class GaitOutput(NamedTuple):
     push: tuple[Vec3, ...]
 
 
-def neutral_feet(config: GaitConfig) -> tuple[Vec3, ...]:
-    """Foot targets of a level stand at the gait's body height, base frame, m."""
-    return config.home
-
-
 def start_gait(config: GaitConfig, yaw_rad: float) -> GaitState:
     """The gait's state of a robot that stands still with heading `yaw_rad`."""
     feet = config.home

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.robots.go2.gait import BodyMotion, GaitConfig, limit_command, neutral_feet, start_gait, step_gait
+from sim_hil.robots.go2.gait import BodyMotion, GaitConfig, limit_command, start_gait, step_gait
 from sim_hil.robots.go2.kinematics import foot_position, foot_velocity, jacobian, joint_angles, joint_torque
 from sim_hil.robots.go2.urdf import LEG_GEOMETRY, TOTAL_MASS_KG
 
@@ -57,7 +57,7 @@ def test_without_a_command_a_still_robot_keeps_all_feet_down_and_carries_its_wei
     state = start_gait(CONFIG, 0.0)
     state, output = step_gait(CONFIG, state, (0.0, 0.0, 0.0), LEVEL, 0.002)
     assert not state.walking
-    assert output.feet == neutral_feet(CONFIG)
+    assert output.feet == CONFIG.home
     assert -sum(push[2] for push in output.push) == pytest.approx(TOTAL_MASS_KG * 9.81)
 
 
