@@ -15,7 +15,7 @@ _SHORT = {"desk": "desk"}  # shorter name for instructions
 
 def named(kind: str, colour: str = "") -> str:
     """Return an object's name for instructions, with its colour if that distinguishes it."""
-    return f"{colour} {_SHORT.get(kind, KINDS[kind].words)}".strip()
+    return f"{colour} {_SHORT.get(kind, KINDS[kind].noun)}".strip()
 
 
 def lights(builder: Builder, spacing_m: float = 5.0) -> None:

@@ -19,17 +19,16 @@ from sim_hil.scene.parts import (
     Area,
     Box,
     Floor,
-    Footprint,
     Place,
     Route,
     SceneObject,
+    Terrain,
     Vec2,
     Vec3,
     Wall,
     check_choice,
 )
 from sim_hil.scene.table import SceneError, Table
-from sim_hil.scene.terrain import ConvexPiece, Terrain
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -38,7 +37,7 @@ else:
 
 __all__ = [
     "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
-    "WALL_TEXTURES", "Area", "Box", "ConvexPiece", "Floor", "Footprint", "Place", "Route", "Scene", "SceneError",
+    "WALL_TEXTURES", "Area", "Box", "Floor", "Place", "Route", "Scene", "SceneError",
     "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names", "scene_to_toml",
 ]  # fmt: skip
 
@@ -99,11 +98,6 @@ class Scene:
         check_choice("floor", "texture", self.floor_texture, FLOOR_TEXTURES)
         check_choice("scene", "ceiling_texture", self.ceiling_texture, CEILING_TEXTURES)
 
-    def footprints(self) -> list[Footprint]:
-        """Return the outlines of all walls and objects, for a map."""
-        outlines = [Footprint(wall.label, "wall", wall.box.corners()) for wall in self.walls]
-        return outlines + [Footprint(thing.label, thing.kind, thing.box.corners()) for thing in self.objects]
-
     def obstacles(self) -> list[tuple[str, Box]]:
         """Return label and box of every obstacle; an object with several boxes occurs several times.
 
@@ -111,10 +105,6 @@ class Scene:
         """
         walls = [(wall.label, wall.box) for wall in self.walls]
         return walls + [(thing.label, box) for thing in self.objects for box in thing.boxes]
-
-    def terrain_pieces(self) -> list[ConvexPiece]:
-        """Return the terrain as convex solids for a physics engine."""
-        return [terrain.piece() for terrain in self.terrain]
 
     def ground_height_m(self, x: float, y: float) -> float:
         """Return the height of the ground at a point, m: the highest terrain, or 0."""

@@ -21,8 +21,7 @@ from sim_hil.robots.go2.body import Go2, RobotTruth
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.go2.sport import SportAction
 from sim_hil.robots.interface import BaseTruth, Robot
-from sim_hil.scene.scene import Box, Scene
-from sim_hil.scene.terrain import ConvexPiece
+from sim_hil.scene.scene import Box, Scene, Terrain
 from sim_hil.simulation.person_body import PersonBody
 from sim_hil.world.drawing.stage import BulletStage
 from sim_hil.world.scene_meshes import build_scene
@@ -108,8 +107,8 @@ class Simulation:
         # The floor reaches beyond the walls, so that nothing can ever fall off the world.
         ground = Box(((x0 + x1) / 2, (y0 + y1) / 2, -0.5), (1.0, 0.0), (x1 - x0 + 10, y1 - y0 + 10, 1.0))
         self._floor = self._static(ground, friction=_FOOTING)
-        for piece in scene.terrain_pieces():
-            self._raised(piece)
+        for terrain in scene.terrain:
+            self._raised(terrain)
         self._solids = self._obstacles(scene.obstacles())
         self._aside = (x1 + 50.0, y1 + 50.0)
         shape = pybullet.createCollisionShape(
@@ -170,13 +169,13 @@ class Simulation:
             solids[self._immovable(shape, (0, 0, 0), (0, 0, 0, 1), _SIDES)] = group
         return solids
 
-    def _raised(self, piece: ConvexPiece) -> int:
-        corners = np.array(piece.vertices_m)
+    def _raised(self, terrain: Terrain) -> None:
+        corners = np.array(terrain.vertices_m())
         middle = corners.mean(axis=0)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self.client
         )
-        return self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
+        self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
 
     def _immovable(
         self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float

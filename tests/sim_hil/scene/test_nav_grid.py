@@ -11,8 +11,7 @@ import pytest
 
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.scene.nav_grid import NavGrid, length_m
-from sim_hil.scene.scene import Scene, SceneObject, Wall, load_scene
-from sim_hil.scene.terrain import Terrain
+from sim_hil.scene.scene import Scene, SceneObject, Terrain, Wall, load_scene
 
 CLEARANCE_M = 0.4
 

@@ -23,19 +23,6 @@ def test_every_shipped_scene_loads() -> None:
         assert load_scene(name).name == name
 
 
-def test_footprints_name_every_wall_and_object_once() -> None:
-    scene = load_scene("corridor")
-    labels = [footprint.label for footprint in scene.footprints()]
-    assert len(labels) == len(set(labels)) == len(scene.walls) + len(scene.objects)
-
-
-def test_a_footprint_is_where_the_object_stands() -> None:
-    machine = next(f for f in load_scene("corridor").footprints() if f.kind == "vending_machine")
-    xs, ys = zip(*machine.polygon, strict=True)
-    assert (min(xs), max(xs)) == pytest.approx((23.45, 24.55))
-    assert (min(ys), max(ys)) == pytest.approx((1.18, 1.98))
-
-
 def test_unknown_scene_is_refused_by_naming_the_known_ones() -> None:
     with pytest.raises(SceneError, match="corridor"):
         load_scene("no-such-place")

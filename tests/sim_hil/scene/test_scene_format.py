@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_hil.scene.parts import AREA_KINDS, PLACE_KINDS
+from sim_hil.scene.parts import AREA_KINDS, PLACE_KINDS, TERRAIN_KINDS
 from sim_hil.scene.scene import (
     CEILING_TEXTURES,
     FLOOR_TEXTURES,
@@ -29,7 +29,6 @@ from sim_hil.scene.scene import (
     parse_scene,
     scene_to_toml,
 )
-from sim_hil.scene.terrain import TERRAIN_KINDS
 
 PLAIN = Scene("plain", (0.0, 0.0, 0.0), (1.0, 1.0), (-9.0, -9.0), (9.0, 9.0), "paving", 0.0, (), (), ())
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))
@@ -133,9 +132,9 @@ def test_what_stands_on_a_platform_is_as_high_as_both_together() -> None:
 @pytest.mark.parametrize("kind", sorted(TERRAIN_KINDS))
 def test_the_physics_piece_has_the_top_that_ground_height_tells(kind: str) -> None:
     terrain = Terrain("it", kind, (1.0, -2.0, 0.1), 0.7, (2.0, 1.0), 0.3, "paving")
-    top = max(z for _, _, z in terrain.piece().vertices_m)
+    top = max(z for _, _, z in terrain.vertices_m())
     assert top == pytest.approx(0.4)
-    for x, y, z in terrain.piece().vertices_m:
+    for x, y, z in terrain.vertices_m():
         # Just inside the outline, so that rounding does not put the corner beside it.
         inner_x, inner_y = 1.0 + (x - 1.0) * 0.9999, -2.0 + (y + 2.0) * 0.9999
         assert z <= terrain.height_m(inner_x, inner_y) + 1e-3

@@ -13,8 +13,7 @@ import pybullet
 import pytest
 
 from sim_hil.crowd.people import UPDATE_HZ
-from sim_hil.scene.scene import Scene, load_scene
-from sim_hil.scene.terrain import Terrain
+from sim_hil.scene.scene import Scene, Terrain, load_scene
 from sim_hil.simulation.physics import Simulation, SportAction
 from tests.support.benchmark.benchmark_episodes import block, hall
 
