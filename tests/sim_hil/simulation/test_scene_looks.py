@@ -17,8 +17,7 @@ from sim_hil.scene.scene import KINDS, TEXTURES, Box, Floor, Scene, SceneObject,
 from sim_hil.simulation.renderer import Renderer
 from sim_hil.world.drawing.mesh import MeshBuilder
 from sim_hil.world.drawing.surfaces import SURFACES
-from sim_hil.world.pieces import counter_clockwise, split
-from sim_hil.world.scene_meshes import BUILDERS, add_object, build_scene
+from sim_hil.world.scene_meshes import BUILDERS, add_object, build_scene, counter_clockwise, split
 
 OPEN = Scene("open", (0.0, 0.0, 0.0), (1.0, 1.0), (-12.0, -12.0), (12.0, 12.0), "asphalt", 0.0, (), (), ())
 UP = np.array((0.0, 0.0, 1.0))
