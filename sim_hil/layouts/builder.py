@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import atan2, cos, degrees, hypot, pi, radians, sin
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -270,47 +270,37 @@ def turned(scene: Scene, turn: Turn) -> Scene:
     x0, y0 = min(c[0] for c in corners), min(c[1] for c in corners)
     x1, y1 = max(c[0] for c in corners), max(c[1] for c in corners)
 
-    def at(p: Vec2) -> Vec2:
-        x, y = turn.point(p)
-        return (_mm(x - x0), _mm(y - y0))
+    def at(point: tuple[float, ...]) -> tuple[float, ...]:
+        x, y = turn.point((point[0], point[1]))
+        return (_mm(x - x0), _mm(y - y0), *(_mm(z) for z in point[2:]))
 
-    def round_(polygon: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
-        moved = tuple(at(p) for p in polygon)
-        mirrored = (turn.swap + turn.flip_x + turn.flip_y) % 2 == 1
-        return tuple(reversed(moved)) if mirrored else moved
+    def outline(polygon: tuple[Vec2, ...]) -> tuple[tuple[float, ...], ...]:
+        moved = tuple(at(point) for point in polygon)
+        return moved[::-1] if (turn.swap + turn.flip_x + turn.flip_y) % 2 else moved
 
-    def at3(p: Vec3) -> Vec3:
-        return (*at((p[0], p[1])), _mm(p[2]))
+    changes: dict[str, Callable[[Any], Any]] = {
+        "start_m": at,
+        "end_m": at,
+        "position_m": at,
+        "heading_rad": turn.heading,
+        "size_m": lambda size: tuple(_mm(extent) for extent in size),
+        "polygon": outline,
+    }
 
-    def size(s: Vec3) -> Vec3:
-        return (_mm(s[0]), _mm(s[1]), _mm(s[2]))
+    def moved(parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        keys = [key for key in changes if parts and hasattr(parts[0], key)]
+        return tuple(replace(part, **{key: changes[key](getattr(part, key)) for key in keys}) for part in parts)
 
+    sections = ("walls", "objects", "floors", "terrain", "areas", "places")
+    start, goal = at(scene.start[:2]), at(scene.goal_xy)
     return replace(
         scene,
-        start=(*at((scene.start[0], scene.start[1])), turn.heading(scene.start[2])),
-        goal_xy=at(scene.goal_xy),
+        start=(start[0], start[1], turn.heading(scene.start[2])),
+        goal_xy=(goal[0], goal[1]),
         floor_min_m=(0.0, 0.0),
         floor_max_m=(_mm(x1 - x0), _mm(y1 - y0)),
-        walls=tuple(replace(wall, start_m=at(wall.start_m), end_m=at(wall.end_m)) for wall in scene.walls),
-        objects=tuple(
-            replace(thing, position_m=at3(thing.position_m), heading_rad=turn.heading(thing.heading_rad),
-                    size_m=size(thing.size_m))
-            for thing in scene.objects
-        ),
-        floors=tuple(
-            replace(patch, polygon=round_(patch.polygon), heading_rad=turn.heading(patch.heading_rad))
-            for patch in scene.floors
-        ),
-        terrain=tuple(
-            replace(piece, position_m=at3(piece.position_m), heading_rad=turn.heading(piece.heading_rad))
-            for piece in scene.terrain
-        ),
-        areas=tuple(replace(area, polygon=round_(area.polygon)) for area in scene.areas),
-        places=tuple(
-            replace(place, position_m=at(place.position_m), heading_rad=turn.heading(place.heading_rad))
-            for place in scene.places
-        ),
-    )  # fmt: skip
+        **{name: moved(getattr(scene, name)) for name in sections},
+    )
 
 
 def _mm(value: float) -> float:
