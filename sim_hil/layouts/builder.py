@@ -292,6 +292,7 @@ def turned(scene: Scene, turn: Turn) -> Scene:
         return tuple(replace(part, **{key: changes[key](getattr(part, key)) for key in keys}) for part in parts)
 
     sections = ("walls", "objects", "floors", "terrain", "areas", "places")
+    parts: dict[str, Any] = {name: moved(getattr(scene, name)) for name in sections}
     start, goal = at(scene.start[:2]), at(scene.goal_xy)
     return replace(
         scene,
@@ -299,7 +300,7 @@ def turned(scene: Scene, turn: Turn) -> Scene:
         goal_xy=(goal[0], goal[1]),
         floor_min_m=(0.0, 0.0),
         floor_max_m=(_mm(x1 - x0), _mm(y1 - y0)),
-        **{name: moved(getattr(scene, name)) for name in sections},
+        **parts,
     )
 
 

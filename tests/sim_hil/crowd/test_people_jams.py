@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_hil.crowd.jams import Jams
+from sim_hil.crowd.courtesy import Jams
 from sim_hil.crowd.spots import spots_of
 from sim_hil.crowd.state import Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
@@ -34,7 +34,7 @@ def test_a_way_through_a_jam_is_less_attractive_than_one_away_from_it(hall: Scen
     ways = CrowdMap(hall)
     (x0, y0), (x1, y1) = hall.floor_min_m, hall.floor_max_m
     middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
-    ways.add_destinations([(x0 + 1.5, middle_y), (x1 - 1.5, middle_y)])
+    ways.set_destinations([(x0 + 1.5, middle_y), (x1 - 1.5, middle_y)])
     _, jams = _jammed_at(middle_x + 5.0, middle_y)
     away, through = jams.prices(ways, 2, middle_x, middle_y)
     assert away == 1.0
