@@ -87,33 +87,6 @@ def _unrotate(quaternion_xyzw: Quaternion, v: Vec3) -> Vec3:
     return _rotate((-x, -y, -z, w), v)
 
 
-def load_carter(
-    client: int, folder: Path, position: tuple[float, float, float], yaw_rad: float
-) -> tuple[int, list[int]]:
-    """Load the URDF into `client`; return the body id and the joint indices of the left and the right wheel."""
-    body = pybullet.loadURDF(
-        str(write_carter_urdf(folder)),
-        position,
-        pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        # Round wheels: without the flag a cylinder becomes a prism, and its edges hammer the tyres off the floor.
-        flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
-        physicsClientId=client,
-    )
-    index = {}
-    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        index[pybullet.getJointInfo(body, joint, physicsClientId=client)[12].decode()] = joint
-    return body, [index[LINKS[0]], index[LINKS[1]]]
-
-
-def place_carter(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Set a loaded Carter to the pose of a render state."""
-    x, y, z, qx, qy, qz, qw = (float(value) for value in state[:7])
-    ax, ay, az = _rotate((qx, qy, qz, qw), BODY_COM_M)
-    pybullet.resetBasePositionAndOrientation(body, (x + ax, y + ay, z + az), (qx, qy, qz, qw), physicsClientId=client)
-    for joint, angle in zip(joints, state[7:9], strict=True):
-        pybullet.resetJointState(body, joint, float(angle), physicsClientId=client)
-
-
 class Carter:
     """The robot's body in one physics client (a `sim_hil.robots.interface.Robot`)."""
 
@@ -131,7 +104,19 @@ class Carter:
         """Load the robot. `start`: x m, y m, heading rad; `calibration`: wheel dimensions assumed by odometry."""
         self._client = client
         self._dt_s = dt_s
-        self.body, self._wheels = load_carter(client, folder, (start[0], start[1], 0.0), start[2])
+        self.body = pybullet.loadURDF(
+            str(write_carter_urdf(folder)),
+            (start[0], start[1], 0.0),
+            pybullet.getQuaternionFromEuler((0, 0, start[2])),
+            # Round wheels: without the flag a cylinder becomes a prism, and its edges hammer the tyres off the floor.
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
+            physicsClientId=client,
+        )
+        links = {
+            pybullet.getJointInfo(self.body, link, physicsClientId=client)[12].decode(): link
+            for link in range(pybullet.getNumJoints(self.body, physicsClientId=client))
+        }
+        self._wheels = [links[LINKS[0]], links[LINKS[1]]]
         self.controller = DriveController(dt_s)
         self._odometry = WheelOdometry(calibration)
         self._battery = CarterBattery()

@@ -60,24 +60,6 @@ def rotation_matrix(quaternion_xyzw: tuple[float, ...]) -> Array:
     )
 
 
-def load_go2(client: int, folder: Path, position: tuple[float, float, float], yaw_rad: float) -> tuple[int, list[int]]:
-    """Load the URDF into `client`; return the body id and the 12 joint indices in JOINT_NAMES' order."""
-    path = write_go2_urdf(folder)
-    body = pybullet.loadURDF(
-        str(path),
-        position,
-        pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-        physicsClientId=client,
-    )
-    index = {}
-    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        index[pybullet.getJointInfo(body, joint, physicsClientId=client)[1].decode()] = joint
-    for name, angle in zip(JOINT_NAMES, LYING_RAD, strict=True):
-        pybullet.resetJointState(body, index[name], angle, physicsClientId=client)
-    return body, [index[name] for name in JOINT_NAMES]
-
-
 class Go2:
     """The robot's body in one physics client; implements sim_hil.robots.interface.Robot.
 
@@ -92,12 +74,21 @@ class Go2:
     def __init__(self, client: int, folder: Path, start: tuple[float, float, float], dt_s: float) -> None:
         self._client = client
         self._dt_s = dt_s
-        self.body, self._joints = load_go2(client, folder, (start[0], start[1], LYING_HEIGHT_M), start[2])
-        self.sport = SportController(dt_s)
+        self.body = pybullet.loadURDF(
+            str(write_go2_urdf(folder)),
+            (start[0], start[1], LYING_HEIGHT_M),
+            pybullet.getQuaternionFromEuler((0, 0, start[2])),
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=client,
+        )
         links = pybullet.getNumJoints(self.body, physicsClientId=client)
         names = {
             pybullet.getJointInfo(self.body, link, physicsClientId=client)[1].decode(): link for link in range(links)
         }
+        self._joints = [names[name] for name in JOINT_NAMES]
+        for joint, angle in zip(self._joints, LYING_RAD, strict=True):
+            pybullet.resetJointState(self.body, joint, angle, physicsClientId=client)
+        self.sport = SportController(dt_s)
         self._feet = [names[f"{leg}_foot"] for leg in LEGS]
         self._set_friction(JOINT_FRICTION_NM)
         self._trotting = False
@@ -280,13 +271,3 @@ class Go2:
             body_height_m=self._position[2],
             commanded=self.sport.commanded,
         )
-
-
-def place_go2(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Set a loaded Go2 to the pose of a render state (base frame, not centre of mass; then the joints)."""
-    position, quaternion = tuple(float(v) for v in state[:3]), tuple(float(v) for v in state[3:7])
-    arm = rotation_matrix(quaternion) @ BASE_COM_M
-    centre = [position[axis] + float(arm[axis]) for axis in range(3)]
-    pybullet.resetBasePositionAndOrientation(body, centre, quaternion, physicsClientId=client)
-    for joint, angle in zip(joints, state[7:19], strict=True):
-        pybullet.resetJointState(body, joint, float(angle), physicsClientId=client)

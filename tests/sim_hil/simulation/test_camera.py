@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from math import cos, pi, radians, sin
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -19,7 +17,6 @@ from sim_hil.scene.scene import load_scene
 from sim_hil.simulation import renderer as world_renderer
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.physics import Simulation
-from sim_hil.world.drawing.textures import sign
 
 WIDTH, HEIGHT = 320, 180
 NOWHERE = (-100.0, -100.0, 0.0, 0.0, 0.0)
@@ -51,16 +48,6 @@ def _changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(a.astype(int) - b.astype(int)).max(axis=2) > 20
 
 
-def test_a_picture_has_the_size_asked_for_and_is_not_blank(world: CameraWorld) -> None:
-    picture = world.render(_state(0, 0, 0), 448, 252)
-    assert picture.shape == (252, 448, 3) and picture.dtype == np.uint8
-    assert picture.std() > 15
-
-
-def test_the_same_state_gives_the_same_picture(world: CameraWorld) -> None:
-    assert np.array_equal(world.render(_state(3, 0, 0), WIDTH, HEIGHT), world.render(_state(3, 0, 0), WIDTH, HEIGHT))
-
-
 def test_the_vending_machine_is_where_the_scene_puts_it(world: CameraWorld, bare_world: CameraWorld) -> None:
     # From 4 m before it, by the other wall: it must appear left of the middle, and nothing else may change.
     state = _state(20.0, 0.0, 0.2)
@@ -77,20 +64,6 @@ def test_the_vending_machine_is_red_and_blue_not_blue_and_red(world: CameraWorld
     red = ((machine[:, 0] > 120) & (machine[:, 2] < 80)).mean()
     blue = ((machine[:, 2] > 90) & (machine[:, 0] < 60)).mean()
     assert red > 0.3 and 0.05 < blue < red
-
-
-def test_lettering_is_upright_and_not_mirrored(world: CameraWorld) -> None:
-    """The exit sign's E is solid on its left and open on its right: compare with the drawing itself."""
-    scene = load_scene("corridor")
-    plate = next(thing for thing in scene.objects if thing.label == "exit sign")
-    # A camera 1 m before the sign, as high as its middle, sees nothing but the sign and the wall.
-    hfov_rad = 2 * np.arctan(0.45 / 1.035)
-    seen = world.look(_state(0, 0, 0), (26.9, 0.0, 2.35), (27.9, 0.0, 2.35), 240, 80, hfov_rad)
-    drawn = cv2.resize(sign(plate), (240, 80)).astype(float)[..., 0]
-    shown = seen.astype(float)[..., 0]
-    likeness = [np.corrcoef(view.ravel(), shown.ravel())[0, 1] for view in (drawn, drawn[:, ::-1], drawn[::-1])]
-    assert likeness[0] > 0.7
-    assert likeness[0] > max(likeness[1:]) + 0.1
 
 
 @pytest.mark.parametrize(("side", "columns"), [(0.8, slice(0, WIDTH // 2)), (-0.8, slice(WIDTH // 2, WIDTH))])
@@ -149,32 +122,7 @@ def test_the_simulations_state_fits_the_cameras_world() -> None:
         camera.render(simulation.render_state()[:-1], 160, 90)
     simulation.close()
     camera.close()
-
-
-def test_the_robot_is_seen_from_outside(world: CameraWorld) -> None:
-    view = ((12.0, 1.0, 0.8), (10.5, 0.0, 0.3))
-    here = world.look(_state(10.5, 0, 0), *view, WIDTH, HEIGHT)
-    away = world.look(_state(20.0, 0, 0), *view, WIDTH, HEIGHT)
-    assert _changed(here, away).sum() > 800
-
-
-def test_the_top_of_a_wall_is_seen_from_above(world: CameraWorld) -> None:
-    left = next(wall for wall in load_scene("corridor").walls if wall.label == "left wall").box
-    x, y, top = 10.3, left.centre_m[1], left.size_m[2]
-    seen = world.look(_state(0, 0, 0), (x, y - 0.5, top + 1.5), (x, y, top), 41, 41, 0.02)
-    red, green, blue = seen[20, 20].astype(float)
-    assert red > green > blue > 100
-    assert (red / blue, green / blue) == pytest.approx((206 / 186, 200 / 186), abs=0.04)
-
-
-def test_a_camera_keeps_no_files_and_may_be_closed_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    camera = CameraWorld(load_scene("corridor"), people=1, seed=0)
-    camera.look(_state(0, 0, 0), (2.0, 0.0, 1.0), (0.0, 0.0, 0.3), 64, 36)
-    assert list(tmp_path.iterdir()) == []
-    camera.close()
-    camera.close()
-    assert list(tmp_path.iterdir()) == []
+    camera.close()  # may be repeated
 
 
 def test_a_squeezed_picture_shows_what_the_wide_one_shows(world: CameraWorld) -> None:

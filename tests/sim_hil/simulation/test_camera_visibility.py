@@ -29,25 +29,25 @@ def _state(scene: Scene, x: float, y: float, theta: float, people: int) -> np.nd
 
 
 def test_a_wall_hides_what_is_behind_it_and_nothing_before_it() -> None:
-    sight = Visibility(ROOMS, BOUNDS).look(np.array((1.0, 2.0)), EAST, 1.2)
+    sight = Visibility(ROOMS, BOUNDS).sight(np.array((1.0, 2.0)), EAST, 1.2)
     assert list(Visibility(ROOMS, BOUNDS).pieces(sight)) == [0]
 
 
 def test_what_shows_beside_the_end_of_a_wall_is_seen() -> None:
     visibility = Visibility(ROOMS, BOUNDS)
-    sight = visibility.look(np.array((1.0, 9.0)), EAST, 1.2)
+    sight = visibility.sight(np.array((1.0, 9.0)), EAST, 1.2)
     assert list(visibility.pieces(sight)) == [2]
 
 
 def test_a_wall_that_does_not_reach_the_ceiling_hides_nothing() -> None:
     low = Scene(**{**ROOMS.__dict__, "walls": (Wall("low", (10.0, 0.0), (10.0, 8.0), 0.15, 1.2, "railing"),)})
     visibility = Visibility(low, BOUNDS)
-    assert sorted(visibility.pieces(visibility.look(np.array((1.0, 2.0)), EAST, 1.2))) == [0, 1, 2]
+    assert sorted(visibility.pieces(visibility.sight(np.array((1.0, 2.0)), EAST, 1.2))) == [0, 1, 2]
 
 
 def test_what_is_behind_the_eye_is_left_out_unless_it_is_very_near() -> None:
     visibility = Visibility(ROOMS, [(1.0, 4.0, 2.0, 6.0), (5.5, 4.0, 7.0, 6.0)])
-    assert list(visibility.pieces(visibility.look(np.array((8.0, 5.0)), EAST, 1.2))) == [1]
+    assert list(visibility.pieces(visibility.sight(np.array((8.0, 5.0)), EAST, 1.2))) == [1]
 
 
 @pytest.fixture(scope="module")
@@ -81,5 +81,4 @@ def test_a_picture_does_not_depend_on_what_was_drawn_before(hospital: tuple[Came
     first = world.render(states[0], 128, 128, 16 / 9)
     for state in states:
         world.render(state, 128, 128, 16 / 9)
-        world.look(state, (5.0, 5.0, 2.0), (6.0, 6.0, 0.0), 64, 36)
     assert np.array_equal(world.render(states[0], 128, 128, 16 / 9), first)

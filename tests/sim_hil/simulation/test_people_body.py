@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from sim_hil.crowd.people import RENDER_FIELDS, appearances
-from sim_hil.simulation.person_body import PersonBody
+from sim_hil.simulation.person_body import PersonBody, limbs
 from sim_hil.simulation.person_meshes import SHIN_M, THIGH_M, tail_m
-from sim_hil.simulation.person_posture import limbs
 from sim_hil.world.drawing.mesh import MeshBuilder
 
 ROW = np.array((1.0, 2.0, 0.5, 0.3, 1.0, 0.0, 0.0, 0.0))

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_hil.scene.scene import KINDS, TEXTURES, Box, Floor, Scene, SceneObject, Terrain, Wall
+from sim_hil.scene.scene import KINDS, TEXTURES, Box, Floor, Scene, SceneObject, Terrain, Wall, load_scene
 from sim_hil.simulation.renderer import Renderer
 from sim_hil.world.drawing.mesh import MeshBuilder
 from sim_hil.world.drawing.surfaces import SURFACES
+from sim_hil.world.drawing.textures import sign
 from sim_hil.world.scene_meshes import BUILDERS, add_object, build_scene, counter_clockwise, split
 
 OPEN = Scene("open", (0.0, 0.0, 0.0), (1.0, 1.0), (-12.0, -12.0), (12.0, 12.0), "asphalt", 0.0, (), (), ())
@@ -36,9 +37,9 @@ def _shown(scene: Scene) -> Iterator[Renderer]:
     renderer.close()
 
 
-def _down(renderer: Renderer, x: float, y: float, high: float) -> np.ndarray:
-    """Mean colour of half a metre of what lies below a point."""
-    hfov = 2 * float(np.arctan(0.25 / high))
+def _down(renderer: Renderer, x: float, y: float, high: float, width_m: float = 0.5) -> np.ndarray:
+    """Mean colour of the square of floor (at height 0) below a point."""
+    hfov = 2 * float(np.arctan(width_m / 2 / high))
     north = np.array((0.0, 1.0, 0.0))
     picture = renderer.picture(np.array((x, y, high)), np.array((0.0, 0.0, -1.0)), north, hfov, 16, 16, 1.0)
     return picture.reshape(-1, 3).astype(float).mean(axis=0)
@@ -178,3 +179,29 @@ def test_cutting_a_polygon_keeps_its_area(first: Corners, second: Corners) -> No
     inside, outside = split(subject, cutter)
     parts = [*outside, *([inside] if inside else [])]
     assert sum(cv2.contourArea(np.array(part, np.float32)) for part in parts) == pytest.approx(areas[0], abs=1e-2)
+
+
+def test_lettering_is_upright_and_not_mirrored() -> None:
+    scene = load_scene("corridor")
+    plate = next(thing for thing in scene.objects if thing.label == "exit sign")
+    # A camera 1 m before the sign, as high as its middle, sees nothing but the sign and the wall.
+    with _shown(scene) as renderer:
+        eye, ahead, hfov_rad = (
+            np.array((26.9, 0.0, 2.35)),
+            np.array((1.0, 0.0, 0.0)),
+            2 * float(np.arctan(0.45 / 1.035)),
+        )
+        seen = renderer.picture(eye, ahead, UP, hfov_rad, 240, 80, 3.0).astype(float)[..., 0]
+    drawn = cv2.resize(sign(plate), (240, 80)).astype(float)[..., 0]
+    likeness = [np.corrcoef(view.ravel(), seen.ravel())[0, 1] for view in (drawn, drawn[:, ::-1], drawn[::-1])]
+    assert likeness[0] > 0.7
+    assert likeness[0] > max(likeness[1:]) + 0.1
+
+
+def test_the_top_of_a_wall_is_seen_from_above() -> None:
+    scene = load_scene("corridor")
+    left = next(wall for wall in scene.walls if wall.label == "left wall").box
+    with _shown(scene) as renderer:
+        red, green, blue = _down(renderer, 10.3, left.centre_m[1], left.size_m[2] + 1.5, 0.03)
+    assert red > green > blue > 100
+    assert (red / blue, green / blue) == pytest.approx((206 / 186, 200 / 186), abs=0.04)

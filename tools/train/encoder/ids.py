@@ -130,7 +130,7 @@ class IdWorld:
         flat = float(np.hypot(view.ahead[0], view.ahead[1]))
         if up[2] < _UPRIGHT or flat < _UPRIGHT:
             return None
-        return self._visibility.look(view.eye[:2], view.ahead[:2] / flat, view.half_width / (flat * float(up[2])))
+        return self._visibility.sight(view.eye[:2], view.ahead[:2] / flat, view.half_width / (flat * float(up[2])))
 
     def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
         rows = state[self.mount.fields :].reshape(len(self._looks), RENDER_FIELDS)
