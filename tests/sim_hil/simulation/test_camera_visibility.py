@@ -11,7 +11,7 @@ import pytest
 from sim_hil.crowd.people import RENDER_FIELDS
 from sim_hil.scene.scene import Scene, Wall, load_scene
 from sim_hil.simulation.camera import CameraWorld
-from sim_hil.world.wall_visibility import Visibility
+from sim_hil.world.wall_visibility import Sight, Visibility
 
 ROOMS = Scene(
     "rooms", (1.0, 1.0, 0.0), (2.0, 2.0), (0.0, 0.0), (20.0, 10.0), "vinyl", 2.6,
@@ -68,7 +68,7 @@ def test_a_hospitals_picture_is_the_same_with_and_without_what_walls_hide(
     x, y = (float(v) for v in rng.uniform(scene.floor_min_m, scene.floor_max_m))
     state = _state(scene, x, y, float(rng.uniform(-pi, pi)), 30)
     picture = world.render(state, 320, 180)
-    monkeypatch.setattr(world, "_sight", lambda *_: None)
+    monkeypatch.setattr(Sight, "sees", lambda _, low, high: (np.ones(len(low), dtype=bool), np.zeros(len(low))))
     whole = world.render(state, 320, 180)
     # A person's elbow in the last column, or two surfaces in one plane, drawn in another order.
     differing = np.abs(picture.astype(int) - whole.astype(int)).max(axis=2) > 16

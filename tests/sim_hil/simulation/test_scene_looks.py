@@ -82,19 +82,6 @@ def test_what_is_seen_at_the_height_of_a_robot_stops_it(kind: str) -> None:
             assert min(_gap(box, x, y) for box in thing.boxes) < 0.06
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
-def test_a_thing_costs_few_triangles(kind: str) -> None:
-    mesh = MeshBuilder()
-    add_object(mesh, SceneObject("it", kind, (0, 0, 0), 0.0, KINDS[kind].size_m, (0.5, 0.5, 0.5), "A1"))
-    assert sum(len(surface.indices) // 3 for surface in mesh.surfaces()) < 900
-
-
-def test_the_same_thing_looks_the_same_whenever_it_is_built() -> None:
-    _, first = _vertices("tree")
-    _, again = _vertices("tree")
-    assert np.array_equal(first, again)
-
-
 def test_a_patch_of_floor_shows_its_own_texture_and_the_rest_the_floors() -> None:
     grass = Floor(((0.0, 0.0), (5.0, 0.0), (5.0, 5.0), (0.0, 5.0)), "grass")
     with _shown(replace(OPEN, floors=(grass,))) as renderer:

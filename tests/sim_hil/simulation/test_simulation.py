@@ -87,18 +87,18 @@ def test_people_keep_their_own_rate(rate_hz: int) -> None:
 
 
 def test_only_people_near_the_robot_have_a_body() -> None:
-    with simulated(load_scene("corridor"), people=4) as simulation:
-        run(simulation, 4.0)
-        (x, y, _), _ = simulation.pose()
-        near = [(px, py) for px, py, _ in simulation.people() if hypot(px - x, py - y) < 2.0]
-        bodies = [
-            pybullet.getBasePositionAndOrientation(body, physicsClientId=simulation.client)[0][:2]
-            for body in simulation._person_bodies
-        ]
-        inside = [place for place in bodies if place[0] < 28.0]
-        assert len(inside) < 4 or len(near) == 4
-        for person in near:
-            assert min(hypot(person[0] - bx, person[1] - by) for bx, by in inside) < 1e-6
+    seen = set()
+    with simulated(load_scene("corridor"), people=6, start=(9.0, 0.0, 0.0), rate_hz=240) as simulation:
+        for _ in range(30):
+            run(simulation, 0.5)
+            (x, y, _), _ = simulation.pose()
+            for px, py, _ in simulation.people():
+                ((hit, *_),) = pybullet.rayTest((px, py, 2.5), (px, py, 0.5), physicsClientId=simulation.client)
+                gap_m = hypot(px - x, py - y)
+                if not 2.0 < gap_m < 3.0:
+                    assert (hit >= 0) == (gap_m < 2.5)
+                    seen.add(hit >= 0)
+    assert seen == {True, False}
 
 
 def test_what_is_touched_is_forgotten_as_touching_but_not_as_collided() -> None:
