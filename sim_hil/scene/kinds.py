@@ -160,6 +160,3 @@ KINDS: dict[str, Kind] = {
         _flat("awning", "awning", (1.4, 4.0, 0.9), (0.86, 0.20, 0.18)),
     )
 }  # fmt: skip
-
-SOLID_KINDS = frozenset(name for name, kind in KINDS.items() if kind.solid)
-FLAT_KINDS = frozenset(KINDS) - SOLID_KINDS

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin
 
-from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+from sim_hil.scene.kinds import KINDS
 from sim_hil.scene.table import SceneError
 
 Vec2 = tuple[float, float]
@@ -97,7 +97,7 @@ class SceneObject:
     landmark: str = ""
 
     def __post_init__(self) -> None:
-        check_choice(f"object {self.label}", "kind", self.kind, SOLID_KINDS | FLAT_KINDS)
+        check_choice(f"object {self.label}", "kind", self.kind, KINDS)
         if min(self.size_m) <= 0:
             raise SceneError(f"object {self.label}: size_m must be positive, found {self.size_m}")
         if not all(0 <= channel <= 1 for channel in self.colour):
@@ -106,7 +106,7 @@ class SceneObject:
     @property
     def solid(self) -> bool:
         """Whether the object is an obstacle for robots and people."""
-        return self.kind in SOLID_KINDS
+        return KINDS[self.kind].solid
 
     @property
     def box(self) -> Box:
@@ -263,10 +263,10 @@ class Route:
             raise SceneError("route: expected at least two different points")
 
 
-def check_choice(what: str, key: str, value: str, known: Iterable[str]) -> None:
-    """Check that a value is one of the known ones. Raises SceneError."""
-    if value not in known:
-        raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(known))}")
+def check_choice(what: str, key: str, value: str, choices: Iterable[str]) -> None:
+    """Check that a value is one of the choices. Raises SceneError."""
+    if value not in choices:
+        raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(choices))}")
 
 
 def area_m2(polygon: tuple[Vec2, ...]) -> float:

@@ -10,7 +10,7 @@ from math import degrees, radians
 from pathlib import Path
 from typing import Any
 
-from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+from sim_hil.scene.kinds import KINDS
 from sim_hil.scene.parts import (
     CEILING_TEXTURES,
     FLOOR_TEXTURES,
@@ -36,7 +36,7 @@ else:
     import tomli as tomllib
 
 __all__ = [
-    "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
+    "CEILING_TEXTURES", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "TEXTURES",
     "WALL_TEXTURES", "Area", "Box", "Floor", "Place", "Route", "Scene", "SceneError",
     "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names", "scene_to_toml",
 ]  # fmt: skip

@@ -25,13 +25,10 @@ def load_w(left_nm: float, left_radps: float, right_nm: float, right_radps: floa
 
 
 class CarterBattery:
-    """State of charge; `draw` takes energy as it is used, `read` reports."""
+    """Battery that starts full; `draw` takes energy as it is used, `read` reports."""
 
-    def __init__(self, soc: float = 1.0) -> None:
-        """`soc`: charge at the start, 0 to 1."""
-        if not 0.0 <= soc <= 1.0:
-            raise ValueError(f"battery: expected a charge of 0 to 1, found {soc}")
-        self._charge_c = soc * _CAPACITY_C
+    def __init__(self) -> None:
+        self._charge_c = _CAPACITY_C
         self._used_j = self._used_s = 0.0
         self._load_w = ELECTRONICS_W
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from sim_hil.robots.battery import BatteryReading
 from sim_hil.robots.carter.battery import CarterBattery, load_w
-from sim_hil.robots.carter.drive import DriveController
+from sim_hil.robots.carter.drive import DriveController, OdometrySample, WheelCalibration, WheelOdometry
 from sim_hil.robots.carter.urdf import BODY_COM_M, LINKS, RADIUS_M, write_carter_urdf
-from sim_hil.robots.carter.wheel_odometry import OdometrySample, WheelCalibration, WheelOdometry
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.interface import BaseTruth
 
@@ -46,9 +45,6 @@ class Bumpers:
     rear: bool = False
     left: bool = False
     right: bool = False
-
-    def __bool__(self) -> bool:
-        return self.front or self.rear or self.left or self.right
 
 
 @dataclass(frozen=True)

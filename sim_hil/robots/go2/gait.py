@@ -56,18 +56,6 @@ class GaitConfig:
     run_mps: float = 1.0
     turn_mps2: float = 1.5
 
-    def __post_init__(self) -> None:
-        for period_s, ratio in (
-            (self.period_s, self.stance_ratio),
-            (self.fast_period_s, self.fast_stance_ratio),
-        ):
-            if not 0.2 <= period_s <= 1.0 or not 0.5 <= ratio < 0.9:
-                raise ValueError(f"gait: period {period_s} s or stance ratio {ratio} makes no trot")
-        if not 0.0 <= self.slow_mps < self.fast_mps:
-            raise ValueError(f"gait: speeds {self.slow_mps} and {self.fast_mps} m/s, expected 0 <= slow < fast")
-        if not 0.15 <= self.body_height_m <= 0.36:
-            raise ValueError(f"gait: body height {self.body_height_m} m, expected 0.15..0.36")
-
     @cached_property
     def home(self) -> tuple[Vec3, ...]:
         """Foot targets of a level stand at the gait's body height, base frame, m."""

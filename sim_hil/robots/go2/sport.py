@@ -111,9 +111,9 @@ def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
 class SportController:
     """The mode machine and its torques. Deterministic; call `step` once every dt_s."""
 
-    def __init__(self, dt_s: float, gait: GaitConfig | None = None) -> None:
+    def __init__(self, dt_s: float) -> None:
         self._dt_s, self._inverse_dt = dt_s, 1.0 / dt_s
-        self._config = gait if gait is not None else GaitConfig()
+        self._config = GaitConfig()
         self.mode = MODE_LIE_DOWN  # SportModeState.mode
         self._time_s = 0.0
         self._motion: _Motion | None = None

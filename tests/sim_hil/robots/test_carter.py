@@ -10,7 +10,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from sim_hil.robots.carter.body import TYRE_GRIP
+from sim_hil.robots.carter.body import TYRE_GRIP, Bumpers
 from sim_hil.robots.carter.sensors import CarterSensors
 from sim_hil.robots.carter.urdf import LENGTH_M, MASS_KG, RADIUS_M, WHEEL_RADIUS_M, WIDTH_M
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
@@ -113,7 +113,7 @@ def test_turning_in_place_it_stays_inside_its_circle(make: Make) -> None:
         world.box((out * math.cos(a), out * math.sin(a), 0.5), (0.06, 0.06, 1.0))
     world.go()
     for _ in range(50):
-        assert not world.run(0.1, 0.0, 1.5).bumpers
+        assert world.run(0.1, 0.0, 1.5).bumpers == Bumpers()
     assert math.hypot(*world.truth().position_m[:2]) < 0.02
 
 
@@ -141,7 +141,7 @@ def test_it_climbs_an_edge_of_2_cm(make: Make, v: float, rate_hz: int) -> None:
     truth = world.run(1.0 + 2.2 / v, v)
     assert truth.position_m[0] > 1.8
     assert truth.position_m[2] == pytest.approx(0.02, abs=0.003)
-    assert not truth.bumpers
+    assert truth.bumpers == Bumpers()
 
 
 @pytest.mark.parametrize("v", [0.3, 1.5])
@@ -194,7 +194,7 @@ def test_the_bumper_that_is_pushed_says_so_and_lets_go(make: Make, side: str, ce
     world.go()
     sign = 1.0 if side == "front" else -1.0
     assert getattr(world.run(1.5, 0.3 * sign).bumpers, side)
-    assert not world.run(1.5, -0.3 * sign).bumpers
+    assert world.run(1.5, -0.3 * sign).bumpers == Bumpers()
 
 
 def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None:

@@ -14,15 +14,17 @@ from sim_hil.robots.carter.drive import (
     ACCEL_MPS2,
     ALPHA_RADPS2,
     BRAKE_MPS2,
+    COUNTS_PER_TURN,
     HOLD_S,
     MAX_TORQUE_NM,
     NO_LOAD_RADPS,
     V_MAX_MPS,
     W_MAX_RADPS,
     DriveController,
+    WheelCalibration,
+    WheelOdometry,
 )  # fmt: skip
 from sim_hil.robots.carter.urdf import TRACK_M, WHEEL_RADIUS_M
-from sim_hil.robots.carter.wheel_odometry import COUNTS_PER_TURN, WheelCalibration, WheelOdometry
 
 DT_S = 1 / 240
 
@@ -212,9 +214,3 @@ def test_the_current_is_a_mean_over_time_however_often_it_is_asked_for() -> None
     found = silent.read()
     assert asked.read() == found
     assert found.current_a == pytest.approx(200.0 / 41.5, rel=1e-3)
-
-
-@pytest.mark.parametrize("soc", [-0.1, 1.1, math.nan])
-def test_a_charge_that_cannot_be_is_refused(soc: float) -> None:
-    with pytest.raises(ValueError, match="0 to 1"):
-        CarterBattery(soc)

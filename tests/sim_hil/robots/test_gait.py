@@ -102,8 +102,3 @@ def test_commands_are_clipped_to_what_the_gait_can_do(command: tuple[float, floa
 @pytest.mark.parametrize("command", [(1.5, 0.3, -1.0), (1.0, -0.5, 1.2), (-0.8, 0.5, 1.2)])
 def test_the_corners_of_the_envelope_pass_unclipped(command: tuple[float, float, float]) -> None:
     assert limit_command(CONFIG, command) == pytest.approx(command)
-
-
-def test_a_gait_that_is_no_trot_is_refused() -> None:
-    with pytest.raises(ValueError, match="trot"):
-        GaitConfig(stance_ratio=0.3)
