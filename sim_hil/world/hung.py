@@ -14,7 +14,6 @@ from sim_hil.world.drawing.textures import DARK, WHITE, Image, canvas, fill, fro
 
 
 def _double_door_face(thing: SceneObject) -> Image:
-    """Two leaves with round windows, push plates and a sign above the handles."""
     image = front(thing, 0.55)
     for left in (0.03, 0.505):
         fill(image, left, 0.03, left + 0.465, 1, rgb(thing.colour))
@@ -31,7 +30,6 @@ def _double_door_face(thing: SceneObject) -> Image:
 
 
 def _elevator_face(thing: SceneObject) -> Image:
-    """Steel doors in a frame, a lit floor display and ELEVATOR above, buttons beside."""
     _, width, height = thing.size_m
     image = canvas(width, height, (96, 100, 106))
     fill(image, 0.0, 0.0, 1.0, 0.16, (30, 34, 40))
@@ -51,7 +49,6 @@ def _elevator_face(thing: SceneObject) -> Image:
 
 
 def _loading_face(thing: SceneObject) -> Image:
-    """A roller door in a black and yellow frame, with its number."""
     image = front(thing)
     rows = image.shape[0]
     for top in range(0, rows, 14):
@@ -67,7 +64,6 @@ def _loading_face(thing: SceneObject) -> Image:
 
 
 def _whiteboard_face(thing: SceneObject) -> Image:
-    """Writing in three colours in an aluminium frame."""
     _, width, height = thing.size_m
     image = canvas(width, height, (168, 172, 176))
     fill(image, 0.02, 0.03, 0.98, 0.95, rgb(thing.colour))
@@ -82,7 +78,6 @@ def _whiteboard_face(thing: SceneObject) -> Image:
 
 
 def _painting_face(thing: SceneObject) -> Image:
-    """A landscape in a frame of the object's colour: sun, hills, a lake."""
     image = front(thing)
     h, w = image.shape[:2]
     fill(image, 0.08, 0.10, 0.92, 0.90, (240, 190, 130))
@@ -98,7 +93,6 @@ def _painting_face(thing: SceneObject) -> Image:
 
 
 def _clock_face(thing: SceneObject) -> Image:
-    """Ten past ten."""
     image = plain(96, 96, rgb(thing.colour))
     cv2.rectangle(image, (0, 0), (95, 95), DARK, 5)
     for hour in range(12):
@@ -111,7 +105,6 @@ def _clock_face(thing: SceneObject) -> Image:
 
 
 def _room_face(thing: SceneObject) -> Image:
-    """A door plate: the number or name in white."""
     image = plain(128, 96, rgb(thing.colour))
     fill(image, 0.0, 0.86, 1.0, 1.0, (230, 180, 60))
     write(image, thing.text or "-", 0.06, 0.12, 0.94, 0.78, WHITE)
@@ -119,7 +112,6 @@ def _room_face(thing: SceneObject) -> Image:
 
 
 def _exit_face(thing: SceneObject) -> Image:
-    """EXIT and an arrow, white on green."""
     image = plain(256, 104, rgb(thing.colour))
     write(image, thing.text or "EXIT", 0.04, 0.10, 0.66, 0.90, WHITE)
     cv2.arrowedLine(image, (178, 52), (244, 52), WHITE, 10, tipLength=0.45)
@@ -127,7 +119,6 @@ def _exit_face(thing: SceneObject) -> Image:
 
 
 def _carpet_top(thing: SceneObject) -> Image:
-    """A border and a lozenge in a lighter colour."""
     depth, width, _ = thing.size_m
     image = canvas(width, depth, rgb(thing.colour))
     h, w = image.shape[:2]

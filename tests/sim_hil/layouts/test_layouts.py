@@ -20,13 +20,12 @@ from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, load_scene
 
 SEED = 4711
-HOLDS = {
+TYPICAL = {
     "hospital": {"hospital_bed", "vending_machine", "water_dispenser", "reception_desk", "medical_cart", "double_door"},
     "office": {"elevator", "desk", "carpet", "coffee_machine", "printer", "door", "meeting_table"},
     "warehouse": {"storage_rack", "forklift", "traffic_cone", "fire_extinguisher", "pallet_jack", "loading_door"},
     "sidewalk": {"fountain", "umbrella", "storefront", "building", "park_bench", "tree", "kiosk", "car"},
 }
-SIZE_M = {"hospital": (43, 33), "office": (38, 30), "warehouse": (34, 30), "sidewalk": (120, 60)}
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +52,8 @@ def test_every_doorway_is_passable_for_a_robot_almost_a_metre_wide(kind: str, ma
 
 
 @pytest.mark.parametrize("kind", layouts.KINDS)
-def test_it_holds_what_its_environment_is_known_by_and_is_about_as_large(kind: str, made: dict[str, Scene]) -> None:
-    scene = made[kind]
-    assert HOLDS[kind] <= {thing.kind for thing in scene.objects}
-    assert sorted(scene.floor_max_m) <= sorted(SIZE_M[kind])
-    assert sorted(scene.floor_max_m) >= sorted(0.7 * size for size in SIZE_M[kind])
+def test_a_layout_contains_the_typical_objects_of_its_environment(kind: str, made: dict[str, Scene]) -> None:
+    assert TYPICAL[kind] <= {thing.kind for thing in made[kind].objects}
 
 
 @pytest.mark.slow

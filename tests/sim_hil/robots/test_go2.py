@@ -51,14 +51,11 @@ def _stand(simulation: Simulation) -> None:
     _run(simulation, 0.2)
 
 
-def test_robot_starts_lying(simulation: Simulation) -> None:
+def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simulation) -> None:
     _run(simulation, 0.5)
     truth = simulation.truth()
-    assert truth.mode == 5
-    assert truth.body_height_m < 0.12
-
-
-def test_stand_up_ends_locked_and_balance_stand_balances(simulation: Simulation) -> None:
+    assert truth.mode == 5 and truth.body_height_m < 0.12
+    assert simulation.sport(SportAction.BALANCE_STAND) == ERROR_NOT_STANDING
     assert simulation.sport(SportAction.STAND_UP) == 0
     _run(simulation, 2.0)
     truth = simulation.truth()

@@ -109,27 +109,32 @@ def test_an_object_without_size_and_colour_gets_those_of_its_kind() -> None:
     assert (thing.size_m, thing.colour) == (KINDS["forklift"].size_m, KINDS["forklift"].colour)
 
 
-def test_a_ramp_rises_evenly_and_drops_off_at_its_front() -> None:
-    ramp = Terrain("ramp", "ramp", (2.0, 1.0, 0.0), pi / 2, (3.0, 1.2), 0.42, "concrete")
-    scene = replace(PLAIN, terrain=(ramp,))
-    heights = [scene.ground_height_m(2.0, 1.0 + u) for u in (-1.6, -1.5, 0.0, 1.5, 1.6)]
-    assert heights == pytest.approx([0, 0, 0.21, 0.42, 0], abs=1e-6)
-    assert scene.ground_height_m(2.7, 1.0) == 0.0
-
-
-def test_a_bump_is_as_high_as_it_says_in_its_middle_and_level_with_the_floor_at_its_ends() -> None:
-    scene = replace(PLAIN, terrain=(Terrain("bump", "bump", (0.0, 0.0, 0.0), 0.0, (0.6, 2.0), 0.05, "asphalt"),))
-    assert scene.ground_height_m(0.0, 0.5) == pytest.approx(0.05)
-    assert scene.ground_height_m(0.2999, 0.5) < 0.001
-    assert 0.02 < scene.ground_height_m(0.15, 0.5) < 0.05
-
-
-def test_what_stands_on_a_platform_is_as_high_as_both_together() -> None:
-    platform = Terrain("slab", "platform", (0.0, 0.0, 0.0), 0.3, (4.0, 4.0), 0.15, "paving")
-    ramp = Terrain("ramp", "ramp", (0.0, 0.0, 0.15), 0.3, (2.0, 1.0), 0.2, "paving")
-    scene = replace(PLAIN, terrain=(ramp, platform))
-    assert scene.ground_height_m(0.0, 0.0) == pytest.approx(0.25)
-    assert scene.ground_height_m(-1.8, 0.0) == pytest.approx(0.15)
+@pytest.mark.parametrize(
+    ("terrain", "heights_m"),
+    [
+        pytest.param(
+            (Terrain("ramp", "ramp", (0.0, 0.0, 0.0), 0.0, (3.0, 1.2), 0.42, "concrete"),),
+            {(-1.6, 0): 0, (-1.5, 0): 0, (0, 0): 0.21, (1.499, 0): 0.42, (1.6, 0): 0, (0, 0.7): 0},
+            id="a ramp rises evenly and drops off at its front",
+        ),
+        pytest.param(
+            (Terrain("bump", "bump", (0.0, 0.0, 0.0), 0.0, (0.6, 2.0), 0.05, "asphalt"),),
+            {(0, 0.5): 0.05, (0.2999, 0.5): 0, (0.15, 0.5): 0.05 * 0.5**0.5},
+            id="a bump follows half a sine wave",
+        ),
+        pytest.param(
+            (
+                Terrain("ramp", "ramp", (0.0, 0.0, 0.15), 0.3, (2.0, 1.0), 0.2, "paving"),
+                Terrain("slab", "platform", (0.0, 0.0, 0.0), 0.3, (4.0, 4.0), 0.15, "paving"),
+            ),
+            {(0, 0): 0.25, (-1.8, 0): 0.15},
+            id="a ramp on a platform",
+        ),
+    ],
+)
+def test_ground_height(terrain: tuple[Terrain, ...], heights_m: dict[tuple[float, float], float]) -> None:
+    scene = replace(PLAIN, terrain=terrain)
+    assert [scene.ground_height_m(*xy) for xy in heights_m] == pytest.approx(list(heights_m.values()), abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", sorted(TERRAIN_KINDS))
