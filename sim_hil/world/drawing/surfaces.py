@@ -132,7 +132,7 @@ def _asphalt_line() -> Image:
 def _bricks(
     joint: Colour, colour: Colour, shares: tuple[int, int, int], width: int, height: int, px: int, seed: int
 ) -> Image:  # fmt: skip
-    """Rows of bricks, `width` x `height` pixels, shifted by half a brick; `shares`: divisors of a channel's variation."""
+    """Rows of bricks of `width` x `height` pixels, shifted by half a brick; `shares`: divisors of the variation."""
     image = plain(px, px, joint)
     rng = np.random.default_rng(seed)
     for row in range(px // height):

@@ -205,17 +205,6 @@ def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None
     assert 100.0 > left[0] > left[1]
 
 
-def test_the_same_commands_give_the_same_motion_to_the_last_bit(make: Make) -> None:
-    def trail() -> list[float]:
-        world, seen = make().go(), []
-        for v, w in ((1.0, 0.3), (0.4, -1.2), (0.0, 0.0)):
-            world.run(1.0, v, w)
-            seen += world.robot.render_state()
-        return seen
-
-    assert trail() == trail()
-
-
 def test_sensors_of_a_seed_always_read_the_same(make: Make) -> None:
     def readings(seed: int) -> list[object]:
         world = make().go()

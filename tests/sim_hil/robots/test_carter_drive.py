@@ -197,13 +197,6 @@ def test_driving_takes_more_than_standing_and_braking_gives_nothing_back() -> No
     assert load_w(5.0, 3.0, 5.0, 3.0) > ELECTRONICS_W
 
 
-def test_a_battery_under_load_has_less_voltage() -> None:
-    idle, busy = CarterBattery(), CarterBattery()
-    idle.draw(0.0, 1.0)
-    busy.draw(500.0, 1.0)
-    assert busy.read().voltage_v < idle.read().voltage_v
-
-
 def test_the_current_is_a_mean_over_time_however_often_it_is_asked_for() -> None:
     asked, silent = CarterBattery(), CarterBattery()
     for step in range(48):  # 0.1 s of nothing, then 0.1 s of 400 W in every second step

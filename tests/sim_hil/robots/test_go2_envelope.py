@@ -8,10 +8,9 @@ import numpy as np
 import pybullet
 import pytest
 
-from sim_hil.robots.go2.body import FOOT_GRIP, HALF_LENGTH_M, RENDER_FIELDS, SHELL_GRIP
+from sim_hil.robots.go2.body import FOOT_GRIP, HALF_LENGTH_M, SHELL_GRIP
 from sim_hil.robots.go2.sport import MODE_DAMPING
 from sim_hil.robots.go2.urdf import LEGS, TORQUE_LIMITS_NM, TOTAL_MASS_KG, VELOCITY_LIMITS_RADPS
-from sim_hil.robots.interface import BaseTruth, Robot
 from tools.bench.sim.locomotion_course import Command, Course
 from tools.bench.sim.locomotion_runs import PUSHES, as_row, endure, push_over, track
 
@@ -92,20 +91,6 @@ def test_a_robot_that_has_fallen_is_limp_and_stays_down_until_it_is_asked_to_sta
     assert not course.robot.ready and course.robot.pose()[0][2] < 0.2
     course.robot.command(0.5, 0.0, 0.0)
     assert course.robot.truth(course.time_s).commanded == (0.0, 0.0, 0.0)
-
-
-def test_a_go2_is_a_robot(course: Course) -> None:
-    robot: Robot = course.robot
-    assert not robot.ready
-    assert course.stand() and robot.ready and robot.up() > 0.99
-    robot.command(0.4, 0.1, 0.2)
-    truth = robot.truth(1.5)
-    assert isinstance(truth, BaseTruth) and truth.time_s == 1.5 and truth.commanded == (0.4, 0.1, 0.2)
-    state = robot.render_state()
-    assert len(state) == RENDER_FIELDS
-    assert state[:3] == pytest.approx(truth.position_m) and state[3:7] == pytest.approx(
-        np.roll(truth.quaternion_wxyz, -1)
-    )
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sim_hil.crowd.people import appearances
+from sim_hil.robots.go2.body import rotation_matrix
 from sim_hil.simulation.person_body import PersonBody, limbs
 from sim_hil.simulation.person_meshes import SHIN_M, THIGH_M, tail_m
 from sim_hil.world.drawing.mesh import MeshBuilder
@@ -38,14 +39,8 @@ class FakeStage:
     def points(self) -> np.ndarray:
         """[n, 3]: every vertex that is shown, in the world."""
         found = []
-        for handle, (position, (x, y, z, w)) in self.shown.items():
-            turn = np.array(
-                (
-                    (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-                    (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-                    (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-                )
-            )
+        for handle, (position, quaternion) in self.shown.items():
+            turn = rotation_matrix(quaternion)
             for surface in self.meshes[handle].surfaces():
                 found.append(np.array(surface.vertices) @ turn.T + position)
         return np.concatenate(found)

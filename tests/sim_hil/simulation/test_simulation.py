@@ -45,6 +45,17 @@ def test_any_robot_gets_ready_and_drives_as_commanded(robot: str) -> None:
         assert simulation.truth().commanded[0] == pytest.approx(0.6)
 
 
+@pytest.mark.parametrize("robot", ["go2", "carter"])
+def test_the_same_seed_and_commands_give_the_same_motion(robot: str) -> None:
+    states = []
+    for _ in range(2):
+        with simulated(load_scene("corridor"), people=3, robot=robot, rate_hz=240) as simulation:
+            simulation.settle()
+            run(simulation, 2.0, (0.6, 0.0, 0.2))
+            states.append(simulation.render_state())
+    assert np.array_equal(*states)
+
+
 def test_a_start_of_its_own_takes_the_place_of_the_scenes() -> None:
     with simulated(hall(), start=(2.0, 1.0, 1.5)) as simulation:
         (x, y, _), heading = simulation.pose()
@@ -110,6 +121,7 @@ def test_what_is_touched_is_forgotten_as_touching_but_not_as_collided() -> None:
         assert simulation.touching == {"block -7.0 0.0"}
         run(simulation, 2.0, (-0.4, 0.0, 0.0))
         assert simulation.touching == frozenset() and simulation.collided_with() == {"block -7.0 0.0"}
+        assert not simulation.fell
 
 
 @pytest.mark.parametrize("options", [{"robot": "spot"}, {"rate_hz": 30}])
