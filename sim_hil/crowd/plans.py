@@ -355,7 +355,7 @@ class Plans:
         dx = np.where(near, fx, np.where(roomy, sx - x, dx))
         dy = np.where(near, fy, np.where(roomy, sy - y, dy))
         norm = np.sqrt(dx * dx + dy * dy) + 1e-9
-        pace = crowd.free_mps[who] * self._groups.patience(crowd)[who]
+        pace = crowd.free_mps[who] * self._groups.patience()[who]
         ends = self._ends[crowd.spot[who]]
         pace = np.where(near & ends, np.minimum(pace, 0.35 + 0.6 * left), pace)
         return dx / norm * pace, dy / norm * pace

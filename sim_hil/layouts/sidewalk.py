@@ -37,7 +37,7 @@ def sidewalk(rng: np.random.Generator) -> Scene:
 
     crossings = _streets(builder, length, depth, (x0, y0, x1, y1), walk, zebra)
     strips = _sidewalks(builder, length, depth, (x0, y0, x1, y1), walk)
-    _kerbs(builder, strips, crossings, (x0, y0, x1, y1), length, depth)
+    _kerbs(builder, crossings, (x0, y0, x1, y1), length, depth)
     lots = [
         Rect(0, 0, x0 - walk, y0 - walk), Rect(x1 + walk, 0, length, y0 - walk),
         Rect(0, y1 + walk, x0 - walk, depth), Rect(x1 + walk, y1 + walk, length, depth),
@@ -132,9 +132,8 @@ def _sidewalks(
 
 
 def _kerbs(
-    builder: Builder, strips: list[Room], crossings: list[Room], road: tuple[float, float, float, float],
-    length: float, depth: float,
-) -> None:  # fmt: skip
+    builder: Builder, crossings: list[Room], road: tuple[float, float, float, float], length: float, depth: float
+) -> None:
     """Add kerb stones along every edge between sidewalk and street; they are lowered at crossings."""
     x0, y0, x1, y1 = road
     width, rise = _KERB_M

@@ -56,7 +56,7 @@ def warehouse(rng: np.random.Generator) -> Scene:
     else:
         y += _MARGIN_M
 
-    made = _racks(builder, blocks, cross, aisles, width, block, bay)
+    made = _racks(builder, blocks, aisles, width, block, bay)
     _loading(builder, yard)
     _things(builder, main, made)
     lights(builder, 8.0)
@@ -76,9 +76,8 @@ def _hall(builder: Builder, bounds: Rect) -> list[Wall]:
 
 
 def _racks(
-    builder: Builder, blocks: list[tuple[float, float]], cross: list[Room], aisles: int, width: float, block: float,
-    bay: float,
-) -> list[Room]:  # fmt: skip
+    builder: Builder, blocks: list[tuple[float, float]], aisles: int, width: float, block: float, bay: float
+) -> list[Room]:
     """Add rows of racks, back to back between aisles, with one colour per block, and the aisles."""
     colours = builder.shuffled(_RACK_COLOURS)
     made = []

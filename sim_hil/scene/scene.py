@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields
 from math import degrees, radians
 from pathlib import Path
 from typing import Any
@@ -118,13 +118,6 @@ class Scene:
     def landmarks(self) -> list[SceneObject]:
         """Return the objects that instructions may name."""
         return [thing for thing in self.objects if thing.landmark]
-
-    def without(self, label: str) -> Scene:
-        """Return the scene without one object. Raises KeyError for an unknown label."""
-        rest = tuple(thing for thing in self.objects if thing.label != label)
-        if len(rest) == len(self.objects):
-            raise KeyError(label)
-        return replace(self, objects=rest)
 
 
 def parse_scene(text: str, source: str) -> Scene:

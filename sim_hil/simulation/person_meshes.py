@@ -43,7 +43,7 @@ def _tube(mesh: MeshBuilder, frame: Frame, colour: Rgb, sides: int, *rings: Ring
 
 
 def trunk(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
-    """Pelvis to neck, and what is worn and carried on it; origin between the hip joints, x to the front."""
+    """Add pelvis to neck with clothes and bags; origin between the hip joints, x to the front."""
     k = look.scale
     frame = frame.at((0.0, 0.0, -HIP_M * k))
     wide = look.build
@@ -83,7 +83,7 @@ def trunk(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
 
 
 def head(mesh: MeshBuilder, frame: Frame, look: Appearance, face: bool = True) -> None:
-    """Head, hair and what is worn on it, with or without a face; origin at the neck's base."""
+    """Add head, hair, cap or helmet, with or without a face; origin at the neck's base."""
     k = look.scale
     frame = frame.at((0.0, 0.0, -NECK_M * k))
     mesh.ball(frame, (0.012 * k, 0, 1.605 * k), (0.098 * k, 0.078 * k, 0.122 * k), look.skin, 10)
@@ -120,7 +120,7 @@ def thigh(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
     """Hip to knee; origin at the hip joint."""
     k = look.scale
     bare = look.legs in ("shorts", "skirt", "dress")
-    w = k * look.build * (0.78 if tail_m(look) else 1.0)  # what cloth hides need not press against it
+    w = k * look.build * (0.78 if tail_m(look) else 1.0)  # hidden by cloth, so it may be thinner
     rings = ((-THIGH_M * k, 0.062 * w, 0.060 * w), (-0.20 * k, 0.078 * w, 0.075 * w), (0.02, 0.090 * w, 0.085 * w))
     _tube(mesh, frame, look.skin if bare else look.trousers, 8, *rings)
     if look.legs == "shorts":
@@ -175,7 +175,7 @@ def _bare_arms(look: Appearance) -> bool:
 
 
 def tail(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
-    """What hangs from the waist round both legs: skirt, dress, coat; origin between the hip joints."""
+    """Add skirt, dress or coat tails around both legs; origin between the hip joints."""
     length = tail_m(look)
     hangs_from_legs = look.legs in ("skirt", "dress")
     colour, flare = (look.trousers, 1.06) if hangs_from_legs else (look.over, 1.0)
@@ -186,6 +186,6 @@ def tail(mesh: MeshBuilder, frame: Frame, look: Appearance) -> None:
 
 
 def tail_m(look: Appearance) -> float:
-    """How far a skirt, dress or coat hangs below the hips, m; 0 for other clothes."""
+    """Return how far a skirt, dress or coat reaches below the hips, m; 0 for other clothes."""
     lengths = {"skirt": 0.46, "dress": 0.50}
     return lengths.get(look.legs, {"coat": 0.48, "lab_coat": 0.38}.get(look.top, 0.0))

@@ -305,10 +305,6 @@ class Simulation:
             raise ValueError(f"simulation: sport actions are the Go2's, this robot is a {type(self.robot).__name__}")
         return self.robot.sport.request(action)
 
-    def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Alias of `command` with the name of the Go2's sport service."""
-        self.command(vx_mps, vy_mps, wz_radps)
-
     @property
     def commanded(self) -> tuple[float, float, float]:
         """Velocity command in force; zero if the robot may not move or the last command has expired."""

@@ -39,7 +39,7 @@ _MIN_BUMP_N: Final = 5.0
 
 @dataclass(frozen=True)
 class Bumpers:
-    """Which sides of the shell have been pushed within the last 0.2 s."""
+    """Sides of the shell that were pushed within the last 0.2 s."""
 
     front: bool = False
     rear: bool = False
@@ -153,7 +153,7 @@ class Carter:
 
     @property
     def ready(self) -> bool:
-        """Whether the base would obey a velocity command now."""
+        """Whether the base would follow a velocity command now."""
         return self.controller.ready
 
     def drive(self) -> None:
@@ -195,7 +195,7 @@ class Carter:
         self._bumped_steps[side] = self._steps
 
     def bumpers(self) -> Bumpers:
-        """Which sides of the shell have been pushed within the last 0.2 s."""
+        """Return the sides of the shell that were pushed within the last 0.2 s."""
         since = self._steps - round(_BUMPER_HOLD_S / self._dt_s)
         return Bumpers(**{side: step > since for side, step in self._bumped_steps.items()})
 

@@ -65,7 +65,7 @@ _JOINTS = tuple(
 
 
 class SportAction(Enum):
-    """Requests of the sport service that change what the robot is doing."""
+    """Requests of the sport service that change the robot's motion."""
 
     DAMP = "Damp"
     BALANCE_STAND = "BalanceStand"
@@ -76,7 +76,7 @@ class SportAction(Enum):
 
 
 class Measured(NamedTuple):
-    """What the controller reads every step: joints (FR, FL, RR, RL x hip, thigh, calf) and the body."""
+    """Inputs of one controller step: joints (FR, FL, RR, RL x hip, thigh, calf) and the body."""
 
     q_rad: tuple[float, ...]
     dq_radps: tuple[float, ...]
@@ -96,7 +96,7 @@ def _clip(value: float, low: float, high: float) -> float:
 
 
 def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
-    """What the motor of hip, thigh or calf (0, 1, 2) gives of a wanted torque at a speed.
+    """Return the torque that the motor of hip, thigh or calf (0, 1, 2) reaches at a speed, N.m.
 
     Braking is bounded by the torque limit alone; driving fades to zero towards the velocity limit.
     """
@@ -147,7 +147,7 @@ class SportController:
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity command would be obeyed: it stands balanced and no motion is running or awaited."""
+        """Whether the robot would follow a velocity: it stands balanced, and no motion runs or is awaited."""
         return self.mode in _BALANCED and self._bound_for is None
 
     @property
@@ -157,7 +157,7 @@ class SportController:
         return None if motion is None else motion.mode
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity; kept one second, clipped to the robot's range, without effect unless it stands balanced."""
+        """Command a velocity for one second, clipped to the robot's range; ignored unless the robot stands balanced."""
         if not self.ready:
             return
         self._command = (

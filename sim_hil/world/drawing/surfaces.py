@@ -104,7 +104,7 @@ def _concrete() -> Image:
 
 
 def _concrete_yellow_line() -> Image:
-    """A line along the heading every 4 m, as it bounds the lanes of a warehouse."""
+    """A line along the heading every 4 m, the boundary of a warehouse's lanes."""
     image = _concrete()
     image[0:7] = image[-7:] = (236, 190, 20)
     return image
@@ -153,7 +153,7 @@ def _soil() -> Image:
 
 
 def _zebra_crossing() -> Image:
-    """Bars across the heading, which is the way that people walk."""
+    """Bars across the heading, the direction in which people walk."""
     image = np.asarray(cv2.resize(_asphalt(), (128, 128)), np.uint8)
     fill(image, 0.0, 0.0, 0.5, 1.0, (238, 238, 232))
     return image

@@ -12,7 +12,7 @@ import pytest
 
 from sim_hil.robots.carter.body import TYRE_GRIP, Bumpers
 from sim_hil.robots.carter.sensors import CarterSensors
-from sim_hil.robots.carter.urdf import LENGTH_M, MASS_KG, RADIUS_M, WHEEL_RADIUS_M, WIDTH_M
+from sim_hil.robots.carter.urdf import LENGTH_M, RADIUS_M, WHEEL_RADIUS_M
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from tools.bench.sim.wheeled_course import World, forward_mps
 
@@ -33,14 +33,6 @@ def make(tmp_path: Path) -> Iterator[Make]:
     yield build
     for world in worlds:
         world.close()
-
-
-def test_the_body_has_the_published_mass_and_fits_its_own_circle(make: Make) -> None:
-    world = make()
-    links = range(-1, pybullet.getNumJoints(world.robot.body, physicsClientId=world.client))
-    masses = [pybullet.getDynamicsInfo(world.robot.body, link, physicsClientId=world.client)[0] for link in links]
-    assert sum(masses) == pytest.approx(MASS_KG)
-    assert WIDTH_M / 2 < RADIUS_M < math.hypot(LENGTH_M / 2, WIDTH_M / 2)
 
 
 def test_the_tyres_have_the_grip_that_they_should(make: Make) -> None:

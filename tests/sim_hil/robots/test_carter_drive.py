@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.geometry import SE2
 from sim_hil.robots.carter.battery import CAPACITY_WH, ELECTRONICS_W, CarterBattery, load_w
 from sim_hil.robots.carter.drive import (
     ACCEL_MPS2,
@@ -169,17 +168,6 @@ def test_wheels_of_another_size_than_believed_make_odometry_drift() -> None:
     found = odometry.sample(0.0, 0.0)
     assert found.distance_m == pytest.approx(2000 * 0.05 * WHEEL_RADIUS_M, rel=1e-3)
     assert found.T_odom_base.theta_rad == pytest.approx(found.distance_m * 0.002 / TRACK_M, rel=0.02)
-
-
-def test_a_robot_of_a_seed_is_always_the_same_and_no_other() -> None:
-    assert WheelCalibration.drawn(7) == WheelCalibration.drawn(7) != WheelCalibration.drawn(8)
-
-
-def test_odometry_reports_the_speeds_of_the_wheels() -> None:
-    sample = WheelOdometry().sample(2.0, 4.0)
-    assert sample.v_mps == pytest.approx(3.0 * WHEEL_RADIUS_M)
-    assert sample.w_radps == pytest.approx(2.0 * WHEEL_RADIUS_M / TRACK_M)
-    assert sample.T_odom_base == SE2(0.0, 0.0, 0.0)
 
 
 def test_a_full_battery_lasts_as_long_as_its_energy_says() -> None:

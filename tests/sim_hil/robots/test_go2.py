@@ -40,7 +40,7 @@ def simulation(open_floor: Scene) -> Iterator[Simulation]:
 def _run(simulation: Simulation, seconds: float, command: tuple[float, float, float] | None = None) -> None:
     for index in range(round(seconds / Simulation.DT_S)):
         if command is not None and index % 50 == 0:
-            simulation.move(*command)
+            simulation.command(*command)
         simulation.step()
 
 
@@ -97,7 +97,7 @@ def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulati
 
 def test_a_move_is_held_one_second_and_then_the_robot_stands_still(simulation: Simulation) -> None:
     _stand(simulation)
-    simulation.move(0.5, 0.0, 0.0)
+    simulation.command(0.5, 0.0, 0.0)
     _run(simulation, 0.98)
     truth = simulation.truth()
     assert truth.commanded == (0.5, 0.0, 0.0) and truth.mode == 3 and truth.gait_type == 1

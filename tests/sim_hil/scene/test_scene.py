@@ -247,11 +247,3 @@ def test_a_wrong_scene_file_is_refused_in_one_line(old: str, new: str, complaint
 def test_text_that_is_not_toml_is_refused() -> None:
     with pytest.raises(SceneError, match="TOML"):
         parse_scene("walls = [", "test.toml")
-
-
-def test_a_scene_without_one_object_lacks_only_that() -> None:
-    scene = load_scene("corridor")
-    rest = scene.without("vending machine")
-    assert {thing.label for thing in scene.objects} - {thing.label for thing in rest.objects} == {"vending machine"}
-    with pytest.raises(KeyError):
-        rest.without("vending machine")

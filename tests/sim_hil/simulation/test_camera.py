@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from math import cos, pi, radians, sin
 from types import SimpleNamespace
 
@@ -31,7 +32,9 @@ def world() -> Iterator[CameraWorld]:
 
 @pytest.fixture(scope="module")
 def bare_world() -> Iterator[CameraWorld]:
-    world = CameraWorld(load_scene("corridor").without("vending machine"), people=1, seed=0)
+    scene = load_scene("corridor")
+    rest = tuple(thing for thing in scene.objects if thing.label != "vending machine")
+    world = CameraWorld(replace(scene, objects=rest), people=1, seed=0)
     yield world
     world.close()
 
