@@ -46,14 +46,9 @@ class NavGrid:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        *,
-        clearance_m: float,
-        resolution_m: float = 0.1,
-        height_m: float = 0.8,
+        self, scene: Scene, *, clearance_m: float, resolution_m: float = 0.1, height_m: float = 0.8,
         max_step_m: float = MAX_STEP_M,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not (0 <= clearance_m < CLEARANCE_CAP_M and 0.02 <= resolution_m <= 1.0):
             raise ValueError(
                 f"navigation grid: expected a clearance of 0..{CLEARANCE_CAP_M} m and cells of 0.02..1 m,"

@@ -89,13 +89,7 @@ class Carter:
     radius_m = RADIUS_M
 
     def __init__(
-        self,
-        client: int,
-        folder: Path,
-        start: tuple[float, float, float],
-        dt_s: float,
-        *,
-        calibration: WheelCalibration | None = None,
+        self, client: int, folder: Path, start: Vec3, dt_s: float, *, calibration: WheelCalibration | None = None
     ) -> None:
         """Load the robot. `start`: x m, y m, heading rad; `calibration`: wheel dimensions assumed by odometry."""
         self._client = client

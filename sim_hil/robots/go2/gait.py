@@ -233,13 +233,9 @@ def _stand(config: GaitConfig, state: GaitState, body: BodyMotion) -> tuple[Gait
 
 
 def _push(
-    config: GaitConfig,
-    feet: tuple[Vec3, ...],
-    stance: tuple[bool, ...],
-    body: BodyMotion,
-    drive_x_n: float,
-    drive_y_n: float,
-) -> tuple[Vec3, ...]:
+    config: GaitConfig, feet: tuple[Vec3, ...], stance: tuple[bool, ...], body: BodyMotion,
+    drive_x_n: float, drive_y_n: float,
+) -> tuple[Vec3, ...]:  # fmt: skip
     """Share weight, attitude correction and the wanted horizontal force among the stance feet.
 
     Done in forces rather than in foot heights: a rate term in a position target would be differentiated once more by
@@ -272,18 +268,9 @@ def _push(
 
 
 def _feet(
-    config: GaitConfig,
-    feet: tuple[Vec3, ...],
-    lifted: tuple[Vec3, ...],
-    phase: float,
-    period_s: float,
-    ratio: float,
-    height_m: float,
-    carry: Vec3,
-    step_x_m: float,
-    step_y_m: float,
-    dt_s: float,
-) -> tuple[tuple[Vec3, ...], tuple[Vec3, ...], tuple[bool, ...]]:
+    config: GaitConfig, feet: tuple[Vec3, ...], lifted: tuple[Vec3, ...], phase: float, period_s: float, ratio: float,
+    height_m: float, carry: Vec3, step_x_m: float, step_y_m: float, dt_s: float,
+) -> tuple[tuple[Vec3, ...], tuple[Vec3, ...], tuple[bool, ...]]:  # fmt: skip
     ground = FOOT_RADIUS_M - config.body_height_m
     height16 = 16.0 * height_m
     half_stance_s, swing_s = 0.5 * ratio * period_s, (1.0 - ratio) * period_s

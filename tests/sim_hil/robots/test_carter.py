@@ -197,19 +197,6 @@ def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None
     assert 100.0 > left[0] > left[1]
 
 
-def test_sensors_of_a_seed_always_read_the_same(make: Make) -> None:
-    def readings(seed: int) -> list[object]:
-        world = make().go()
-        sensors = CarterSensors(world.robot, odometry_noise="severe", seed=seed)
-        seen: list[object] = []
-        for step in range(20):
-            world.run(0.1, 0.8, 0.3)
-            seen.append(sensors.read(step * 0.1 + 0.1))
-        return seen
-
-    assert readings(1) == readings(1) != readings(2)
-
-
 def test_severe_odometry_noise_moves_the_report_away_and_none_does_not(make: Make) -> None:
     world = make().go()
     exact, severe = CarterSensors(world.robot), CarterSensors(world.robot, odometry_noise="severe", seed=3)

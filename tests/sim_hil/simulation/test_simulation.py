@@ -70,15 +70,6 @@ def test_a_robot_that_starts_on_a_platform_stands_on_it() -> None:
         assert 0.5 < simulation.pose()[0][2] < 0.7
 
 
-def test_a_ramp_is_walked_up() -> None:
-    ramp = Terrain("ramp", "ramp", (-5.5, 0.0, 0.0), 0.0, (3.0, 2.0), 0.3, "concrete")
-    with simulated(replace(hall(), terrain=(ramp,)), rate_hz=240) as simulation:
-        simulation.settle()
-        low = simulation.pose()[0][2]
-        run(simulation, 5.0, (0.6, 0.0, 0.0))
-        assert simulation.pose()[0][2] > low + 0.1 and not simulation.fell
-
-
 def test_nobody_walks_while_the_robot_gets_ready() -> None:
     with simulated(load_scene("corridor"), people=3) as simulation:
         before = simulation.people()
