@@ -73,7 +73,7 @@ def test_a_wall_hides_the_robot(hall: Scene) -> None:
     assert _noticed_after_s(_one(0.0), walled, _robot(11.3)) < 1.0
 
 
-def test_out_of_sight_is_out_of_mind_after_a_while(ways: CrowdMap) -> None:
+def test_an_unseen_robot_is_forgotten_after_a_while(ways: CrowdMap) -> None:
     crowd = _one(0.0)
     _noticed_after_s(crowd, ways, _robot(14.0))
     for _ in range(20):
@@ -84,7 +84,7 @@ def test_out_of_sight_is_out_of_mind_after_a_while(ways: CrowdMap) -> None:
     assert not crowd.aware[0]
 
 
-def test_some_people_are_inattentive_and_the_seed_says_who() -> None:
+def test_some_people_are_inattentive_and_react_later() -> None:
     crowd = Crowd(400, np.random.default_rng((3, 7)))
     assert 0.06 < crowd.inattentive.mean() < 0.18
     assert crowd.reaction_s[crowd.inattentive].mean() > crowd.reaction_s[~crowd.inattentive].mean() + 0.2
@@ -120,7 +120,7 @@ def standing(hall: Scene) -> People:
     raise AssertionError("no seed with a standing person")
 
 
-def test_a_person_who_stands_does_not_mind_a_robot_that_passes(standing: People) -> None:
+def test_a_standing_person_stays_when_a_robot_passes(standing: People) -> None:
     for step in range(8 * UPDATE_HZ):
         standing.step(11.0 + step / UPDATE_HZ, 1.2, 0.0)
     assert hypot(standing.poses()[0, 0] - 15.0, standing.poses()[0, 1]) < 0.05
@@ -137,7 +137,7 @@ def test_a_person_whom_the_robot_drives_at_steps_aside_without_jumping(standing:
     assert fastest < 1.0
 
 
-def test_a_robot_that_waits_before_somebody_is_let_past(standing: People) -> None:
+def test_a_person_steps_aside_for_a_waiting_robot(standing: People) -> None:
     for _ in range(12 * UPDATE_HZ):
         standing.step(13.6, 0.0, 0.0)
         if abs(standing.poses()[0, 1]) > 0.7:

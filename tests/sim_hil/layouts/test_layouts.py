@@ -77,7 +77,7 @@ def test_every_landmark_and_named_area_has_a_name_that_instructions_know(kind: s
             assert area.name in AREAS
 
 
-def test_things_that_stand_in_each_other_are_found(made: dict[str, Scene]) -> None:
+def test_overlapping_objects_are_found(made: dict[str, Scene]) -> None:
     scene = made["hospital"]
     bed = next(thing for thing in scene.objects if thing.kind == "hospital_bed")
     twin = replace(bed, label="twin", position_m=(bed.position_m[0] + 0.3, *bed.position_m[1:]))

@@ -62,17 +62,17 @@ def test_a_turned_box_is_as_near_as_its_corner() -> None:
     assert grid.clearance_m(2.0, 0.0) == pytest.approx(2.0 - sqrt(2.0), abs=0.02)
 
 
-def test_what_hangs_above_the_robot_stops_nobody() -> None:
+def test_an_object_above_the_robot_is_no_obstacle() -> None:
     assert NavGrid(hall(block(0.0, 0.0, 1.0, 1.0, z=1.0)), clearance_m=CLEARANCE_M).is_free(0.0, 0.0)
     assert not NavGrid(hall(block(0.0, 0.0, 1.0, 1.0, z=0.5)), clearance_m=CLEARANCE_M).is_free(0.0, 0.0)
 
 
-def test_a_free_way_is_straight() -> None:
+def test_a_free_path_is_straight() -> None:
     grid = NavGrid(hall(), clearance_m=CLEARANCE_M)
     assert grid.path((-8.0, 3.0), (7.3, -2.1)) == [(-8.0, 3.0), (7.3, -2.1)]
 
 
-def test_the_way_round_a_wall_is_the_shortest_that_keeps_the_clearance() -> None:
+def test_the_path_round_a_wall_is_the_shortest_that_keeps_the_clearance() -> None:
     # A wall from the lower edge up to y = 3: the shortest way touches the circle of the clearance around its corners.
     grid = NavGrid(hall(walls=(wall(0.0, -5.0, 3.0),)), clearance_m=CLEARANCE_M)
     found = grid.distance_m((-6.0, 0.0), (6.0, 0.0))
@@ -98,7 +98,7 @@ def test_a_path_keeps_the_clearance_and_is_no_longer_than_the_path_over_cells(se
     assert hypot(18.0, 8.0) - 1e-9 <= length_m(path) <= grid.field_at(grid.distance_field(goal), *start) + 0.15
 
 
-def test_a_gap_that_the_robot_does_not_fit_through_is_no_way() -> None:
+def test_a_gap_too_narrow_for_the_robot_has_no_path() -> None:
     walls = (wall(0.0, -5.0, -0.37), wall(0.0, 0.37, 5.0))
     assert NavGrid(hall(walls=walls), clearance_m=0.3).path((-3.0, 0.0), (3.0, 0.0)) is not None
     grid = NavGrid(hall(walls=walls), clearance_m=CLEARANCE_M)

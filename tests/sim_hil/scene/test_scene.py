@@ -138,7 +138,7 @@ def test_ground_height(terrain: tuple[Terrain, ...], heights_m: dict[tuple[float
 
 
 @pytest.mark.parametrize("kind", sorted(TERRAIN_KINDS))
-def test_the_physics_piece_has_the_top_that_ground_height_tells(kind: str) -> None:
+def test_the_physics_solid_has_the_top_of_the_ground_height(kind: str) -> None:
     terrain = Terrain("it", kind, (1.0, -2.0, 0.1), 0.7, (2.0, 1.0), 0.3, "paving")
     top = max(z for _, _, z in terrain.vertices_m())
     assert top == pytest.approx(0.4)
@@ -177,7 +177,7 @@ def test_parts_turn_with_their_object() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_parts_stay_within_what_is_seen(kind: str) -> None:
+def test_parts_stay_within_the_visible_object(kind: str) -> None:
     size = KINDS[kind].size_m
     thing = SceneObject("it", kind, (0.0, 0.0, 0.0), 0.0, size, (0.5, 0.5, 0.5), "")
     round_off = 1 / cos(pi / 8)  # an octagon's corners reach a little beyond the circle within it

@@ -121,13 +121,13 @@ def test_postures_change_without_jumps() -> None:
             assert abs(after - before) < 0.2
 
 
-def test_who_sits_has_hips_at_the_height_of_a_seat() -> None:
+def test_a_seated_person_has_hips_at_the_height_of_a_seat() -> None:
     posture = limbs(0.0, 0.0, 1.0, 0)
     assert 0.45 < posture.hips_m < 0.62
     assert abs(posture.shins[0]) < 0.1 and cos(posture.thighs[0]) < 0.3
 
 
-def test_who_is_on_the_phone_looks_down_at_a_raised_hand() -> None:
+def test_a_person_on_the_phone_looks_down_at_a_raised_hand() -> None:
     plain, phone = limbs(0.0, 0.0, 0.0, 0), limbs(0.0, 0.0, 0.0, 2)
     assert phone.head > plain.head + 0.3
     assert phone.forearms[0] < plain.forearms[0] - 1.0

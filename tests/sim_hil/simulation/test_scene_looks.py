@@ -65,7 +65,7 @@ def test_every_kind_has_a_form_and_every_texture_a_picture() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_a_thing_is_as_large_as_the_scene_says(kind: str) -> None:
+def test_an_object_is_as_large_as_the_scene_says(kind: str) -> None:
     thing, vertices = _vertices(kind)
     slack = OVERHANG_M.get(kind, 0.07)
     for axis, size in enumerate(thing.size_m):
@@ -75,7 +75,7 @@ def test_a_thing_is_as_large_as_the_scene_says(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(name for name, kind in KINDS.items() if kind.solid))
-def test_what_is_seen_at_the_height_of_a_robot_stops_it(kind: str) -> None:
+def test_visible_parts_at_the_height_of_a_robot_are_obstacles(kind: str) -> None:
     thing, vertices = _vertices(kind)
     for x, y, z in vertices:
         if 0.03 < z < 0.5:

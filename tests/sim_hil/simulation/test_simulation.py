@@ -103,7 +103,7 @@ def test_only_people_near_the_robot_have_a_body() -> None:
     assert seen == {True, False}
 
 
-def test_what_is_touched_is_forgotten_as_touching_but_not_as_collided() -> None:
+def test_a_contact_ends_but_the_collision_stays_recorded() -> None:
     with simulated(hall(block(-7.0, 0.0, 0.5, 2.0)), rate_hz=240) as simulation:
         simulation.settle()
         for _ in range(40):
