@@ -69,7 +69,7 @@ def record(walk: Walk, duration_s: float = CLIP_S) -> Iterator[Frame]:
         for tick in range(ticks + 1):
             if tick >= first and (tick - first) % every == 0:
                 yield _frame(simulation, world, (tick - first) * 100_000_000)
-            simulation.move(*_command(simulation, walk, tick * CONTROL_S))
+            simulation.command(*_command(simulation, walk, tick * CONTROL_S))
             _steps(simulation, CONTROL_S)
         if simulation.fell or simulation.collided_with():
             raise WalkError(f"walk {walk.name}: fell or touched {sorted(simulation.collided_with())}")

@@ -24,7 +24,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
-from sim_hil.robots.carter.wheel_odometry import WheelCalibration
+from sim_hil.robots.carter.drive import WheelCalibration
 from tools.bench.sim.wheeled_course import World, forward_mps
 
 Row = dict[str, object]

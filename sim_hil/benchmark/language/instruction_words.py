@@ -12,7 +12,5 @@ AREAS = (
 )  # fmt: skip
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 # Names of landmarks: those of all kinds, and additional names used in scenes.
-NOUNS = tuple(
-    sorted({kind.words for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True)
-)
+NOUNS = tuple(sorted({kind.noun for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True))
 NAME = rf"\b(?:(?:{'|'.join(sorted(COLOUR_WORDS))}) )?(?:{'|'.join(NOUNS)})\b"

@@ -18,9 +18,9 @@ from edge.core.geometry import wrap_angle
 from sim_hil.protocols.mavlink.setpoints import heading_degrees
 from sim_hil.protocols.mavlink.vehicle import Vehicle
 from sim_hil.protocols.mavlink.wire import Message
+from sim_hil.robots.carter.drive import COUNTS_PER_TURN
 from sim_hil.robots.carter.sensors import Sensors
 from sim_hil.robots.carter.urdf import WHEEL_RADIUS_M
-from sim_hil.robots.carter.wheel_odometry import COUNTS_PER_TURN
 
 MAX_HZ: Final = 50.0  # rate of sensor readings
 # Same origin as in PX4's simulation, a place that users recognise as simulated.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pybullet
 
 from sim_hil.robots.carter.body import Carter, CarterTruth
-from sim_hil.robots.carter.wheel_odometry import WheelCalibration
+from sim_hil.robots.carter.drive import WheelCalibration
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 
 Vec3 = tuple[float, float, float]

@@ -16,7 +16,7 @@ from sim_hil.benchmark.results.summary import summarise
 from sim_hil.benchmark.runs import run_episodes
 from sim_hil.benchmark.suite.episode import load_suite, suite_to_toml
 from sim_hil.benchmark.workers.jobs import RunWatcher
-from sim_hil.scene.writer import scene_to_toml
+from sim_hil.scene.scene import scene_to_toml
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import SHARES
 from tools.train.config.rl import EvaluateConfig
