@@ -18,9 +18,9 @@ from pathlib import Path
 
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import shipped_weights
+from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
+from export.model.weights import CheckpointError
 from reporting.progress_line import Progress, TraceTail
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir

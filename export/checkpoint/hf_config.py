@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.sources import read_json
 from export.model.config import LanguageConfig, ModelConfigError, TicVlaConfig, VisionConfig
+from export.model.weights import CheckpointError
 
 CONFIG = "config.json"
 PREPROCESSOR = "preprocessor_config.json"
@@ -71,7 +71,7 @@ _HF_VISION_DEFAULTS = {
 
 @dataclass(frozen=True)
 class HfConfig:
-    """What a directory says of its network."""
+    """The network of a directory."""
 
     vision: VisionConfig
     language: LanguageConfig
@@ -79,17 +79,11 @@ class HfConfig:
     """The output head is the embedding: a file without a head is complete."""
 
 
-def config_from_hf(directory: Path) -> tuple[VisionConfig, LanguageConfig]:
-    """Encoder and language model of an InternVL directory; raises CheckpointError naming what we do not implement.
-
-    Token ids and `max_context` are not in config.json and keep the defaults of `LanguageConfig`.
-    """
-    config = read_hf_config(directory, LanguageConfig())
-    return config.vision, config.language
-
-
 def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
-    """config.json in either layout; `ours` gives what it does not say (token ids, `max_context`)."""
+    """config.json in either layout; `ours` gives what it does not have (token ids, `max_context`).
+
+    Raises CheckpointError naming what this network does not implement.
+    """
     top = read_json(directory, CONFIG)
     where = f"{directory.resolve().name}/{CONFIG}"
     try:
@@ -105,12 +99,11 @@ def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
 
 def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
     """Refuse a directory whose config.json contradicts `config`; raises CheckpointError naming the numbers."""
-    said = read_hf_config(directory, config.language)
+    theirs = read_hf_config(directory, config.language)
     pairs = []
-    for section, theirs in (("vision", said.vision), ("language", said.language)):
-        ours = getattr(config, section)
-        for field in dataclasses.fields(theirs):
-            a, b = getattr(theirs, field.name), getattr(ours, field.name)
+    for section in ("vision", "language"):
+        for field in dataclasses.fields(getattr(config, section)):
+            a, b = (getattr(getattr(side, section), field.name) for side in (theirs, config))
             # The layer scale's initial value has no part in a network whose weights are loaded.
             if a != b and field.name != "layer_scale_init":
                 pairs.append(f"{section}.{field.name} is {a}, model {config.name!r} has {b}")
@@ -120,7 +113,7 @@ def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
             f"{directory.resolve().name}/{CONFIG}: {'; '.join(pairs[:3])}{more}: "
             "choose the --model this checkpoint was made for"
         )
-    return said
+    return theirs
 
 
 def _chat(where: str, top: Mapping[str, object], directory: Path, ours: LanguageConfig) -> HfConfig:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Final
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from export.checkpoint.coverage import CheckpointError, Coverage, SourceCoverage
 from export.checkpoint.hf_config import check_config
 from export.checkpoint.layouts import find_layouts
 from export.checkpoint.sources import Source, open_source
@@ -20,11 +21,64 @@ from export.core.cache import file_sha256
 from export.model.config import TicVlaConfig
 from export.model.config_file import config_from_dict
 from export.model.network import TicVla, empty_network, initialise
-from export.model.weights import FORMAT, WeightsInfo
+from export.model.weights import FORMAT, CheckpointError, WeightsInfo
 
+SHIPPED: Final = Path(__file__).parents[1] / "weights"
+"""Trained weights that come with the package."""
+SHOWN = 3
 EMBED, LM_HEAD = "language.embed.weight", "language.lm_head.weight"
 VALUE_SEED = 0
 """Of a value network that no file has: it is training's business and in no graph."""
+
+
+@dataclass(frozen=True)
+class SourceCoverage:
+    """One `--checkpoint`: how its tensors were read."""
+
+    label: str
+    layouts: tuple[str, ...]
+    """Names of the layouts found, each with the prefix its tensors carry ("internvl, prefix vlm.")."""
+    tensors: int
+    loaded: int
+    ignored: tuple[str, ...] = ()
+    """Tensors that hold nothing to load (buffers computed from the configuration)."""
+    outside: tuple[str, ...] = ()
+    """Entries beside the weights (optimizer state and the like) that were not read."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Every tensor of the files and of the network accounted for."""
+
+    sources: tuple[SourceCoverage, ...] = ()
+    loaded: dict[str, str] = field(default_factory=dict)
+    """Tensor of the network → "file: tensor[, tensor …]" it was read from."""
+    seeded: dict[str, int] = field(default_factory=dict)
+    """Part of the network that no file has → the seed of its random weights."""
+    missing: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+    misshaped: tuple[str, ...] = ()
+    repeated: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing, unknown, of another shape or given twice."""
+        return not (self.missing or self.unknown or self.misshaped or self.repeated)
+
+    def difference(self) -> str:
+        """The difference in one line: a count and the first few names of each kind."""
+        kinds = {
+            "missing": self.missing,
+            "unknown": self.unknown,
+            "of another shape": self.misshaped,
+            "given twice": self.repeated,
+        }
+        return "; ".join(
+            f"{len(names)} tensor{'s'[: len(names) != 1]} {kind} ({', '.join(names[:SHOWN])}"
+            f"{', …' if len(names) > SHOWN else ''})"
+            for kind, names in kinds.items()
+            if names
+        )
 
 
 @dataclass(frozen=True)
@@ -98,12 +152,12 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
         raise CheckpointError(f"{source.label}: format {written!r}, expected {FORMAT!r}")
     try:
         # A number that an older file does not know of: the usual value is what there was before it.
-        said, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
+        theirs, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
         differ = [
-            f"{section}.{key} is {said[section][key]!r}, expected {value!r}"
+            f"{section}.{key} is {theirs[section][key]!r}, expected {value!r}"
             for section in ("vision", "language", "action", "value")
             for key, value in ours[section].items()
-            if said[section][key] != value
+            if theirs[section][key] != value
         ]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{source.label}: its configuration is not readable; was it changed?") from error
@@ -196,8 +250,8 @@ def _refuse(coverage: Coverage, config: TicVlaConfig, sources: Sequence[Source])
         if absent == ["action"]:
             hint += ", or ask for untrained weights with --random-weights SEED"
         parts = " and no ".join(names[part] for part in absent)
-        raise CheckpointError(f"{labels}: no {parts} ({len(coverage.missing)} tensors); {hint}", coverage)
-    raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}", coverage)
+        raise CheckpointError(f"{labels}: no {parts} ({len(coverage.missing)} tensors); {hint}")
+    raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}")
 
 
 def _read(model: TicVla, recipes: dict[str, _Recipe]) -> None:
@@ -217,9 +271,27 @@ def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
     """Origin by file name and hash; trained unless a file of ours or a seed says otherwise."""
     parts = []
     for source in sources:
-        said = source.metadata.get("origin", "")
-        suffix = f", {said}" if said else ""
+        origin = source.metadata.get("origin", "")
+        suffix = f", {origin}" if origin else ""
         parts += [f"{label} (sha256 {file_sha256(path)}{suffix})" for label, path in source.files.items()]
     parts += [f"{part}: random seed {seed}" for part, seed in coverage.seeded.items()]
     untrained = "action" in coverage.seeded or any(s.metadata.get("trained") == "false" for s in sources)
     return WeightsInfo(trained=not untrained, origin="; ".join(parts))
+
+
+def shipped_weights(config: TicVlaConfig, folder: Path = SHIPPED) -> Path | None:
+    """The file for this very network; None if there is none. Raises CheckpointError for one that cannot be read.
+
+    A network of that name with changed numbers (`--set model.…`) has none: it would have to be trained.
+    """
+    path = folder / f"{config.name}.safetensors"
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            written = config_from_dict(json.loads((file.metadata() or {})["config"]))
+        return path if written == config else None
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}: the shipped weights cannot be read ({error}); install the package again"
+        ) from error

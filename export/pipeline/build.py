@@ -173,7 +173,7 @@ class Pipeline:
                 "sha256": weights_sha256(loaded.model),
                 "trained": loaded.info.trained,
                 "origin": loaded.info.origin,
-                "coverage": loaded.coverage.to_dict(),
+                "coverage": asdict(loaded.coverage),
             }
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
             (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded.tokenizer))

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from export.checkpoint.coverage import CheckpointError, Coverage
-from export.checkpoint.load import LoadedCheckpoint, load_checkpoint
-from export.checkpoint.shipped import shipped_weights
+from export.checkpoint.load import Coverage, LoadedCheckpoint, load_checkpoint, shipped_weights
 from export.checkpoint.sources import open_source
 from export.core.cache import file_sha256
 from export.evaluation.calibration import CalibrationSet
 from export.evaluation.task_samples import check_clips
 from export.model.config import TicVlaConfig
 from export.model.network import PARTS, build
-from export.model.weights import WeightsInfo
+from export.model.weights import CheckpointError, WeightsInfo
 from export.target.file import Target
 
 DEFAULT_SEED = 0

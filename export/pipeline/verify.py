@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest
-from export.checkpoint.shipped import shipped_weights
+from export.checkpoint.load import shipped_weights
 from export.core.settings import model_settings, target_settings
 from export.evaluation.calibration import load_calibration
 from export.model.config import ModelConfigError, TicVlaConfig

@@ -31,7 +31,8 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_re
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
 from edge.state.ring import EncodedFrame
-from export.checkpoint import load_checkpoint, tokenizer_for
+from export.checkpoint.load import load_checkpoint
+from export.checkpoint.tokenizer import tokenizer_for
 from export.graphs.build import write_graph
 from export.graphs.language import cache_names
 from export.model.config import TicVlaConfig

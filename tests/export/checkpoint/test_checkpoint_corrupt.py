@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from export.checkpoint import load_checkpoint
+from export.checkpoint.load import load_checkpoint
 from tests.support.export.internvl import CONFIG, hf_model, original_tensors, refusal, write_directory
 
 

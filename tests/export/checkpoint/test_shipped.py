@@ -7,12 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import FOLDER, shipped_weights
+from export.checkpoint.load import SHIPPED, shipped_weights
 from export.model.config import PRESETS
 from export.model.config_file import with_overrides
 from export.model.network import PARTS, build
-from export.model.weights import WeightsInfo, save_weights
+from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from export.pipeline.job import WeightSource
 
 SMALL = with_overrides(
@@ -61,7 +60,7 @@ def test_without_any_an_export_is_of_a_seed(tmp_path: Path, monkeypatch: pytest.
     assert WeightSource(SMALL, [], None).fingerprint()["seed"] == 0
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.safetensors")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
 def test_the_weights_that_ship_are_those_of_todays_network_and_small_and_have_a_card(path: Path) -> None:
     assert shipped_weights(PRESETS[path.stem]) == path
     assert path.stat().st_size <= 40_000_000 and path.with_suffix(".md").is_file()

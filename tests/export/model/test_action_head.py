@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.checkpoint import CheckpointError, load_checkpoint
+from export.checkpoint.load import load_checkpoint
 from export.model.action import ActionExpert
 from export.model.config import PRESETS, ModelConfigError
 from export.model.config_file import config_from_dict, with_overrides
@@ -31,7 +31,7 @@ from export.model.heads import (
     woven,
 )
 from export.model.network import build
-from export.model.weights import WeightsInfo, save_weights, weights_sha256
+from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
 from tests.support.export.action_heads import HEADS, TINY, drives, expert, instants, lively, normal, states, with_head
 
 pytestmark = pytest.mark.usefixtures("one_thread")  # many threads on tiny tensors cost more than they give

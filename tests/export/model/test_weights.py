@@ -10,10 +10,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from export.checkpoint import CheckpointError, LoadedCheckpoint, load_checkpoint
+from export.checkpoint.load import LoadedCheckpoint, load_checkpoint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
-from export.model.weights import WeightsInfo, save_weights, weights_sha256
+from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
 
 NANO = PRESETS["nano"]
 

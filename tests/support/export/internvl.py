@@ -12,8 +12,9 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from export.checkpoint import CheckpointError, load_checkpoint
+from export.checkpoint.load import load_checkpoint
 from export.model.config import ActionConfig, LanguageConfig, TicVlaConfig, VisionConfig
+from export.model.weights import CheckpointError
 
 CONFIG = TicVlaConfig(
     name="small",

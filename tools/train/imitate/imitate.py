@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import torch
 
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
 from tools.train.config.collect import PLANNED_DRIVE_S
 from tools.train.config.imitate import POINT_GOAL, TIC_VLA, DelayConfig, ImitateConfig, SampleConfig

@@ -19,7 +19,7 @@ import torch
 from tokenizers import Tokenizer
 
 from edge.state.reasoning_text import format_text
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.tours import build_tours, tour_anchors
 from tools.train.config.collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ, CollectConfig
