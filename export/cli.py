@@ -28,11 +28,9 @@ from edge.core.cli import (
     write_result,
 )
 from export.core.cache import StageCache, default_cache_dir, open_cache
-from export.core.settings import model_settings, target_settings
 from export.evaluation.calibration import CalibrationError, load_calibration
 from export.evaluation.gates import GateError
-from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, with_overrides
+from export.model.config import PRESETS, ModelConfigError, TicVlaConfig, config_for, model_settings, with_overrides
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
@@ -124,9 +122,7 @@ def _say(line: str) -> None:
 
 def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
     config = with_overrides(config_for(args.model or DEFAULT_MODEL), model_settings(args.settings))
-    return with_settings(
-        load_target(args.target or DEFAULT_TARGET, config.name), target_settings(args.settings)
-    ), config
+    return with_settings(load_target(args.target or DEFAULT_TARGET, config.name), args.settings), config
 
 
 def _asked(args: argparse.Namespace) -> Asked:

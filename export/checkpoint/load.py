@@ -18,8 +18,7 @@ from export.checkpoint.layouts import find_layouts
 from export.checkpoint.sources import Source, open_source
 from export.checkpoint.tokenizer import directory_tokenizer
 from export.core.cache import file_sha256
-from export.model.config import TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import TicVlaConfig, config_from_dict
 from export.model.network import TicVla, empty_network, initialise
 from export.model.weights import FORMAT, CheckpointError, WeightsInfo
 

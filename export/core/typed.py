@@ -72,6 +72,8 @@ def convert(kind: object, value: object, where: str) -> Any:
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise FieldError(f"{where}: expected a list, found {value!r}")
+        if arguments[-1] is not Ellipsis and len(value) != len(arguments):
+            raise FieldError(f"{where}: expected a list of {len(arguments)} values, found {value!r}")
         return tuple(convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     if origin is not None and issubclass(origin, Mapping):
         if not isinstance(value, Mapping):
@@ -101,7 +103,9 @@ def from_text(kind: object, text: str, where: str) -> Any:
                     raise
         raise FieldError(f"{where}: expected {kind_name(kind)}, found {text!r}")
     if origin is tuple:
-        return [from_text(arguments[0], part.strip(), where) for part in text.split(",") if part.strip()]
+        # "24,48" and "[24, 48]" are the same list.
+        parts = text.strip().removeprefix("[").removesuffix("]").split(",")
+        return [from_text(arguments[0], part.strip(), where) for part in parts if part.strip()]
     if kind is bool:
         if text not in ("true", "false"):
             raise FieldError(f"{where}: expected true or false, found {text!r}")

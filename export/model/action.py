@@ -19,10 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.model.attention import CrossAttentionLayer, KeyValue, projection
+from export.model.attention import CrossAttentionLayer, KeyValue, TypedModuleList, projection
 from export.model.config import TicVlaConfig
 from export.model.heads import ActionScale, Diffusion, Flow, differentiated, drawn, integrated, wrapped
-from export.model.module_list import TypedModuleList
 
 
 class TrunkLayers(Protocol):

@@ -10,10 +10,15 @@ from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest
 from export.checkpoint.load import shipped_weights
-from export.core.settings import model_settings, target_settings
 from export.evaluation.calibration import load_calibration
-from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, config_from_dict, with_overrides
+from export.model.config import (
+    ModelConfigError,
+    TicVlaConfig,
+    config_for,
+    config_from_dict,
+    model_settings,
+    with_overrides,
+)
 from export.model.weights import WeightsError
 from export.pipeline.job import Asked, Job, WeightSource
 from export.target.file import Target, TargetError, list_targets, load_target, parse_target, with_settings
@@ -83,7 +88,7 @@ def _target_and_config(manifest: Mapping[str, Any], asked: Asked) -> tuple[Targe
     if asked.target is not None:
         if asked.target not in list_targets():
             raise TargetError(f"target {asked.target!r} is not known")
-        target = with_settings(load_target(asked.target, config.name), target_settings(asked.settings))
+        target = with_settings(load_target(asked.target, config.name), asked.settings)
     return target, config
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ else:
 
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
 from export.core.typed import FieldError, build, convert, field_types, from_text, near, plain
+from export.model.config import MODEL_PREFIX
 from export.quantize.precision import Precision, block_size
 from export.target.sections import (
     Device,
@@ -31,18 +32,6 @@ from export.target.sections import (
     TargetError,
     TaskGate,
 )
-
-__all__ = [
-    "GraphGate",
-    "Target",
-    "TargetError",
-    "TaskGate",
-    "for_model",
-    "list_targets",
-    "load_target",
-    "parse_target",
-    "with_settings",
-]
 
 SCHEMA = 2
 TARGETS_DIR = Path(__file__).parents[1] / "targets"
@@ -248,11 +237,13 @@ def _merged(base: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
 
 
 def with_settings(target: Target, settings: Iterable[str]) -> Target:
-    """The target with `key=value` settings (`--set`), typed by the field; raises TargetError naming near keys."""
+    """The target with `key=value` settings (`--set`), typed by the field; raises TargetError naming near keys.
+
+    Settings of the network (`model.…`) are left out. A graph's precision also ends the search for a better one.
+    """
     content = target.to_dict()
-    for setting in settings:
-        path, sign, text = setting.partition("=")
-        path, text = path.strip(), text.strip()
+    for setting in _expanded(settings):
+        path, sign, text = (part.strip() for part in setting.partition("="))
         if not sign or not path:
             raise TargetError(f"--set {setting}: expected KEY=VALUE, e.g. --set power.mode=15W")
         if path.split(".")[0] in FIXED_KEYS:
@@ -266,6 +257,16 @@ def with_settings(target: Target, settings: Iterable[str]) -> Target:
         except FieldError as error:
             raise TargetError(f"--set {error}") from error
     return parse_target(content, f"{target.name} with --set")
+
+
+def _expanded(settings: Iterable[str]) -> Iterator[str]:
+    for setting in settings:
+        path = setting.partition("=")[0].strip()
+        if path.startswith(MODEL_PREFIX):
+            continue
+        yield setting
+        if path.startswith("graphs.") and path.endswith(".precision"):
+            yield f"{path.removesuffix('precision')}candidates="
 
 
 def _value(kind: object, text: str, path: str) -> Any:
@@ -290,14 +291,14 @@ def _place(content: Mapping[str, object], parts: list[str], path: str) -> tuple[
     keys: list[str] = []
     table: Any = content
     while parts:
-        if _optional(kind):
+        if type(None) in typing.get_args(kind):
             kind = next((option for option in typing.get_args(kind) if dataclasses.is_dataclass(option)), kind)
         if dataclasses.is_dataclass(kind):
             known = {name: hint for name, hint in field_types(typing.cast(type, kind)).items() if name != "task_gate"}
             if parts[0] not in known:
                 raise FieldError(f"{path}: unknown key {parts[0]!r}; {near(parts[0], known)}")
             kind, key, parts = known[parts[0]], parts[0], parts[1:]
-        elif _is_mapping(kind):
+        elif typing.get_origin(kind) is Mapping:
             below = typing.get_args(kind)[1]
             if not dataclasses.is_dataclass(below):
                 # A layer pattern or an option name may hold dots: all that is left is the key.
@@ -318,12 +319,3 @@ def _entry(table: Mapping[str, object], parts: list[str], path: str) -> tuple[st
         if ".".join(parts[:end]) in table:
             return ".".join(parts[:end]), parts[end:]
     raise FieldError(f"{path}: unknown key {parts[0]!r}; {near(parts[0], table)}")
-
-
-def _optional(kind: object) -> bool:
-    return type(None) in typing.get_args(kind)
-
-
-def _is_mapping(kind: object) -> bool:
-    origin = typing.get_origin(kind)
-    return isinstance(origin, type) and issubclass(origin, Mapping)

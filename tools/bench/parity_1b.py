@@ -35,8 +35,7 @@ from export.checkpoint.load import load_checkpoint
 from export.checkpoint.tokenizer import tokenizer_for
 from export.graphs.build import write_graph
 from export.graphs.language import cache_names
-from export.model.config import TicVlaConfig
-from export.model.config_file import config_for
+from export.model.config import TicVlaConfig, config_for
 from export.quantize.precision import Precision
 
 Arrays = dict[str, npt.NDArray[Any]]

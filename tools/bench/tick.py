@@ -26,7 +26,7 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
 from edge.core.geometry import SE2
 from edge.inference.policy import Policy
 from edge.state.semantic import SemanticState
-from export.model.config_file import config_for
+from export.model.config import config_for
 from export.model.network import build
 
 HERE = SE2(0.0, 0.0, 0.0)

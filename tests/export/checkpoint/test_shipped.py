@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from export.checkpoint.load import SHIPPED, shipped_weights
-from export.model.config import PRESETS
-from export.model.config_file import with_overrides
+from export.model.config import PRESETS, with_overrides
 from export.model.network import PARTS, build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from export.pipeline.job import WeightSource

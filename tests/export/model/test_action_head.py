@@ -17,8 +17,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
 from export.checkpoint.load import load_checkpoint
 from export.model.action import ActionExpert
-from export.model.config import PRESETS, ModelConfigError
-from export.model.config_file import config_from_dict, with_overrides
+from export.model.config import PRESETS, ModelConfigError, config_from_dict, with_overrides
 from export.model.heads import (
     MIN_STD,
     ActionScale,

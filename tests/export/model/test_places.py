@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from export.model.config import PRESETS
-from export.model.network import build
-from export.model.places import RMS, grid_codes, line_codes
+from export.model.network import PLACE_RMS, build, grid_codes, line_codes
 
 
 @pytest.mark.parametrize(("count", "width"), [(512, 256), (3, 64), (1, 8), (64, 33)])
 def test_a_lines_codes_are_of_one_size(count: int, width: int) -> None:
     codes = line_codes(count, width)
     assert codes.shape == (count, width) and codes.dtype == torch.float32
-    assert float(codes.square().mean().sqrt()) == pytest.approx(RMS, rel=0.2)
+    assert float(codes.square().mean().sqrt()) == pytest.approx(PLACE_RMS, rel=0.2)
 
 
 def test_neighbours_are_alike_and_no_two_places_are_the_same() -> None:
@@ -38,7 +37,7 @@ def test_a_new_network_knows_its_places() -> None:
     action = model.action
     places = (action.visual_position, action.semantic_position, action.metadata_position)
     for position in (model.vision.position[0, 1:], *places):
-        assert float(position.detach().square().mean().sqrt()) == pytest.approx(RMS, rel=0.1)
+        assert float(position.detach().square().mean().sqrt()) == pytest.approx(PLACE_RMS, rel=0.1)
 
 
 def test_the_last_semantic_token_has_the_same_code_in_a_longer_context() -> None:

@@ -12,8 +12,7 @@ from typing import Final
 from safetensors import SafetensorError, safe_open
 
 from export.checkpoint.load import load_checkpoint
-from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
 from tools.train.drives.drive import file_sha256

@@ -14,8 +14,7 @@ import torch
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from edge.inference.latency_profile import LatencyProfile
 from export.checkpoint.load import shipped_weights
-from export.model.config import PRESETS
-from export.model.config_file import with_overrides
+from export.model.config import PRESETS, with_overrides
 from export.model.network import build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from tools.train import cli
