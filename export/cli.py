@@ -34,11 +34,10 @@ from export.model.config import PRESETS, ModelConfigError, TicVlaConfig, config_
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
-from export.pipeline.job import Asked, Job, WeightSource
-from export.pipeline.verify import job_of
+from export.pipeline.job import Asked, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
-from export.target.file import Target, TargetError, list_targets, load_target, with_settings
+from export.targets.file import Target, TargetError, list_targets, load_target, with_settings
 from reporting.build_progress import Progress, peak_rss_bytes
 
 COMMAND = "edge-export"
@@ -172,7 +171,7 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
             with progress:
                 report = build_artifacts(job, out, cache, progress)
                 if args.save_weights is not None:
-                    loaded = job.weights.get()
+                    loaded = job.weights.loaded
                     with named_file(args.save_weights) as path:
                         save_weights(loaded.model, path, loaded.info)
         finally:

@@ -1,7 +1,7 @@
 """Calibration data: named, hashed walks of a robot through people; never random.
 
-A name is a set that ships in `export/calibration_sets/`, `folder:PATH` (a user's images in the order of their names) or
-`video:PATH`. What a user's pictures do not say (poses, velocities) is assumed, and `Clip.assumed` says so.
+A name is a set that ships in `calibration_sets/` here, `folder:PATH` (a user's images in the order of their names) or
+`video:PATH`. What a user's pictures do not record (poses, velocities) is assumed, and `Clip.assumed` names it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ else:
 
 Picture = npt.NDArray[np.uint8]
 
-SETS = Path(__file__).parents[1] / "calibration_sets"
+SETS = Path(__file__).with_name("calibration_sets")
 CLIP_S = 20.0
 """Shortest clip: 9 s of the frames before an anchor, 10 s of growing delay after it, and 1 s to choose anchors in."""
 MAX_GAP_S = 1.5

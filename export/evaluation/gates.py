@@ -9,7 +9,7 @@ from typing import Any
 
 from export.evaluation.metrics import ParityResult
 from export.evaluation.task_error import TaskError, short
-from export.target.sections import GraphGate, TaskGate
+from export.targets.sections import GraphGate, TaskGate
 
 PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
 

@@ -32,7 +32,7 @@ from export.graphs.build import write_graph
 from export.model.weights import weights_sha256
 from export.pipeline.job import Job
 from export.quantize.precision import PRECISIONS, Precision
-from export.quantize.ranges import activation_ranges
+from export.quantize.rounding import activation_ranges
 from reporting.build_progress import Progress, Stage
 
 WEIGHTS_FILE = "weights.json"
@@ -50,7 +50,7 @@ WEIGHTS_CODE = ("export.pipeline.job", "export.checkpoint.load", "export.checkpo
 REFERENCE_CODE = ("export.evaluation.parity", "export.evaluation.sample_files")
 TASK_CODE = ("export.evaluation.task_samples", "export.evaluation.torch_stages", "export.evaluation.sample_files")
 PRECISION_CODE = ("export.evaluation.precision_search",)
-RANGES_CODE = ("export.quantize.ranges",)
+RANGES_CODE = ("export.quantize.rounding",)
 GRAPH_CODE = ("export.graphs.build",)
 GATE_CODE = ("export.evaluation.gate_run", "export.evaluation.gates", "export.evaluation.sample_files")
 """The modules that make each kind of stage; what they import counts too (`stages.source_sha256`)."""
@@ -168,7 +168,7 @@ class Pipeline:
     @cached_property
     def _weights_entry(self) -> Path:
         def build(directory: Path) -> None:
-            loaded = self.job.weights.get()
+            loaded = self.job.weights.loaded
             record = {
                 "sha256": weights_sha256(loaded.model),
                 "trained": loaded.info.trained,
@@ -195,7 +195,7 @@ class Pipeline:
         """Test inputs of a graph and PyTorch's outputs."""
 
         def build(directory: Path) -> None:
-            model = self.job.weights.get().model
+            model = self.job.weights.loaded.model
             save_samples(references(model, graph, self.job.target.gate(graph).inputs), directory / SAMPLES_FILE)
 
         return self._stage(f"reference {graph}", self._reference_key(graph), build) / SAMPLES_FILE
@@ -217,7 +217,7 @@ class Pipeline:
         """PyTorch's plans in those situations."""
 
         def build(directory: Path) -> None:
-            stages = TorchStages(self.job.weights.get().model)
+            stages = TorchStages(self.job.weights.loaded.model)
             outputs = run_stages(stages, self.samples, new_tokens=NEW_TOKENS, progress=self._progress.detail)
             save_outputs(outputs, directory / OUTPUTS_FILE)
 
@@ -274,7 +274,7 @@ class Pipeline:
 
     @cached_property
     def _search(self) -> Search:
-        loaded = self.job.weights.get()
+        loaded = self.job.weights.loaded
         samples = search_samples(self.job.calibration, self.job.config, self.job.target.runtime, self.tokenizer())
         return Search(loaded.model, samples, trained=loaded.info.trained, progress=self._progress.detail)
 
@@ -298,7 +298,7 @@ class Pipeline:
         key = self._key("graph", parts, GRAPH_CODE, Pipeline.graph)
 
         def build(directory: Path) -> None:
-            model = self.job.weights.get().model
+            model = self.job.weights.loaded.model
             write_graph(model, graph, precision, policy.form, directory, half=half, ranges=ranges)
 
         entry = self._stage(f"graph {graph}", key, build)
@@ -312,7 +312,7 @@ class Pipeline:
 
         def build(directory: Path) -> None:
             frames = self.samples.frames[:: max(1, len(self.samples.frames) // RANGE_FRAMES)]
-            ranges = activation_ranges(self.job.weights.get().model.vision, frames)
+            ranges = activation_ranges(self.job.weights.loaded.model.vision, frames)
             (directory / RANGES_FILE).write_text(json.dumps(ranges, sort_keys=True, allow_nan=False), encoding="utf-8")
 
         entry = self._stage(
@@ -380,7 +380,7 @@ class Pipeline:
         return compare(graph, load_samples(self.reference(graph)), OpenGraph(artifacts, graph, self._threads))
 
     def _task(self, artifacts: Artifacts, graph: str) -> TaskResult:
-        check = TaskCheck(TorchStages(self.job.weights.get().model), self._task_outputs, self.samples)
+        check = TaskCheck(TorchStages(self.job.weights.loaded.model), self._task_outputs, self.samples)
         if graph in (*LANGUAGE_WHOLE, *LANGUAGE_PAIR):
             shipping = artifacts.graphs[graph].session.provider
             provider = gate_provider(shipping)

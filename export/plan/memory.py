@@ -8,8 +8,8 @@ from export.model.config import TicVlaConfig
 from export.plan.cost import context_numbers
 from export.plan.timing import Work, stage_calls, stage_graph
 from export.quantize.precision import Precision
-from export.target.file import Target
-from export.target.sections import KV_DTYPES
+from export.targets.file import Target
+from export.targets.sections import KV_DTYPES
 
 GIB = 1 << 30
 TICK_STAGES = ("vision_encoder", "action_expert")

@@ -26,8 +26,8 @@ from export.model.config import TicVlaConfig
 from export.plan.memory import GENERATION_STAGES, GIB, TICK_STAGES, Memory, graph_weights, memory_of
 from export.plan.timing import Estimate, StageTime, Work, stage_graph, stage_time, total
 from export.quantize.precision import Precision
-from export.target.file import Target
-from export.target.sections import MEASURED, MODELLED, PowerMode
+from export.targets.file import Target
+from export.targets.sections import MEASURED, MODELLED, PowerMode
 
 TEXT_TOKENS = {True: 166, False: 104}
 """Tokens of a prompt beside its frames (chat template, an instruction of 10 words, a way of 8 points, progress),

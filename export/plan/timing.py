@@ -10,8 +10,8 @@ from edge.artifacts.manifest import LANGUAGE_WHOLE
 from export.model.config import TicVlaConfig
 from export.plan.cost import DECODE, PREFILL, Call, action_call, context_call, language_call, vision_call
 from export.quantize.precision import Precision
-from export.target.file import Target
-from export.target.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured, Provider
+from export.targets.file import Target
+from export.targets.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured, Provider
 
 SAME_LENGTH = 0.05
 """A measurement at a length within this share of the wanted one stands for it; else it only scales the model."""

@@ -7,13 +7,16 @@ model holds its own tensors again whenever no layer is running.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from export.model.vision import VisionEncoder
 from export.quantize.precision import Precision
 from export.quantize.weights import Blocks, Channels, quantise_blocks, quantise_channels
 
@@ -140,3 +143,25 @@ def _table_rows(rows: Tensor, precision: str) -> Tensor:
 def _bytes(packed: Blocks | Channels) -> int:
     values = packed.packed if isinstance(packed, Blocks) else packed.values
     return int(values.nbytes + packed.scales.nbytes)
+
+
+def activation_ranges(vision: VisionEncoder, frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, float]:
+    """Largest magnitude at the input of every linear layer over frames [1, px, px, 3], by the layer's name."""
+    largest: dict[str, float] = {}
+
+    def watch(name: str) -> Any:
+        def hook(_module: nn.Module, inputs: tuple[Tensor, ...], _output: Tensor) -> None:
+            largest[name] = max(largest.get(name, 0.0), float(inputs[0].abs().max()))
+
+        return hook
+
+    linear = [(name, module) for name, module in vision.named_modules() if isinstance(module, nn.Linear)]
+    handles = [module.register_forward_hook(watch(name)) for name, module in linear]
+    try:
+        with torch.no_grad():
+            for frame in frames:
+                vision(torch.from_numpy(frame))
+    finally:
+        for handle in handles:
+            handle.remove()
+    return largest

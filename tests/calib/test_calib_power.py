@@ -27,7 +27,7 @@ from edge.power.meters.meter import MeterError, PowerSample
 from export.model.config import PRESETS
 from export.plan.measure import measured_point
 from export.plan.plan import plan
-from export.target.file import for_model, list_targets, load_target, parse_target, with_settings
+from export.targets.file import for_model, list_targets, load_target, parse_target, with_settings
 from reporting.toml_text import toml_text
 
 TREES = Path(__file__).parents[1] / "data/sysfs"

@@ -27,7 +27,7 @@ from edge.power.governor.plan import PowerPlan, power_plan
 from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from export.model.config import PRESETS
 from export.plan.plan import plan
-from export.target.file import load_target
+from export.targets.file import load_target
 
 WINDOW_S, SETTLE_S, TOLERANCE, LENGTH_S = 10.0, 30.0, 0.02, 600.0
 NOISE, LOST = 0.02, 0.01

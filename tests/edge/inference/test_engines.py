@@ -39,7 +39,7 @@ from edge.inference.engines import (
     with_engines,
 )
 from edge.inference.graph import GraphError
-from export.target.file import load_target
+from export.targets.file import load_target
 
 NEEDING = ("vision_encoder", "semantic_context", "action_expert")
 FACTS = DeviceFacts("aarch64", "nvidia,p3767-0000", "36.4.3", "1.25.1", "10.3.0")

@@ -46,7 +46,7 @@ def test_a_damaged_file_is_said(folder: Path) -> None:
 
 def test_an_export_takes_them_unless_it_is_told_otherwise(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("export.pipeline.job.shipped_weights", lambda config: shipped_weights(config, folder))
-    shipped, random = WeightSource(SMALL, [], None).get(), WeightSource(SMALL, [], 3).get()
+    shipped, random = WeightSource(SMALL, [], None).loaded, WeightSource(SMALL, [], 3).loaded
     assert shipped.info.trained and not random.info.trained
     trained = build(SMALL, 5).half().float()
     for name, tensor in shipped.model.state_dict().items():

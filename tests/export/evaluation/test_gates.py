@@ -10,7 +10,7 @@ import pytest
 
 from export.evaluation.gates import GateError, GateResult, TaskResult, Verdict, judge, require, worst
 from export.evaluation.metrics import Arrays, ParityError, ParityResult, Sample, compare
-from export.target.sections import GraphGate, TaskGate
+from export.targets.sections import GraphGate, TaskGate
 
 GATE = GraphGate(inputs=2, min_cosine=0.99, max_abs=0.1, min_difference=1e-3, warn_cosine=0.999, top1=0.9)
 TASK_GATE = TaskGate(

@@ -23,8 +23,8 @@ from export.plan.cost import action_call
 from export.plan.timing import Work, stage_time
 from export.quantize.precision import Precision
 from export.quantize.rounding import Rounder
-from export.target.file import load_target
-from export.target.sections import MEASURED, MODELLED, Measured
+from export.targets.file import load_target
+from export.targets.sections import MEASURED, MODELLED, Measured
 from tests.support.export.action_heads import HEADS, TINY, lively, with_head
 from tests.support.export.byte_products import skip_where_bytes_saturate
 

@@ -19,7 +19,7 @@ from export.graphs.language import cache_names
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
 from export.quantize.precision import Precision
-from export.quantize.ranges import activation_ranges
+from export.quantize.rounding import activation_ranges
 from tests.support.export.byte_products import skip_where_bytes_saturate
 
 NANO = PRESETS["nano"]

@@ -19,7 +19,7 @@ from edge.state.reasoning_text import format_waypoints
 from edge.state.ring import EncodedFrame
 from export.model.config import PRESETS
 from export.model.tokenizers.nano import FARTHEST_M, NANO_TOKENIZER, train, word_lists
-from export.target.file import list_targets, load_target
+from export.targets.file import list_targets, load_target
 from sim_hil.benchmark.language.instruction_words import AREAS, NOUNS, ORDINALS
 from sim_hil.benchmark.language.instructions import wordings
 from sim_hil.benchmark.language.route import COLOUR_WORDS, Passed, RouteDescription, Step

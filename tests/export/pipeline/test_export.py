@@ -25,7 +25,7 @@ from export.graphs.build import graph_names, write_graph
 from export.model.network import TicVla, build
 from export.pipeline.artifacts import build_artifacts
 from export.pipeline.build import Pipeline, WeightsRecord
-from export.target.file import with_settings
+from export.targets.file import with_settings
 from tests.support.export.export_job import NANO, TARGET, job, manifest, progress
 
 GRAPHS = graph_names(pair=False)

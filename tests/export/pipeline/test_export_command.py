@@ -11,7 +11,7 @@ from export import entry
 from export.cli import main
 from export.pipeline.build import with_exceptions
 from export.quantize.precision import Precision
-from export.target.file import list_targets
+from export.targets.file import list_targets
 from tests.support.export.export_job import manifest
 
 LOOSE = [

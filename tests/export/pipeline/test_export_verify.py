@@ -12,8 +12,8 @@ import pytest
 from edge.artifacts.files import seal
 from export.cli import main
 from export.core.cache import file_sha256
-from export.pipeline import verify
-from export.target.file import TARGETS_DIR
+from export.pipeline import job
+from export.targets.file import TARGETS_DIR
 from tests.support.export.export_job import manifest
 
 
@@ -105,7 +105,7 @@ def test_verify_of_a_checkpoint_takes_the_checkpoint(
         assert main(["--out", where, "--random-weights", str(seed), "--save-weights", str(weights)]) == 0
     assert main(["--out", str(out), "--checkpoint", str(saved)]) == 0
     capsys.readouterr()
-    monkeypatch.setattr(verify, "shipped_weights", lambda config: others if shipped else None)
+    monkeypatch.setattr(job, "shipped_weights", lambda config: others if shipped else None)
     assert main(["verify", str(out)]) == code
     told = capsys.readouterr().err
     assert says in told and "checkpoint" in told

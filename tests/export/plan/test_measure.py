@@ -18,8 +18,8 @@ from export.core.typed import plain
 from export.model.config import PRESETS
 from export.plan.measure import STAGES, main, measure_points, points_toml
 from export.plan.plan import plan
-from export.target.file import Target, load_target, parse_target
-from export.target.sections import MEASURED, Measured
+from export.targets.file import Target, load_target, parse_target
+from export.targets.sections import MEASURED, Measured
 
 
 @pytest.fixture(scope="module")

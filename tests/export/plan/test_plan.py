@@ -15,8 +15,8 @@ from export.plan.cost import DECODE, PREFILL, action_call, context_call, languag
 from export.plan.plan import Plan, PlanError, plan
 from export.plan.table import plan_table
 from export.quantize.precision import Precision
-from export.target.file import Target, load_target, with_settings
-from export.target.sections import MEASURED, MODELLED, Measured
+from export.targets.file import Target, load_target, with_settings
+from export.targets.sections import MEASURED, MODELLED, Measured
 
 BIG, NANO = PRESETS["1b"], PRESETS["nano"]
 PAPER_MS = {"orin": (120.27, 4831.73), "rtx4060": (85.73, 3430.73)}

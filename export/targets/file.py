@@ -19,7 +19,7 @@ from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
 from export.core.typed import FieldError, build, convert, field_types, from_text, near, plain
 from export.model.config import MODEL_PREFIX
 from export.quantize.precision import Precision, block_size
-from export.target.sections import (
+from export.targets.sections import (
     Device,
     Figure,
     GraphGate,
@@ -34,7 +34,7 @@ from export.target.sections import (
 )
 
 SCHEMA = 2
-TARGETS_DIR = Path(__file__).parents[1] / "targets"
+TARGETS_DIR = Path(__file__).parent
 TASK_GATE = "task"
 OTHER_GRAPHS = ("vision_encoder", "semantic_context", "action_expert")
 CHOOSING = (*LANGUAGE_WHOLE, LANGUAGE_PAIR[1])
