@@ -38,8 +38,8 @@ from edge.power.meters.modelled import ModelledMeter
 from edge.power.meters.select import open_meter
 from export.core.typed import plain
 from export.plan.measure import measured_point
-from export.targets.file import Target, TargetError, parse_target
-from export.targets.sections import Figure, Measured
+from export.targets.file import Target, parse_target
+from export.targets.sections import Figure, Measured, TargetError
 from reporting.toml_text import toml_text
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")

@@ -37,7 +37,8 @@ from export.pipeline.build import build_stages
 from export.pipeline.job import Asked, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
-from export.targets.file import Target, TargetError, list_targets, load_target, with_settings
+from export.targets.file import Target, list_targets, load_target, with_settings
+from export.targets.sections import TargetError
 from reporting.build_progress import Progress, peak_rss_bytes
 
 COMMAND = "edge-export"

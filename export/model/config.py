@@ -317,7 +317,7 @@ def model_settings(settings: Sequence[str]) -> dict[str, str]:
 def with_overrides(config: TicVlaConfig, overrides: Mapping[str, str]) -> TicVlaConfig:
     """`config` with fields such as `action.layers` replaced by values written as text; raises ModelConfigError."""
     content = config.to_dict()
-    sections = {key: kind for key, kind in field_types(TicVlaConfig).items() if dataclasses.is_dataclass(kind)}
+    sections = {key: kind for key, kind in field_types(TicVlaConfig).items() if key != "name"}
     kinds = {f"{section}.{key}": kind for section, cls in sections.items() for key, kind in field_types(cls).items()}
     for key, text in overrides.items():
         if key not in kinds:

@@ -25,7 +25,8 @@ from export.model.config import (
 )
 from export.model.network import PARTS, build
 from export.model.weights import CheckpointError, WeightsError, WeightsInfo
-from export.targets.file import Target, TargetError, list_targets, load_target, parse_target, with_settings
+from export.targets.file import Target, list_targets, load_target, parse_target, with_settings
+from export.targets.sections import TargetError
 
 DEFAULT_SEED = 0
 WHOLLY_RANDOM = re.compile(r"random seed (\d{1,19})")
@@ -93,7 +94,7 @@ class Job:
     asked: Asked = Asked()
 
     def __post_init__(self) -> None:
-        check_clips(self.calibration, self.target.runtime)
+        check_clips(self.calibration, self.target.runtime.frame_offsets_s)
 
     @property
     def config(self) -> TicVlaConfig:

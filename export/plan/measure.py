@@ -31,8 +31,8 @@ from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 from export.core.typed import plain
 from export.plan.timing import stage_graph
 from export.quantize.precision import Precision
-from export.targets.file import Target, TargetError, parse_target
-from export.targets.sections import Measured
+from export.targets.file import Target, parse_target
+from export.targets.sections import Measured, TargetError
 
 INSTRUCTION = "walk down the corridor and stop at the vending machine"
 STAGES = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from export.evaluation.gates import GateError, GateResult, TaskResult, Verdict, judge, require, worst
-from export.evaluation.metrics import Arrays, ParityError, ParityResult, Sample, compare
+from export.evaluation.gates import GateError, GateResult, Verdict, judge, require
+from export.evaluation.parity import Arrays, ParityError, ParityResult, Sample, compare
+from export.evaluation.task_error import TaskResult
 from export.targets.sections import GraphGate, TaskGate
 
 GATE = GraphGate(inputs=2, min_cosine=0.99, max_abs=0.1, min_difference=1e-3, warn_cosine=0.999, top1=0.9)
@@ -54,14 +55,6 @@ def test_the_worst_input_counts() -> None:
     assert compare("vision_encoder", samples(), run).max_abs == pytest.approx(0.5)
 
 
-def test_outputs_that_point_elsewhere_have_a_low_cosine() -> None:
-    assert compare("vision_encoder", samples(), lambda f: {"visual_tokens": -f["x"]}).cosine == -1.0
-
-
-def test_a_graph_that_gives_the_same_for_every_input_shows_no_difference() -> None:
-    assert compare("vision_encoder", samples(), lambda _: {"visual_tokens": np.ones((1, 4))}).min_difference == 0.0
-
-
 def test_the_share_of_equal_tokens_is_counted_over_all_inputs() -> None:
     expected = [tokens([[0, 1]]), tokens([[1, 0]]), tokens([[0, 3]]), tokens([[5, 0]])]
     answers = iter([[[0.0, 2.0]], [[1.0, 0.1]], [[9.0, 3.0]], [[5.0, 0.0]]])
@@ -95,10 +88,6 @@ def test_one_input_is_not_enough_for_the_negative_control() -> None:
 
 
 # ---- what it is held to
-
-
-def test_numbers_within_every_threshold_pass() -> None:
-    assert judge(GOOD, STEADY, GATE, TASK_GATE) == Verdict("PASS")
 
 
 def test_a_threshold_itself_still_passes() -> None:
@@ -169,10 +158,6 @@ def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task
     assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (said,))
 
 
-def test_a_failure_is_not_softened_by_a_warning() -> None:
-    assert judge(replace(GOOD, cosine=0.5), replace(STEADY, waypoint_cm=3), GATE, TASK_GATE).level == "FAIL"
-
-
 def test_another_token_from_untrained_weights_only_warns() -> None:
     unsure = replace(GOOD, top1=0.5)
     assert judge(unsure, STEADY, GATE, TASK_GATE, trained=False).level == "WARN"
@@ -207,14 +192,6 @@ def test_a_failed_graph_is_refused_with_one_line_that_gives_the_numbers() -> Non
         require("action_expert", judge(replace(GOOD, cosine=0.5), None, GATE, TASK_GATE))
 
 
-def test_a_warning_is_not_refused() -> None:
-    require("action_expert", Verdict("WARN", ("cosine",)))
-
-
-def test_the_worst_verdict_speaks_for_all() -> None:
-    assert worst({"a": Verdict("PASS"), "b": Verdict("WARN"), "c": Verdict("PASS")}) == "WARN"
-
-
 @pytest.mark.parametrize(
     ("provider", "checked"), [("CPUExecutionProvider", False), ("TensorrtExecutionProvider", True)]
 )
@@ -227,4 +204,4 @@ def test_a_gate_on_another_provider_than_the_one_that_ships_is_recorded_as_such(
 
 
 def test_a_task_result_survives_json() -> None:
-    assert TaskResult.from_dict(json.loads(json.dumps(STEADY.to_dict()))) == STEADY
+    assert TaskResult.from_dict(json.loads(json.dumps(asdict(STEADY)))) == STEADY

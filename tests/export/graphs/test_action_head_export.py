@@ -13,9 +13,8 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from export.evaluation.metrics import compare
-from export.evaluation.parity import Arrays, references, sample_inputs
-from export.evaluation.torch_stages import TorchStages
+from export.evaluation.parity import Arrays, compare, references, sample_inputs
+from export.evaluation.task_error import TorchStages
 from export.graphs.build import graph_contract, linear_layers, write_graph
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla

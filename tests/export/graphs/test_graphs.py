@@ -12,8 +12,7 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.evaluation.metrics import compare
-from export.evaluation.parity import Arrays, references, sample_inputs
+from export.evaluation.parity import Arrays, compare, references, sample_inputs
 from export.graphs.build import LANGUAGE_PAIR, graph_names, linear_layers, write_graph
 from export.graphs.language import cache_names
 from export.model.config import PRESETS, TicVlaConfig

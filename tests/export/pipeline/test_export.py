@@ -16,11 +16,9 @@ import torch
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from export.cli import DEFAULT_CALIBRATION, main
 from export.core.cache import StageCache
-from export.evaluation.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
-from export.evaluation.gates import GateError, judge
-from export.evaluation.metrics import Arrays, ParityResult, Sample, compare
-from export.evaluation.parity import references, sample_inputs
-from export.evaluation.task_error import TaskError, prompt_parts
+from export.evaluation.gates import NEW_TOKENS, GateError, OpenGraph, TaskCheck, judge
+from export.evaluation.parity import Arrays, ParityResult, Sample, compare, references, sample_inputs
+from export.evaluation.task_error import TaskResult, prompt_parts
 from export.graphs.build import graph_names, write_graph
 from export.model.network import TicVla, build
 from export.pipeline.artifacts import build_artifacts
@@ -160,7 +158,7 @@ def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
 class Blind(TaskCheck):
     """A runner that never feeds its language model a frame."""
 
-    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
+    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskResult:
         unseen = [np.zeros_like(tokens) for tokens in self._reference.visual]
         kv, texts = [], []
         for sample in self._samples.samples:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from export.targets.file import TargetError, for_model, list_targets, load_target, parse_target, with_settings
-from export.targets.sections import MEASURED, MODELLED, Figure
+from export.targets.file import for_model, list_targets, load_target, parse_target, with_settings
+from export.targets.sections import MEASURED, MODELLED, Figure, TargetError
 
 PAIR = ("language_model.prefill", "language_model.decode")
 
