@@ -12,7 +12,7 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from export.quantize.precision import PRECISIONS, Precision, block_size
+from export.quantize.precision import Precision, block_size
 from export.quantize.weights import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
@@ -65,7 +65,6 @@ class GraphWriter:
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
         self._shared: dict[tuple[str, tuple[int, ...], bytes], str] = {}
-        self.parameters = 0
 
     def __enter__(self) -> GraphWriter:
         return self
@@ -194,7 +193,6 @@ class GraphWriter:
         `of`: the network's layer that this is a part of, by whose name precision and range are looked up.
         """
         precision = precision or self.precision.of(of or layer)
-        self.parameters += weight.size + (0 if bias is None else bias.size)
         if block_size(precision) is not None:
             if not self.fused:
                 raise ValueError(f"{self.name}: {layer} in {precision}: blocks are an operator of the fused form only")
@@ -297,8 +295,3 @@ class GraphWriter:
             self._data.flush()
         self._path.write_bytes(proto.SerializeToString(deterministic=True))
         return [path.name for path in (self._path, self._data_path, self._shared_path) if path is not None]
-
-
-def most_exact(precisions: Sequence[str]) -> str:
-    """The most exact of several layers' precisions: what they get when one product computes them all."""
-    return min(precisions, key=PRECISIONS.index)

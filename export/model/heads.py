@@ -23,7 +23,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from export.model.attention import CrossAttentionLayer, KeyValue, projection
+from export.model.attention import CrossAttentionLayer, KeyValue, TypedModuleList, projection
 from export.model.config import ActionConfig
 
 MIN_STD = 1e-3
@@ -215,7 +215,7 @@ class Flow(nn.Module):
 
     def __init__(self, config: ActionConfig) -> None:
         super().__init__()
-        self.couplings = nn.ModuleList(Coupling(config.hidden, config.heads) for _ in range(config.couplings))
+        self.couplings = TypedModuleList(Coupling(config.hidden, config.heads) for _ in range(config.couplings))
         self.register_buffer("noise", torch.zeros(1, config.steps, 3))
 
     def start(self) -> None:

@@ -23,8 +23,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from export.model.config import TicVlaConfig
-from export.plan.memory import GENERATION_STAGES, GIB, TICK_STAGES, Memory, graph_weights, memory_of
-from export.plan.timing import Estimate, StageTime, Work, stage_graph, stage_time, total
+from export.plan.timing import (
+    GENERATION_STAGES,
+    GIB,
+    TICK_STAGES,
+    Estimate,
+    Memory,
+    StageTime,
+    Work,
+    graph_weights,
+    memory_of,
+    stage_graph,
+    stage_time,
+    total,
+)
 from export.quantize.precision import Precision
 from export.targets.file import Target
 from export.targets.sections import MEASURED, MODELLED, PowerMode

@@ -43,6 +43,11 @@ MODEL_SECTIONS = ("graphs", "gates", "runtime")
 FIXED_KEYS = ("schema", "name", "measured", "models")
 
 
+def graph_names(*, pair: bool) -> tuple[str, ...]:
+    """Names of a directory's graphs in the order in which they are built, with one language model or with a pair."""
+    return ("vision_encoder", *(LANGUAGE_PAIR if pair else LANGUAGE_WHOLE), "semantic_context", "action_expert")
+
+
 @dataclass(frozen=True)
 class Target:
     """A device to export for."""
@@ -103,8 +108,7 @@ class Target:
     @property
     def graph_names(self) -> tuple[str, ...]:
         """Names of the graphs in the order in which they are built."""
-        language = LANGUAGE_WHOLE if LANGUAGE_WHOLE[0] in self.graphs else LANGUAGE_PAIR
-        return ("vision_encoder", *language, "semantic_context", "action_expert")
+        return graph_names(pair=LANGUAGE_WHOLE[0] not in self.graphs)
 
     @property
     def half(self) -> bool:

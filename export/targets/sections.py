@@ -12,6 +12,7 @@ from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 MODELLED, MEASURED = "modelled", "measured"
 FORMS = ("fused", "plain")
+"""`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""
 ROOFS = ("fp32", "fp16", "int8")
 KV_DTYPES = {"fp32": 4, "fp16": 2}
 METERS = ("ina3221", "nvml", "rapl", "none")

@@ -12,18 +12,21 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from edge.artifacts.manifest import LANGUAGE_PAIR
 from export.evaluation.parity import Arrays, compare, references, sample_inputs
-from export.graphs.build import LANGUAGE_PAIR, graph_names, linear_layers, write_graph
+from export.graphs.build import linear_layers, write_graph
 from export.graphs.language import cache_names
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.network import TicVla, build
 from export.quantize.precision import Precision
 from export.quantize.rounding import activation_ranges
+from export.targets.file import graph_names
 from tests.support.export.byte_products import skip_where_bytes_saturate
 
 NANO = PRESETS["nano"]
 EXACT = Precision("fp32")
-ALL = (*graph_names(False), *LANGUAGE_PAIR)
+GRAPHS = graph_names(pair=False)
+ALL = (*GRAPHS, *LANGUAGE_PAIR)
 # A paper-shaped encoder in small: one convolution as patch embedding, pixel shuffle, no merging of language tokens.
 SMALL = TicVlaConfig(
     name="small",
@@ -129,7 +132,12 @@ STORED = {
 @pytest.mark.parametrize("precision", BOUNDS)
 @pytest.mark.parametrize(
     ("name", "form"),
-    [(name, form) for form in ("fused", "plain") for name in graph_names(False) if form == "fused" or "_m" not in name],
+    [
+        (name, form)
+        for form in ("fused", "plain")
+        for name in graph_names(pair=False)
+        if form == "fused" or "_m" not in name
+    ],
 )
 def test_every_combination_runs_as_the_network_and_stores_what_it_says_or_is_refused(
     small: TicVla, tmp_path: Path, name: str, form: str, precision: str, half: bool

@@ -19,11 +19,11 @@ from export.core.cache import StageCache
 from export.evaluation.gates import NEW_TOKENS, GateError, OpenGraph, TaskCheck, judge
 from export.evaluation.parity import Arrays, ParityResult, Sample, compare, references, sample_inputs
 from export.evaluation.task_error import TaskResult, prompt_parts
-from export.graphs.build import graph_names, write_graph
+from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.pipeline.artifacts import build_artifacts
 from export.pipeline.build import Pipeline, WeightsRecord
-from export.targets.file import with_settings
+from export.targets.file import graph_names, with_settings
 from tests.support.export.export_job import NANO, TARGET, job, manifest, progress
 
 GRAPHS = graph_names(pair=False)
