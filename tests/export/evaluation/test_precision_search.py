@@ -167,12 +167,6 @@ def test_the_vocabulary_matters_to_the_token_and_not_to_the_plan(reference: Refe
 
 
 @pytest.mark.slow
-def test_wide_limits_take_the_smallest_candidate(search: Search) -> None:
-    decision = search.choose("language_model", ["fp16", "int8-b32", "int4-b32"], within(10))
-    assert decision.precision == Precision("int4-b32") and decision.within_limits
-
-
-@pytest.mark.slow
 def test_when_even_the_most_exact_candidate_is_outside_it_says_so(search: Search) -> None:
     decision = search.choose("language_model", ["int8-b32", "int4-b32"], within(1e-6))
     assert decision.precision == Precision("int8-b32") and not decision.within_limits
@@ -221,18 +215,6 @@ def test_a_single_candidate_is_measured_and_kept(search: Search) -> None:
     assert search.choose("action_expert", ["fp32"], LIMITS).reason == "fp32: the only candidate"
 
 
-def test_eight_bits_are_tried_with_rounded_inputs(search: Search, reference: Reference) -> None:
-    decision = search.choose("action_expert", ["int8"], LIMITS)
-    rounded = probe(reference, "action_expert", Rounder(), activations=True).whole(Precision("int8"))
-    weights = probe(reference, "action_expert", Rounder(), activations=False).whole(Precision("int8"))
-    assert decision.table[0].output_error == rounded.output_error != weights.output_error
-
-
-def test_no_candidates_is_an_error(search: Search) -> None:
-    with pytest.raises(ValueError, match="no candidates"):
-        search.choose("action_expert", [], LIMITS)
-
-
 def test_each_figure_is_held_against_its_own_limit() -> None:
     reading = Reading(1.0, 0.3, 0.01, 0.02, 0.1, 0.0, 0.9)
     assert LIMITS.load(reading, trained=False) == pytest.approx(0.4)  # 0.02 of 0.05 rad/s
@@ -275,24 +257,12 @@ def test_where_time_counts_a_smaller_variant_that_was_measured_slower_is_dropped
     assert kept == ("fp32",) and "slower than the more exact fp32 (2307 against 802 ms)" in dropped[0].reason
 
 
-@pytest.mark.slow
-def test_a_dropped_variant_is_in_the_reason(search: Search) -> None:
-    decision = search.choose("language_model", ["fp16", "int8-b128", "int8-b32"], LIMITS)
-    assert decision.precision.default == "int8-b128"
-    assert "int8-b32 dropped: not smaller than" in decision.reason
-
-
 def test_rounding_to_eight_bits_keeps_zero_and_the_extremes() -> None:
     x = torch.tensor([-1.0, 0.0, 0.1234, 3.0])
     rounded = round_u8(x)
     assert rounded[1] == 0
     assert torch.allclose(rounded, x, atol=4 / 255 / 2 + 1e-6)
     assert torch.equal(round_u8(torch.zeros(3)), torch.zeros(3))
-
-
-def test_a_small_store_of_rounded_weights_changes_nothing(model: TicVla) -> None:
-    weight = model.language.layers[0].gate.weight
-    assert torch.equal(Rounder(0).weight(weight, "int4-b32"), Rounder().weight(weight, "int4-b32"))
 
 
 def test_the_large_model_is_searched_with_two_short_prompts() -> None:

@@ -18,7 +18,7 @@ from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, Pr
 from edge.state.reasoning_text import format_waypoints
 from edge.state.ring import EncodedFrame
 from export.model.config import PRESETS
-from export.model.tokenizers.nano import FARTHEST_M, NANO_TOKENIZER, train, word_lists
+from export.model.tokenizers.nano import FARTHEST_M, NANO_TOKENIZER, train
 from export.targets.file import list_targets, load_target
 from sim_hil.benchmark.language.instruction_words import AREAS, NOUNS, ORDINALS
 from sim_hil.benchmark.language.instructions import wordings
@@ -130,22 +130,10 @@ def test_the_aspects_names_are_one_token_at_the_start_of_a_line() -> None:
     assert [tokens(head) for head in heads] == [1] * 6
 
 
-def test_the_words_of_the_file_are_one_token_each_but_for_everyday_ones() -> None:
-    lists = word_lists()
-    everyday, starts = set(lists.pop("everyday")), lists.pop("line_starts")
-    assert in_pieces({word for words in lists.values() for word in words}) == []
-    assert [tokens(start) for start in starts] == [1] * len(starts)
-    assert len(in_pieces(everyday)) < len(everyday)
-
-
 def test_the_tokenizer_is_what_its_word_lists_give() -> None:
     made = train(LANGUAGE.vocab)
     assert made.get_vocab() == TOKENIZER.get_vocab()
     assert [made.encode(text).ids for text in instructions()] == [TOKENIZER.encode(t).ids for t in instructions()]
-
-
-def test_every_id_is_used_by_one_token() -> None:
-    assert sorted(TOKENIZER.get_vocab().values()) == list(range(LANGUAGE.vocab))
 
 
 @given(st.text(max_size=80))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -14,11 +16,12 @@ import pytest
 import torch
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
-from export.cli import DEFAULT_CALIBRATION, main
+from edge.inference.language import Generation, LanguageModel
+from edge.reasoning.prompt import Segment
+from export.cli import main
 from export.core.cache import StageCache
-from export.evaluation.gates import NEW_TOKENS, GateError, OpenGraph, TaskCheck, judge
-from export.evaluation.parity import Arrays, ParityResult, Sample, compare, references, sample_inputs
-from export.evaluation.task_error import TaskResult, prompt_parts
+from export.evaluation.gates import GateError, OpenGraph, judge
+from export.evaluation.parity import ParityResult, Sample, compare, references
 from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.pipeline.artifacts import build_artifacts
@@ -77,10 +80,6 @@ def test_every_graph_was_run_on_the_provider_that_ships_and_on_the_task(artifact
     assert [delay_s for delay_s, _ in parity["task"]["by_delay_cm"]] == [0, 1, 2, 3, 5, 7, 10]
 
 
-def test_the_language_model_chooses_the_same_tokens(artifacts_dir: Path) -> None:
-    assert manifest(artifacts_dir)["graphs"]["language_model"]["parity"]["top1"] == 1.0
-
-
 @pytest.mark.parametrize("name", GRAPHS)
 def test_the_manifest_says_what_a_graph_is_made_of_and_how_it_is_opened(artifacts_dir: Path, name: str) -> None:
     graph = manifest(artifacts_dir)["graphs"][name]
@@ -88,14 +87,6 @@ def test_the_manifest_says_what_a_graph_is_made_of_and_how_it_is_opened(artifact
     assert graph["precision"] == {"default": "fp32", "overrides": {}}
     assert graph["precision_reason"]
     assert graph["session"] == {"provider": "CPUExecutionProvider", "options": {}, "threads": 1, "engine": False}
-
-
-def test_the_manifest_holds_plan_calibration_and_target(artifacts_dir: Path) -> None:
-    content = manifest(artifacts_dir)
-    assert content["plan"]["tagged"] in ("modelled", "measured")
-    assert content["provenance"]["calibration"]["name"] == DEFAULT_CALIBRATION
-    assert len(content["provenance"]["calibration"]["sha256"]) == 64
-    assert content["provenance"]["target"]["gates"]["task"]["waypoint_cm"] == TARGET.task_gate.waypoint_cm
 
 
 @pytest.mark.parametrize("name", GRAPHS)
@@ -123,27 +114,10 @@ def test_the_manifest_says_that_the_weights_are_untrained(artifacts_dir: Path) -
 # ---- the gate
 
 
-@pytest.mark.parametrize("name", GRAPHS)
-def test_the_eight_inputs_are_all_different(name: str) -> None:
-    inputs = [sample_inputs(NANO, name, i) for i in range(8)]
-    keys = [b"".join(a.tobytes() for a in feeds.values()) for feeds in inputs]
-    assert len(set(keys)) == 8
-
-
 @pytest.mark.parametrize("name", ["vision_encoder", "action_expert"])
 def test_a_graph_that_ignores_its_input_fails(samples: dict[str, list[Sample]], name: str) -> None:
     first = samples[name][0].expected
     assert verdict(name, compare(name, samples[name], lambda _: first)) == "FAIL"
-
-
-def test_a_small_error_in_one_output_fails(samples: dict[str, list[Sample]], artifacts: Artifacts) -> None:
-    graph = OpenGraph(artifacts, "action_expert", threads=1)
-    assert verdict("action_expert", compare("action_expert", samples["action_expert"], graph)) == "PASS"
-
-    def shifted(feeds: Arrays) -> Arrays:
-        return {name: y + np.float32(2e-3) for name, y in graph(feeds).items()}
-
-    assert verdict("action_expert", compare("action_expert", samples["action_expert"], shifted)) == "FAIL"
 
 
 @pytest.mark.parametrize("dead", ["visual_tokens", "state", "latency", "context.0.key", "context.5.value"])
@@ -155,24 +129,19 @@ def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
     assert verdict("action_expert", found) == "FAIL"
 
 
-class Blind(TaskCheck):
+class Blind(LanguageModel):
     """A runner that never feeds its language model a frame."""
 
-    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskResult:
-        unseen = [np.zeros_like(tokens) for tokens in self._reference.visual]
-        kv, texts = [], []
-        for sample in self._samples.samples:
-            state, ids = self._torch.language(prompt_parts(sample, unseen), NEW_TOKENS)
-            kv.append(state)
-            texts.append(ids)
-        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
+    def generate(self, segments: Sequence[Segment], **options: Any) -> Generation:
+        unseen = [Segment(s.ids, None if s.tokens is None else np.zeros_like(s.tokens)) for s in segments]
+        return super().generate(unseen, **options)
 
 
 @pytest.mark.slow
 def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("export.pipeline.build.TaskCheck", Blind)
+    monkeypatch.setattr("export.evaluation.gates.LanguageModel", Blind)
     assert main([*RANDOM, "--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "language_model: not the same model: deviation as a share of the plans' spread" in said

@@ -47,11 +47,6 @@ def test_block_rounding_never_leaves_a_block_worse_than_plain_rounding(precision
         assert (np.linalg.norm(error[:, part], axis=1) <= bound * 1.001 + 1e-6).all()
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_zero_weights_stay_zero(precision: str) -> None:
-    assert not rounded(np.zeros((3, 200), np.float32), precision).any()
-
-
 def test_a_more_exact_precision_is_closer_to_the_weights() -> None:
     weight = normal(64, 512)
     errors = {p: float(np.linalg.norm(rounded(weight, p) - weight)) for p in PRECISIONS}
@@ -101,11 +96,6 @@ def test_the_first_override_that_matches_a_layer_wins() -> None:
         "int8-b128",
         "int4-b128",
     ]
-
-
-def test_a_precision_survives_the_manifest() -> None:
-    precision = Precision("int8", (("lm_head", "fp16"),))
-    assert Precision.from_dict(precision.to_dict()) == precision
 
 
 @pytest.mark.parametrize("name", ["int3", "", "INT8", "int4"])
