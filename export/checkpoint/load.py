@@ -91,25 +91,19 @@ class LoadedCheckpoint:
     """tokenizer.json of the Hugging Face directory, checked against the configuration's token ids."""
 
 
-@dataclass(frozen=True)
-class _Recipe:
-    """How one of our tensors is read: the pieces are stacked along the first axis."""
-
-    source: Source
-    names: tuple[str, ...]
-
-    def describe(self) -> str:
-        return f"{self.source.label}: {', '.join(self.names)}"
-
-
 @dataclass
 class _Plan:
     """What the files give, before anything is read."""
 
-    recipes: dict[str, _Recipe]
-    sources: list[SourceCoverage]
-    unknown: list[str]
-    repeated: list[str]
+    recipes: dict[str, tuple[Source, tuple[str, ...]]] = field(default_factory=dict)
+    """Our tensor → the file and the names of the pieces there, which are stacked along the first axis."""
+    sources: list[SourceCoverage] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    repeated: list[str] = field(default_factory=list)
+
+
+def _describe(source: Source, names: tuple[str, ...]) -> str:
+    return f"{source.label}: {', '.join(names)}"
 
 
 def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: int | None) -> LoadedCheckpoint:
@@ -134,7 +128,7 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
     coverage = _account(plan, wanted, fill_seed)
     if not coverage.complete:
         _refuse(coverage, config, sources)
-    _read(model, plan.recipes)
+    _read(model, plan)
     for part, seed in coverage.seeded.items():
         initialise(model, seed, (part,))
     contents = (directory_tokenizer(s.directory, config.language) for s in sources if s.directory is not None)
@@ -167,7 +161,7 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
 
 
 def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config: TicVlaConfig) -> _Plan:
-    plan = _Plan({}, [], [], [])
+    plan = _Plan()
     for source in sources:
         matches = find_layouts(source.tensors, wanted, config)
         if not matches:
@@ -183,9 +177,9 @@ def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config:
                     continue
                 used.update(theirs)
                 if ours in plan.recipes:
-                    plan.repeated.append(f"{ours} in {plan.recipes[ours].source.label} and {source.label}")
+                    plan.repeated.append(f"{ours} in {plan.recipes[ours][0].label} and {source.label}")
                 else:
-                    plan.recipes[ours] = _Recipe(source, theirs)
+                    plan.recipes[ours] = (source, theirs)
         rest = [name for name in source.tensors if name not in used]
         patterns = [pattern for match in matches for pattern in match.ignored]
         ignored = tuple(name for name in rest if any(re.fullmatch(pattern, name) for pattern in patterns))
@@ -218,17 +212,14 @@ def _account(plan: _Plan, wanted: dict[str, tuple[int, ...]], fill_seed: int | N
         if recipe is None:
             missing.append(name)
             continue
-        tensors = recipe.source.tensors
-        missing += [f"{recipe.source.label}: {piece}" for piece in recipe.names if piece not in tensors]
-        expected = (shape[0] // len(recipe.names), *shape[1:]) if len(recipe.names) > 1 else shape
-        misshaped += [
-            f"{piece} is {list(tensors[piece].shape)}, expected {list(expected)}"
-            for piece in recipe.names
-            if piece in tensors and tensors[piece].shape != expected
-        ]
+        source, pieces = recipe
+        missing += [f"{source.label}: {piece}" for piece in pieces if piece not in source.tensors]
+        expected = (shape[0] // len(pieces), *shape[1:]) if len(pieces) > 1 else shape
+        found = {piece: source.tensors[piece].shape for piece in pieces if piece in source.tensors}
+        misshaped += [f"{p} is {list(s)}, expected {list(expected)}" for p, s in found.items() if s != expected]
     return Coverage(
         sources=tuple(plan.sources),
-        loaded={name: recipe.describe() for name, recipe in plan.recipes.items()},
+        loaded={name: _describe(*recipe) for name, recipe in plan.recipes.items()},
         seeded=seeded,
         missing=tuple(missing),
         unknown=tuple(plan.unknown),
@@ -253,17 +244,15 @@ def _refuse(coverage: Coverage, config: TicVlaConfig, sources: Sequence[Source])
     raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}")
 
 
-def _read(model: TicVla, recipes: dict[str, _Recipe]) -> None:
+def _read(model: TicVla, plan: _Plan) -> None:
     targets = model.state_dict()
-    for ours, recipe in recipes.items():
+    for ours, (source, pieces) in plan.recipes.items():
         target: Tensor = targets[ours]
-        rows = target.shape[0] // len(recipe.names) if target.ndim else 0
-        for i, name in enumerate(recipe.names):
-            # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
-            tensor = recipe.source.tensors[name].read()
-            (target[i * rows : (i + 1) * rows] if len(recipe.names) > 1 else target).copy_(tensor)
+        # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
+        for part, piece in zip(target.chunk(len(pieces)) if len(pieces) > 1 else [target], pieces, strict=True):
+            part.copy_(source.tensors[piece].read())
         if not torch.isfinite(target).all():
-            raise CheckpointError(f"{recipe.describe()}: has values that are not finite; the file is damaged")
+            raise CheckpointError(f"{_describe(source, pieces)}: has values that are not finite; the file is damaged")
 
 
 def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:

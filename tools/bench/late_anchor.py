@@ -9,20 +9,18 @@ last. So whatever the machine does besides, it does to all of them. The JSON hol
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import statistics
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.core.stats import percentiles
 from edge.inference.language import LanguageModel
@@ -32,6 +30,7 @@ from edge.run.reasoning_loop import ReasoningLoop
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot
 from export.plan.measure import INSTRUCTION
+from tools.bench import bad_input, command_parser
 
 CAMERA_LEAD = 0.5
 """Share of a period by which a frame is captured before its tick, as the runner asks for it."""
@@ -209,11 +208,9 @@ def saved(samples: dict[str, dict[str, list[float]]], way: str) -> float:
 @command_line("late_anchor")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p = command_parser(__doc__, artifacts=True)
     p.add_argument("--rounds", type=int, default=40, metavar="N", help="generations of every variant (default: 40)")
     p.add_argument("--alone", type=float, default=10.0, metavar="S", help="ticks alone, before and after (default: 10)")
-    p.add_argument("--json", metavar="FILE|-", help="write every sample as JSON")
     args = p.parse_args(argv)
     try:
         if args.rounds < 1 or not 1 <= args.alone <= 600:
@@ -223,8 +220,7 @@ def main(argv: list[str] | None = None) -> int:
         result = run(load_artifacts(args.artifacts), args.rounds, args.alone)
         write_result(args.json, result)
     except (ArtifactError, OSError) as error:
-        sys.stderr.write(f"late_anchor: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("late_anchor", error)
     if args.json != "-":
         print(report(result))
     return EXIT_DONE

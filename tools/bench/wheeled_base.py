@@ -10,7 +10,6 @@ buys (every repeat is kept). Exit codes: 0 done, 1 a row is not within its bound
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import sys
@@ -23,8 +22,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.robots.carter.wheel_odometry import WheelCalibration
+from tools.bench import bad_input, command_parser
 from tools.bench.sim.wheeled_course import World, forward_mps
 
 Row = dict[str, object]
@@ -159,11 +159,10 @@ def run(rate_hz: int, minutes: float, repeats: int) -> dict[str, list[Row]]:
 @command_line("wheeled_base")
 def main(argv: list[str] | None = None) -> int:
     """Command line; see the module's page for the exit codes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--rate", type=int, default=BENCHMARK_HZ, metavar="HZ", help="of the physics (default 240)")
     parser.add_argument("--minutes", type=float, default=30.0, metavar="N", help="of random commands (default 30)")
     parser.add_argument("--repeats", type=int, default=5, metavar="N", help="of the speed (default 5)")
-    parser.add_argument("--json", metavar="FILE|-", help="write all rows as JSON")
     args = parser.parse_args(argv)
     try:
         if not 200 <= args.rate <= 1000:
@@ -176,8 +175,7 @@ def main(argv: list[str] | None = None) -> int:
         rows = run(args.rate, args.minutes, args.repeats)
         write_result(args.json, {"rate_hz": args.rate, **rows})
     except (ValueError, OSError) as error:
-        sys.stderr.write(f"wheeled_base: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("wheeled_base", error)
     bad = 0
     for part, found in rows.items():
         for row in found:

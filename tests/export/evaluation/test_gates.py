@@ -46,15 +46,6 @@ def test_the_same_outputs_are_exactly_the_same() -> None:
     assert found.min_difference > 0
 
 
-def test_the_worst_input_counts() -> None:
-    worst_one = samples()[1].feeds["x"]
-
-    def run(feeds: Arrays) -> Arrays:
-        return {"visual_tokens": 2 * feeds["x"] + (0.5 if np.array_equal(feeds["x"], worst_one) else 0)}
-
-    assert compare("vision_encoder", samples(), run).max_abs == pytest.approx(0.5)
-
-
 def test_the_share_of_equal_tokens_is_counted_over_all_inputs() -> None:
     expected = [tokens([[0, 1]]), tokens([[1, 0]]), tokens([[0, 3]]), tokens([[5, 0]])]
     answers = iter([[[0.0, 2.0]], [[1.0, 0.1]], [[9.0, 3.0]], [[5.0, 0.0]]])
@@ -88,16 +79,6 @@ def test_one_input_is_not_enough_for_the_negative_control() -> None:
 
 
 # ---- what it is held to
-
-
-def test_a_threshold_itself_still_passes() -> None:
-    edge = ParityResult(inputs=2, cosine=0.999, max_abs=0.1, min_difference=1e-3, top1=0.9)
-    assert (
-        judge(
-            edge, replace(STEADY, waypoint_cm=2, heading_deg=1, speed_mps=0.05, turn_radps=0.1), GATE, TASK_GATE
-        ).level
-        == "PASS"
-    )
 
 
 @pytest.mark.parametrize(
@@ -176,10 +157,6 @@ def test_plans_that_do_not_follow_the_semantic_state_warn_that_the_task_cannot_t
     verdict = judge(GOOD, replace(STEADY, semantic=semantic), GATE, TASK_GATE)
     assert verdict.level == "WARN"
     assert "hardly follow the semantic state" in verdict.reasons[0]
-
-
-def test_a_graph_without_tokens_or_task_is_held_to_the_rest() -> None:
-    assert judge(replace(GOOD, top1=None), None, GATE, TASK_GATE) == Verdict("PASS")
 
 
 def test_thresholds_that_a_target_does_not_give_do_not_judge() -> None:

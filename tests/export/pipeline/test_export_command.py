@@ -76,19 +76,6 @@ def test_a_plan_that_does_not_fit_is_refused_before_anything_is_built(
 
 
 @pytest.mark.slow
-def test_the_result_has_the_keys_that_other_tools_read(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--out", str(tmp_path / "nano"), "--json", "-"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert {"target", "model", "graphs", "plan", "peak_rss_bytes", "wall_s"} <= set(result)
-    for graph in result["graphs"].values():
-        assert {"params", "bytes", "precision", "parity"} <= set(graph)
-        assert {"cosine", "max_abs", "verdict"} <= set(graph["parity"])
-    assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(result["plan"])
-
-
-@pytest.mark.slow
 def test_a_precision_that_is_asked_for_ships_although_the_target_leaves_a_choice(tmp_path: Path) -> None:
     out = tmp_path / "nano"
     choice = ["--set", "graphs.vision_encoder.candidates=fp32,int8"]

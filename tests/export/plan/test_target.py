@@ -158,16 +158,6 @@ def test_a_budget_cannot_be_planned_for_without_the_power_of_every_mode() -> Non
         parse_target(edited(lambda t: t["power"]["modes"]["15W"].pop("busy_w"), "orin"), "x.toml")
 
 
-def test_a_provider_is_not_given_a_precision_that_it_has_no_kernel_for() -> None:
-    with pytest.raises(TargetError, match="TensorrtExecutionProvider has no kernel for precision 'int4-b32'"):
-        with_settings(load_target("orin"), ["graphs.action_expert.precision=int4-b32"])
-
-
-def test_a_provider_is_not_given_a_form_that_it_cannot_read() -> None:
-    with pytest.raises(TargetError, match="TensorrtExecutionProvider takes plain"):
-        with_settings(load_target("orin"), ["graphs.action_expert.form=fused"])
-
-
 def test_settings_are_typed_by_their_field() -> None:
     target = with_settings(
         load_target("orin"),
@@ -239,14 +229,15 @@ def test_a_wrong_setting_is_refused_with_one_line_and_near_names(setting: str, l
     assert "\n" not in str(refusal.value)
 
 
-def test_an_engine_gets_a_profile_for_every_free_axis() -> None:
+def test_an_engine_gets_a_profile_for_every_free_axis_and_only_what_it_can_run() -> None:
     inputs = [{"name": "context_keys", "shape": [6, 8, 64, "T"]}, {"name": "state", "shape": [1, 3]}]
     session = load_target("orin").session("action_expert", inputs)
     assert session["engine"] is True
     assert session["options"]["trt_profile_min_shapes"] == "context_keys:6x8x64x1"
     assert session["options"]["trt_profile_max_shapes"] == "context_keys:6x8x64x1536"
-
-
-def test_an_engine_without_a_profile_for_a_free_axis_is_refused() -> None:
     with pytest.raises(TargetError, match=r"graphs.action_expert.profile.S is missing"):
         load_target("orin").session("action_expert", [{"name": "ids", "shape": [1, "S"]}])
+    with pytest.raises(TargetError, match="TensorrtExecutionProvider has no kernel for precision 'int4-b32'"):
+        with_settings(load_target("orin"), ["graphs.action_expert.precision=int4-b32"])
+    with pytest.raises(TargetError, match="TensorrtExecutionProvider takes plain"):
+        with_settings(load_target("orin"), ["graphs.action_expert.form=fused"])

@@ -54,12 +54,6 @@ def test_a_more_exact_precision_is_closer_to_the_weights() -> None:
     assert errors["fp16"] < errors["int8-b32"] < errors["int8-b128"] < errors["int4-b32"] < errors["int4-b128"]
 
 
-def test_large_weights_are_rounded_like_their_rows_alone() -> None:
-    weight = normal(5000, 40)
-    whole = quantise_blocks(weight, "int4-b32")
-    assert np.array_equal(whole.dequantised()[4500:], quantise_blocks(weight[4500:], "int4-b32").dequantised())
-
-
 @pytest.mark.parametrize("precision", BLOCKED)
 def test_the_runtimes_kernel_multiplies_with_the_weights_that_rounding_names(precision: str) -> None:
     weight, x = normal(24, 200), normal(3, 200)

@@ -25,8 +25,9 @@ class WorkerError(RuntimeError):
 
 
 def worker_command(python: Path, stack: str) -> list[str]:
-    """Command of a stack's worker under an interpreter."""
-    return [str(python), "-m", f"tools.bench.peers.workers.{stack}_worker"]
+    """Command of a stack's worker under an interpreter; one worker serves a runtime and its GenAI pipeline."""
+    module = {"genai": "onnxruntime", "openvino_genai": "openvino"}.get(stack, stack)
+    return [str(python), "-m", f"tools.bench.peers.workers.{module}_worker", stack]
 
 
 @dataclass
