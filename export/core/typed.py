@@ -5,10 +5,18 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import sys
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["FieldError", "build", "convert", "field_types", "from_text", "near", "plain", "tomllib"]
 
 T = TypeVar("T")
 
@@ -66,7 +74,7 @@ def convert(kind: object, value: object, where: str) -> Any:
         matching = [option for option in options if type(value) is option]
         if matching:
             return value
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {value!r}")
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else build(kind, value, where)
     if origin is tuple:
@@ -84,7 +92,7 @@ def convert(kind: object, value: object, where: str) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**53 else math.inf
     if type(value) is not kind or (kind is float and not math.isfinite(typing.cast(float, value))):
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {value!r}")
     return value
 
 
@@ -101,7 +109,7 @@ def from_text(kind: object, text: str, where: str) -> Any:
             except FieldError:
                 if option is options[-1] and len(options) == 1:
                     raise
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {text!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {text!r}")
     if origin is tuple:
         # "24,48" and "[24, 48]" are the same list.
         parts = text.strip().removeprefix("[").removesuffix("]").split(",")
@@ -114,18 +122,18 @@ def from_text(kind: object, text: str, where: str) -> Any:
         try:
             return kind(text)
         except ValueError:
-            raise FieldError(f"{where}: expected {kind_name(kind)}, found {text!r}") from None
+            raise FieldError(f"{where}: expected {_kind_name(kind)}, found {text!r}") from None
     if kind is str:
         return text
     raise FieldError(f"{where}: is a table; name one of its keys")
 
 
-def kind_name(kind: object) -> str:
-    """A type in words."""
+def _kind_name(kind: object) -> str:
+    """A type as an error names it."""
     names = {str: "a text", int: "a whole number", float: "a finite number", bool: "true or false"}
     if kind in names:
         return names[kind]
-    return " or ".join(kind_name(option) for option in typing.get_args(kind) if option is not type(None)) or str(kind)
+    return " or ".join(_kind_name(option) for option in typing.get_args(kind) if option is not type(None)) or str(kind)
 
 
 def plain(value: object) -> Any:

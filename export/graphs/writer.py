@@ -200,7 +200,12 @@ class GraphWriter:
         if precision == "int8" and not self.fused:
             return self._static_int8(x, layer, weight, bias, self._ranges.get(of or layer))
         if precision == "int8":
-            return self.from_float32(self._dynamic_int8(self.in_float32(x), layer, weight, bias))
+            q = quantise_channels(weight)
+            inputs = [self.in_float32(x), self.weight(q.values.T, f"{layer}.weight")]
+            inputs += [self.weight(q.scales, f"{layer}.scale")]
+            if bias is not None:
+                inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
+            return self.from_float32(self.op("DynamicQuantizeMatMul", inputs, contrib=True))
         if precision == "fp32":
             y = self.op("MatMul", [self.in_float32(x), self.stored(weight.T, f"{layer}.weight", precision)])
             if bias is not None:
@@ -226,13 +231,6 @@ class GraphWriter:
             return self.weight(value.astype(np.float32), name)
         half = self.weight(value.astype(np.float16), name)
         return half if self.half else self.cast(half, TensorProto.FLOAT)
-
-    def _dynamic_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
-        q = quantise_channels(weight)
-        inputs = [x, self.weight(q.values.T, f"{layer}.weight"), self.weight(q.scales, f"{layer}.scale")]
-        if bias is not None:
-            inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
-        return self.op("DynamicQuantizeMatMul", inputs, contrib=True)
 
     def _static_int8(self, x: str, layer: str, weight: Array, bias: Array | None, largest: float | None) -> str:
         """Quantise-dequantise around a product, in the one form that compilers turn into 8-bit kernels.

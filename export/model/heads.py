@@ -1,17 +1,14 @@
 """The two other ways to make a chunk of actions that the paper compares (appendix D, Table 11): denoise it, or flow it.
 
-Both work on actions normalised by each step's own mean and deviation over the data set, which are stored with the
-weights. An *action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the
-parameterisation `offsets`, a position and an increment of the heading.
+Both work on actions normalised by each step's own mean and deviation over the data set, stored with the weights. An
+*action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the parameterisation
+`offsets`, a position and an increment of the heading.
 
-What they start from at inference, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
-function of its inputs, the same on every machine, and a graph is the same bytes when it is written again. Every tick
-takes the same point of the learned distribution: where two ways are as good, ticks do not alternate between them, and
-no chance is left in driving.
+What inference starts from, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
+function of its inputs, a graph is the same bytes when written again, and ticks do not alternate between two equal ways.
 
-* Diffusion: one Gaussian sample, drawn from the seed of the weights. Whatever is particular to it, every tick repeats;
-  but zero would be worse: the denoiser is trained on noise of its full length and never sees an input without any.
-* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned: nothing to repeat.
+* Diffusion: one Gaussian sample of the weights' seed, since the denoiser never sees an input without noise.
+* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned.
 """
 
 from __future__ import annotations

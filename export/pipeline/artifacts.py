@@ -14,6 +14,7 @@ from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
 from edge.artifacts.manifest import load_artifacts
+from export.checkpoint.tokenizer import ID_FIELDS
 from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
 from export.evaluation.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
@@ -27,6 +28,7 @@ from reporting.build_progress import Progress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
+RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
 SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2)
 """Schemas whose directories an export replaces."""
@@ -46,16 +48,8 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "frame_offsets_s": list(policy.frame_offsets_s),
         "tick_period_ms": policy.tick_period_ms,
         "step_s": config.action.step_s,
-        "im_start_id": language.im_start_id,
-        "im_end_id": language.im_end_id,
-        "img_start_id": language.img_start_id,
-        "img_end_id": language.img_end_id,
-        "img_context_id": language.img_context_id,
-        "control_cores": list(policy.control_cores),
-        "reasoning_cores": list(policy.reasoning_cores),
-        "control_priority": policy.control_priority,
-        "decoding": policy.decoding,
-        "recovery": policy.recovery,
+        **{key: getattr(language, key) for key in ID_FIELDS},
+        **{key: getattr(policy, key) for key in RUNNER_KEYS},
     }
 
 

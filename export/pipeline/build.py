@@ -109,18 +109,16 @@ def machine_name() -> str:
 
 def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True) -> list[Stage]:
     """All stages in their order (without those that write graphs), with the seconds they took last time or usually."""
-    column = int(is_large(job.config))
-    names = ["weights", "task reference"]
-    names += [f"reference {graph}" for graph in job.target.graph_names]
-    searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
-    names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
+    column, order = int(is_large(job.config)), job.target.graph_names
+    searched = [graph for graph in order if len(job.target.graphs[graph].candidates) > 1]
+    names = ["weights", "task reference", *(f"reference {graph}" for graph in order)]
+    names += [f"precision {graph}" for graph in searched]
     if graphs:
         vision = job.target.graphs["vision_encoder"]
         if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
             names += ["activation ranges"]
-    names += [
-        f"{kind} {graph}" for kind in (("graph", "gate") if graphs else ("gate",)) for graph in job.target.graph_names
-    ]
+        names += [f"graph {graph}" for graph in order]
+    names += [f"gate {graph}" for graph in order]
     names += ["plan and report"] if graphs else []
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]

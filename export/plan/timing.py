@@ -20,7 +20,7 @@ from export.plan.cost import (
 )
 from export.quantize.precision import Precision
 from export.targets.file import Target
-from export.targets.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured, Provider
+from export.targets.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured
 
 GIB = 1 << 30
 TICK_STAGES = ("vision_encoder", "action_expert")
@@ -135,7 +135,8 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     per = calls if stage == "decode" else 1  # a decode point is per token, any other for the whole stage
     where = f"measured on {point.machine}, {point.date}"
     same_chunks = point.chunk_tokens is None or point.chunk_tokens == work.chunk_tokens
-    timed = _timed(config, stage)
+    # Points name a model, and its action expert was measured with the query head.
+    timed = replace(config, action=replace(config.action, head="query")) if stage == "action_expert" else config
     if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks and timed == config:
         whole = Estimate(measured_ms * per, point.error, MEASURED, where)
         # Only the whole was measured: its longest call is the model's share of it.
@@ -153,13 +154,6 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     ]
     energy_j = None if point.energy_j is None else point.energy_j * scaled[0].ms / measured_ms
     return replace(modelled, whole=scaled[0], each=scaled[1], energy_j=energy_j)
-
-
-def _timed(config: TicVlaConfig, stage: str) -> TicVlaConfig:
-    """What a stage's measurements are of: points name a model, and its action expert was measured with queries."""
-    if stage != "action_expert":
-        return config
-    return replace(config, action=replace(config.action, head="query"))
 
 
 def _length(stage: str, work: Work) -> int:
@@ -228,7 +222,9 @@ def _call_ms(
     """Time of one call in ms, its relative error, and what bounds it."""
     provider, roofline, mode = target.provider(graph), target.roofline, target.power.selected
     efficiency = roofline.compute_efficiency[stage]
-    cores = _cores_share(target, graph, provider)
+    cores = 1.0  # share of the processor
+    if provider.uses_cores:
+        cores = min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
     work = [(provider.compute.attention, call.attention_flops)]
     for name, flops in call.linear_flops(precision).items():
         roof = provider.compute.roof(name)
@@ -254,12 +250,6 @@ def _call_ms(
     whole = ms + overhead.value
     spread = ms * (error or 0.0) + overhead.value * (overhead.error or 0.0)
     return whole, spread / whole if spread else None, bound
-
-
-def _cores_share(target: Target, graph: str, provider: Provider) -> float:
-    if not provider.uses_cores:
-        return 1.0
-    return min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
 
 
 def _together(*errors: float | None) -> float | None:

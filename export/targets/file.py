@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
-from export.core.typed import FieldError, build, convert, field_types, from_text, near, plain
+from export.core.typed import FieldError, build, convert, field_types, from_text, near, plain, tomllib
 from export.model.config import MODEL_PREFIX
 from export.quantize.precision import Precision, block_size
 from export.targets.sections import (

@@ -9,18 +9,13 @@ not depend on the trainer's version.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 
+from export.core.typed import tomllib
 from export.model.config import PRESETS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 NANO_TOKENIZER = Path(__file__).with_name("nano_tokenizer.json")
 NANO_WORDS = Path(__file__).with_name("nano_words.toml")
