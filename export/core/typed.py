@@ -16,13 +16,17 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["FieldError", "build", "convert", "field_types", "from_text", "near", "plain", "tomllib"]
+__all__ = ["FieldError", "SettingText", "build", "convert", "field_types", "from_text", "near", "plain", "tomllib"]
 
 T = TypeVar("T")
 
 
 class FieldError(ValueError):
     """A key that is not known, a key that is missing or a value of another type; its text is the one line to show."""
+
+
+class SettingText(str):
+    """A value as the command line gives it; `convert` reads it as its field's type."""
 
 
 def near(name: str, known: typing.Iterable[str]) -> str:
@@ -62,7 +66,10 @@ def build(cls: type[T], content: object, where: str) -> T:
 
 
 def convert(kind: object, value: object, where: str) -> Any:
-    """`value` as the type `kind`; raises FieldError."""
+    """`value` as the type `kind`; raises FieldError. A dataclass may read a setting by a `from_setting` of its own."""
+    if isinstance(value, SettingText):
+        own = [option for option in (kind, *typing.get_args(kind)) if hasattr(option, "from_setting")]
+        value = own[0].from_setting(str(value), where) if own else from_text(kind, str(value), where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         options = [option for option in arguments if option is not type(None)]

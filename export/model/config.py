@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
-from export.core.typed import FieldError, build, field_types, from_text, near
+from export.core.typed import FieldError, SettingText, build, field_types, near
 
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
@@ -318,13 +318,10 @@ def with_overrides(config: TicVlaConfig, overrides: Mapping[str, str]) -> TicVla
     """`config` with fields such as `action.layers` replaced by values written as text; raises ModelConfigError."""
     content = config.to_dict()
     sections = {key: kind for key, kind in field_types(TicVlaConfig).items() if key != "name"}
-    kinds = {f"{section}.{key}": kind for section, cls in sections.items() for key, kind in field_types(cls).items()}
+    names = [f"{section}.{key}" for section, cls in sections.items() for key in field_types(cls)]
     for key, text in overrides.items():
-        if key not in kinds:
-            raise ModelConfigError(f"model.{key} is not a number of the model; {near(key, kinds)}")
+        if key not in names:
+            raise ModelConfigError(f"model.{key} is not a number of the model; {near(key, names)}")
         section, name = key.split(".")
-        try:
-            content[section][name] = from_text(kinds[key], text, f"model: {key}")
-        except FieldError as error:
-            raise ModelConfigError(str(error)) from error
+        content[section][name] = SettingText(text)
     return config_from_dict(content)

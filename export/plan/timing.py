@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from edge.artifacts.manifest import LANGUAGE_WHOLE
+from edge.artifacts.manifest import LANGUAGE_WHOLE, Artifacts
 from export.model.config import TicVlaConfig
 from export.plan.cost import (
     DECODE,
@@ -303,4 +305,47 @@ def memory_of(target: Target, config: TicVlaConfig, work: Work, weights: int) ->
         activations=2 * activations,  # both threads run
         workspace=round(workspace * GIB),
         available=round((target.device.memory_gib - target.device.reserved_gib) * GIB),
+    )
+
+
+def measured_point(
+    target: Target,
+    manifest: Mapping[str, Any],
+    artifacts: Artifacts,
+    stage: str,
+    samples: Mapping[str, Any],
+    *,
+    machine: str,
+    date: str,
+    energy_j: float | None = None,
+) -> Measured:
+    """The point of one stage: `samples` has its times in ms (decode: of a token), and `prompt` and `new` tokens.
+
+    `energy_j` is the energy above idle of one such time. Raises TargetError for a time that is no time.
+    """
+    graph = stage_graph(target, stage)
+    policy, times_ms = target.graphs[graph], samples[stage]
+    precision = Precision.from_dict(manifest["graphs"][graph]["precision"])
+    median_ms = statistics.median(times_ms)
+    context = samples["prompt"] + samples["new"]
+    tokens = {"prefill": samples["prompt"], "decode": samples["prompt"] + samples["new"] // 2}.get(stage, context)
+    threads = artifacts.graphs[graph].session.threads or 1
+    return Measured(
+        model=artifacts.model_name,
+        graph=graph,
+        precision=precision.default,
+        overrides=dict(precision.overrides),
+        form=policy.form,
+        provider=policy.provider,
+        machine=machine,
+        date=date,
+        ms=None if stage == "decode" else round(median_ms, 3),
+        tokens_per_s=round(1000 / median_ms, 2) if stage == "decode" else None,
+        tokens=None if stage == "vision_encoder" else tokens,
+        chunk_tokens=artifacts.runtime.prefill_chunk_tokens if stage == "prefill" else None,
+        threads=threads if target.providers[policy.provider].uses_cores else None,
+        mode=target.power.mode,
+        # Half the spread of the samples: what a repetition may differ by, not what another machine does.
+        error=round(min(0.99, (max(times_ms) - min(times_ms)) / 2 / median_ms), 3),
+        energy_j=None if energy_j is None else round(energy_j, 6),
     )

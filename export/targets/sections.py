@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from edge.state.switches import Decoding, RecoverySwitch
-from export.core.typed import near
+from export.core.typed import from_text, near
 from export.quantize.precision import PRECISIONS, Precision, block_size
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
@@ -46,6 +46,11 @@ class Figure:
     tag: str = MODELLED
     error: float | None = None
     """Half width of the error bar as a fraction of the value; None: the source gives none."""
+
+    @classmethod
+    def from_setting(cls, text: str, where: str) -> Figure:
+        """A number of the command line; raises FieldError."""
+        return cls(from_text(float, text, where), "set on the command line")
 
     def __post_init__(self) -> None:
         _require(0 <= self.value < 1e9, f"value {self.value} must be between 0 and 1e9")
