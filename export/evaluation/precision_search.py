@@ -51,13 +51,8 @@ class Limits:
 
     def load(self, reading: Reading, *, trained: bool) -> float:
         """The largest of the reading's figures as a share of its limit; at most 1 is within the limits."""
-        shares = [
-            reading.waypoint_cm / self.waypoint_cm,
-            reading.heading_deg / self.heading_deg,
-            reading.speed_mps / self.speed_mps,
-            reading.turn_radps / self.turn_radps,
-            reading.relative / self.relative,
-        ]
+        names = ("waypoint_cm", "heading_deg", "speed_mps", "turn_radps", "relative")
+        shares: list[float] = [getattr(reading, name) / getattr(self, name) for name in names]
         if trained and self.top1 is not None and reading.top1 is not None:
             shares.append((1 - reading.top1) / max(1 - self.top1, 1e-9))
         if self.output_error is not None:

@@ -147,19 +147,17 @@ def run_stages(
         last_layer_kv, ids = stages.language(prompt_parts(sample, visual), new_tokens)
         kv.append(last_layer_kv)
         token_ids.append(ids)
-    contexts = [moment_contexts(stages.context, s, x) for s, x in zip(samples.samples, kv, strict=True)]
-    others = [*samples.samples[1:], samples.samples[0]]
-    swapped = [
-        moment_contexts(stages.context, replace(s, waypoints=other.waypoints), x)
-        for s, other, x in zip(samples.samples, others, kv[1:] + kv[:1], strict=True)
-    ]
-    return StageOutputs(
-        tuple(visual),
-        tuple(kv),
-        tuple(token_ids),
-        tuple(plan(stages.act, s, visual, c) for s, c in zip(samples.samples, contexts, strict=True)),
-        tuple(plan(stages.act, s, visual, c) for s, c in zip(samples.samples, swapped, strict=True)),
-    )
+
+    def plans(waypoints: Sequence[Sample], guidance: Sequence[Floats]) -> tuple[Floats, ...]:
+        found = []
+        for sample, other, x in zip(samples.samples, waypoints, guidance, strict=True):
+            contexts = moment_contexts(stages.context, replace(sample, waypoints=other.waypoints), x)
+            found.append(plan(stages.act, sample, visual, contexts))
+        return tuple(found)
+
+    own = plans(samples.samples, kv)
+    swapped = plans([*samples.samples[1:], samples.samples[0]], kv[1:] + kv[:1])
+    return StageOutputs(tuple(visual), tuple(kv), tuple(token_ids), own, swapped)
 
 
 def prompt_parts(sample: Sample, visual: Visual) -> list[Segment]:

@@ -196,27 +196,6 @@ class ActionExpert(nn.Module):
             actions = self.scale(clean)
         return integrated(actions, self.config.action.parameterisation)
 
-    def loss(
-        self,
-        visual_tokens: Tensor,
-        state: Tensor,
-        latency: Tensor,
-        context_keys: Tensor,
-        context_values: Tensor,
-        target: Tensor,
-        mask: Tensor | None = None,
-        generator: torch.Generator | None = None,
-        *,
-        context_mask: Tensor | None = None,
-    ) -> Tensor:
-        """Mean of `errors` over the steps that `mask` [B, steps] does not leave out; inputs as of `forward`."""
-        now = self.now_tokens(visual_tokens, state, latency, generator)
-        errors = self.errors(self.trunk(now, context_keys, context_values, context_mask), target, generator)
-        if mask is None:
-            return errors.mean()
-        known = mask.to(errors.dtype)[..., None]
-        return (errors * known).sum() / (3 * known.sum()).clamp(min=1)
-
     def errors(self, trunk: TrunkLayers, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """What training makes small, number by number [B, steps, 3], for driven trajectories `target` [B, steps, 3].
 

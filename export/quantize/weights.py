@@ -104,14 +104,3 @@ def _error(x: Floats, codes: Floats, scale: Floats) -> Floats:
     residual = x - codes * scale
     total: Floats = np.einsum("rcb,rcb->rc", residual, residual)[:, :, None]
     return total
-
-
-def rounded(weight: Floats, precision: str) -> Floats:
-    """Weights [out, in] as a kernel of that precision sees them (activations are not touched)."""
-    if precision == "fp32":
-        return weight
-    if precision == "fp16":
-        return weight.astype(np.float16).astype(np.float32)
-    if precision == "int8":
-        return quantise_channels(weight).dequantised()
-    return quantise_blocks(weight, precision).dequantised()

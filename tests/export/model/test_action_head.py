@@ -146,14 +146,15 @@ def test_instants_in_a_row_may_share_a_state(head: str) -> None:
 # Losses
 
 
-def loss(
-    action: ActionExpert,
-    generator: torch.Generator | None = None,
-    target: Tensor | None = None,
-    mask: Tensor | None = None,
+def errors(
+    action: ActionExpert, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    keys, values = action.context(states(3, 6), generator)
-    return action.loss(*instants(3), keys, values, drives(3) if target is None else target, mask, generator)
+    keys, values = action.context(kv, generator)
+    return action.errors(action.trunk(action.now_tokens(*inputs, generator), keys, values), target, generator)
+
+
+def loss(action: ActionExpert, generator: torch.Generator | None = None, target: Tensor | None = None) -> Tensor:
+    return errors(action, instants(3), states(3, 6), drives(3) if target is None else target, generator).mean()
 
 
 def test_the_query_heads_loss_is_equation_4() -> None:
@@ -170,18 +171,6 @@ def test_a_whole_turn_more_is_the_same_heading(head: str) -> None:
     with torch.no_grad():
         a, b = (loss(action, seeded(1), target) for target in (drives(3), turned))
     assert float(a) == pytest.approx(float(b), rel=1e-3)
-
-
-@pytest.mark.parametrize("head", HEADS)
-def test_steps_that_are_not_known_do_not_count(head: str) -> None:
-    action = expert(head)
-    mask = torch.arange(11)[None] < torch.tensor([[11], [4], [7]])
-    with torch.no_grad():
-        trunk = action.trunk(action.now_tokens(*instants(3)), *action.context(states(3, 6)))
-        errors = action.errors(trunk, drives(3), seeded(2))
-        masked = loss(action, seeded(2), mask=mask)
-    assert errors.shape == (3, 11, 3)
-    assert float(masked) == pytest.approx(float(errors[mask].mean()), rel=1e-5)
 
 
 @pytest.mark.parametrize("head", HEADS)
@@ -224,8 +213,7 @@ def trained(head: str, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor) -
     generator = seeded(0)
     for _ in range(250):
         optimiser.zero_grad()
-        keys, values = action.context(kv)
-        action.loss(*inputs, keys, values, target, generator=generator).backward()
+        errors(action, inputs, kv, target, generator).mean().backward()
         torch.nn.utils.clip_grad_norm_(action.parameters(), 1.0)
         optimiser.step()
     return action

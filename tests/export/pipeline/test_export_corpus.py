@@ -180,7 +180,7 @@ WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
     (["--out", "x", "--set", "turbo=1"], "unknown key 'turbo'"),
     (["--out", "x", "--set", "power.mode"], "expected KEY=VALUE"),
     (["--out", "x", "--set", "runtime.tick_period_ms=soon"], "tick_period_ms"),
-    (["--out", "x", "--set", "model.action.layers=none"], "action.layers"),
+    (["--out", "x", "--set", "model.action.layers=none"], "action: layers"),
     (["--out", "x", "--set", "model.action.wheels=4"], "action.wheels is not a number of the model"),
     (["--out", "x", "--set", "model.language.max_context=128"], "exceeds the context"),
     (["--out", "x", "--cache-gb", "0"], "--cache-gb 0: expected a size above 0"),
