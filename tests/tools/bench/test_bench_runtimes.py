@@ -9,12 +9,20 @@ from pathlib import Path
 import pytest
 
 from tools.bench import runtimes
-from tools.bench.peers.contenders import CONTENDERS, OURS, chosen
+from tools.bench.peers.contenders import (
+    CONTENDERS,
+    OURS,
+    Metric,
+    chosen,
+    judge,
+    judge_all,
+    markdown,
+    paired_ratio,
+    verdict_text,
+)
 from tools.bench.peers.models import prepare
 from tools.bench.peers.models.reference import qwen_name
-from tools.bench.peers.process import MemoryWatch, Worker, WorkerError
-from tools.bench.peers.rounds import FOREIGN_CORES, Round, Sample, busy_s, run_rounds
-from tools.bench.peers.summary import Metric, judge, judge_all, markdown, paired_ratio, verdict_text
+from tools.bench.peers.rounds import FOREIGN_CORES, MemoryWatch, Round, Sample, Worker, WorkerError, busy_s, run_rounds
 from tools.bench.peers.workers.serve import Load
 
 FASTER = Metric("x_ms", "x", "ms", False, 1.5)

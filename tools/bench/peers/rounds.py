@@ -1,15 +1,172 @@
-"""Timed rounds: in each round every contender is asked for every task once, the others idle; foreign load is seen."""
+"""The harness's side: worker processes and their memory, and rounds in which each is asked for every task once.
+
+The others idle meanwhile; foreign load is seen.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from tools.bench.peers.process import Worker, WorkerError
+ROOT = Path(__file__).parents[3]
+"""The folder that holds the packages `tools` and `export`, which workers import by name."""
+
+END_S = 10.0
+SAMPLE_S = 0.02
+
+
+class WorkerError(RuntimeError):
+    """A worker that refused, failed or died; the text is one line."""
+
+
+def worker_command(python: Path, stack: str) -> list[str]:
+    """Command of a stack's worker under an interpreter; one worker serves a runtime and its GenAI pipeline."""
+    module = {"genai": "onnxruntime", "openvino_genai": "openvino"}.get(stack, stack)
+    return [str(python), "-m", f"tools.bench.peers.workers.{module}_worker", stack]
+
+
+@dataclass
+class Worker:
+    """One contender's process, pinned to `cores`; idle unless it is asked something."""
+
+    name: str
+    command: Sequence[str]
+    cores: frozenset[int]
+    log: Path
+    _process: subprocess.Popen[str] = field(init=False)
+    _stream: IO[bytes] = field(init=False)
+
+    def __enter__(self) -> Worker:
+        threads = str(len(self.cores))
+        env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+        self._stream = self.log.open("wb")
+        before = os.sched_getaffinity(0)
+        # A child inherits the affinity; its libraries count the cores when they are loaded.
+        os.sched_setaffinity(0, self.cores)
+        try:
+            self._process = subprocess.Popen(
+                list(self.command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._stream,
+                text=True,
+                env=env,
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._stream.close()
+            raise WorkerError(f"{self.name}: cannot start {self.command[0]} ({error.strerror})") from error
+        finally:
+            os.sched_setaffinity(0, before)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._send({"end": True})
+            self._process.wait(END_S)
+        except (WorkerError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout, self._stream):
+            if stream is not None:
+                with suppress(BrokenPipeError):  # what a dead worker was never told
+                    stream.close()
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def _send(self, message: Mapping[str, object]) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(message) + "\n")
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:
+            raise WorkerError(f"{self.name}: the worker is gone; its log: {self.log}") from error
+
+    def ask(self, message: Mapping[str, object]) -> dict[str, Any]:
+        """Send a message and wait for its answer; raises WorkerError."""
+        self._send(message)
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            code = self._process.wait()
+            raise WorkerError(f"{self.name}: the worker ended with code {code}; its log: {self.log}")
+        try:
+            answer: dict[str, Any] = json.loads(line)
+        except ValueError as error:
+            raise WorkerError(f"{self.name}: not an answer: {line[:80]!r}") from error
+        if not answer.pop("ok", False):
+            raise WorkerError(f"{self.name}: {answer.get('error', 'refused without a reason')}; its log: {self.log}")
+        return answer
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Largest memory of a process, MB (10⁶ bytes)."""
+
+    rss_mb: float
+    """All resident pages, mapped weight files included (the kernel's own high-water mark)."""
+    pss_mb: float
+    """The same with shared pages divided by their users (sampled)."""
+    anon_mb: float
+    """Only what is not a copy of a file and could not be dropped (sampled)."""
+
+
+def _kib(text: str, key: str) -> int:
+    line = next((row for row in text.splitlines() if row.startswith(key + ":")), None)
+    if line is None:
+        raise WorkerError(f"/proc has no {key} on this kernel")
+    return int(line.split()[1])
+
+
+class MemoryWatch:
+    """Samples a process's memory in a thread of this process until the block is left."""
+
+    def __init__(self, pid: int) -> None:
+        self._folder = Path("/proc") / str(pid)
+        self._pss_kib = self._anon_kib = 0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> MemoryWatch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._done.is_set():
+            try:
+                self._sample()
+            except (OSError, WorkerError):
+                return  # the process is gone; `peak` says so
+            time.sleep(SAMPLE_S)
+
+    def _sample(self) -> None:
+        self._anon_kib = max(self._anon_kib, _kib((self._folder / "status").read_text(), "RssAnon"))
+        self._pss_kib = max(self._pss_kib, _kib((self._folder / "smaps_rollup").read_text(), "Pss"))
+
+    def peak(self) -> Peak:
+        """The peaks until now; raises WorkerError when the process is gone."""
+        try:
+            self._sample()
+            rss_kib = _kib((self._folder / "status").read_text(), "VmHWM")
+        except OSError as error:
+            raise WorkerError(f"{self._folder}: the worker is gone") from error
+        return Peak(*(round(kib * 1024 / 1e6, 1) for kib in (rss_kib, self._pss_kib, self._anon_kib)))
+
 
 CALLS = {"action": 20}
 """Calls of a sample where one takes milliseconds; the sample is their median."""
