@@ -183,7 +183,7 @@ def _read(top: _Section, directory: Path, ours: LanguageConfig, vision: _Section
         rms_eps=text.number("rms_norm_eps", float, 1e-6),
         token_merge=1,
     )
-    # transformers ties InternVL's head unless told not to; OpenGVLab's Qwen2 does not unless told to.
+    # By default transformers ties InternVL's head and OpenGVLab's Qwen2 does not.
     tied = top.content.get("tie_word_embeddings", content.get("tie_word_embeddings", "text_config" in top.content))
     ratio = top.number("downsample_ratio", float, 0.5)
     if ratio <= 0 or (1 / ratio) != round(1 / ratio):

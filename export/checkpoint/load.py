@@ -137,7 +137,7 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
 
 
 def _check_own_config(source: Source, config: TicVlaConfig) -> None:
-    """A file of ours says which network it was made for: another one is refused even where all shapes fit."""
+    """A file of ours names its network: another one is refused even where all shapes fit."""
     written = source.metadata.get("format", "")
     if written.split("/")[0] != FORMAT.split("/")[0]:
         return
@@ -165,9 +165,9 @@ def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config:
     for source in sources:
         matches = find_layouts(source.tensors, wanted, config)
         if not matches:
-            shown = ", ".join(list(source.tensors)[:3]) or "no tensors"
+            names = ", ".join(list(source.tensors)[:3]) or "no tensors"
             raise CheckpointError(
-                f"{source.label}: tensors of no layout that is known ({shown}); expected InternVL, InternVL-hf or "
+                f"{source.label}: tensors of no layout that is known ({names}); expected InternVL, InternVL-hf or "
                 f"{FORMAT} names"
             )
         used: set[str] = set()
@@ -256,7 +256,7 @@ def _read(model: TicVla, plan: _Plan) -> None:
 
 
 def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
-    """Origin by file name and hash; trained unless a file of ours or a seed says otherwise."""
+    """Origin by file name and hash; untrained by the metadata of a file of ours or by a seed."""
     parts = []
     for source in sources:
         origin = source.metadata.get("origin", "")

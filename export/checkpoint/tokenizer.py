@@ -1,4 +1,4 @@
-"""Which tokenizer an artifact directory gets, and whether it says what the network's token ids mean."""
+"""Which tokenizer an artifact directory gets, checked against the network's token ids."""
 
 from __future__ import annotations
 

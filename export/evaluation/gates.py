@@ -43,7 +43,7 @@ PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
 
 
 class GateError(Exception):
-    """A graph that is not the same model; its text says which and by how much."""
+    """A graph that is not the same model; its text names it and the numbers."""
 
 
 @dataclass(frozen=True)

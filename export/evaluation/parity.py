@@ -70,7 +70,7 @@ def compare(graph: str, samples: Sequence[Sample], run: RunGraph) -> ParityResul
             if not expected.size:
                 continue
             if name == "next_token":
-                # An index has no cosine. Where there are logits they tell more than the one that won.
+                # An index has no cosine. Where there are logits, they are compared instead.
                 if "logits" not in sample.expected:
                     same, tokens = same + int(np.sum(expected == actual)), tokens + expected.size
                 continue

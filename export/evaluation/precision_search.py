@@ -1,4 +1,4 @@
-"""Chooses every graph's precision by what rounding does to the robot's plan, and says why in one sentence.
+"""Chooses every graph's precision by what rounding does to the robot's plan, with the reason in one sentence.
 
 From the smallest candidate up, the first whose task error stays within the limits is taken; its most sensitive groups
 of layers are raised to the next more exact candidate where that is enough. Nothing here is timed: the same inputs give

@@ -298,5 +298,5 @@ def _share(value: float, of: float) -> float:
 
 
 def short(value: float, digits: int = 4) -> float:
-    """The value with that many significant digits: more say nothing, and would differ between machines."""
+    """The value with that many significant digits: more are noise and would differ between machines."""
     return float(f"{float(value):.{digits}g}")

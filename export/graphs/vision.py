@@ -67,7 +67,7 @@ def _patches(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
 def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
     """Stride-2 convolutions; only the deviation folds into them, because their padding is at the mean colour."""
     c = vision.config
-    # As exact as the graph's default says, like the products: no override names a convolution.
+    # As exact as the graph's default, like the products: no override names a convolution.
     exact = g.precision.default == "fp32"
     kind = np.dtype(np.float32) if exact else g.float
     bits = "fp16" if g.precision.default == "fp16" or (g.half and not exact) else "fp32"

@@ -112,7 +112,7 @@ class ActionExpert(nn.Module):
         """Last-layer K‖V [B, T, kv_dim], or waypoints [B, 3, 2] in m in the current robot frame → [B, T, hidden].
 
         States of different lengths are padded on the left: a token's place is counted from the end, where the answer's
-        last line, the waypoints, always stands. In training, `generator` (else torch's own) says what is dropped out.
+        last line, the waypoints, always stands. In training, `generator` (else torch's own) draws what is dropped out.
         """
         interface = self.config.action.semantic_interface
         if interface == "values-only":

@@ -205,7 +205,7 @@ class Coupling(nn.Module):
 class Flow(nn.Module):
     """Normalising flow of couplings, which move even and odd steps in turn (even steps first and last of five).
 
-    Neighbouring steps say nearly everything about one another, which is what a coupling can use.
+    Neighbouring steps determine one another nearly completely, which a coupling can use.
     """
 
     noise: Tensor

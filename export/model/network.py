@@ -118,7 +118,7 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
                 if module.bias is not None:
                     module.bias.zero_()
             elif isinstance(module, nn.Linear):
-                # What a head gives starts near zero; `ActionExpert.start` says around what.
+                # Outputs of a head start near zero; `ActionExpert.start` sets their centre.
                 ends = name.startswith("action.") and name.endswith(".out")
                 std = HEAD_STD if ends else max(INIT_STD, module.in_features**-0.5)
                 module.weight.normal_(0.0, std, generator=generator)

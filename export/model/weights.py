@@ -26,7 +26,7 @@ class CheckpointError(WeightsError):
 
 @dataclass(frozen=True)
 class WeightsInfo:
-    """What a weights file says of itself."""
+    """Metadata of a weights file."""
 
     trained: bool
     origin: str

@@ -35,7 +35,7 @@ OLDER_SCHEMAS = (1, 2)
 
 
 def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, object]:
-    """The manifest's `runtime` section; a plan that fits says how many tokens a generation may have."""
+    """The manifest's `runtime` section; a plan that fits limits the tokens of a generation."""
     language, policy = config.language, target.runtime
     planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
     return {
@@ -111,7 +111,7 @@ def check_replaceable(out: Path) -> None:
 
 
 def _files_of(out: Path) -> dict[str, Any]:
-    """The files that a manifest lists, also one of an older schema if they are all there as it says."""
+    """The files that a manifest lists, also one of an older schema if all of them match it."""
     try:
         return dict(read_manifest(out)["files"])
     except ArtifactError:

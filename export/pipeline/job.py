@@ -32,7 +32,7 @@ DEFAULT_SEED = 0
 WHOLLY_RANDOM = re.compile(r"random seed (\d{1,19})")
 FILLED = re.compile(r"(?:^|; )action: random seed (\d{1,19})")
 DIRECTORY_FILES = ("config.json", "tokenizer.json")
-"""What a Hugging Face directory says beside its weights."""
+"""Read from a Hugging Face directory beside its weights."""
 
 
 class WeightSource:
@@ -105,10 +105,10 @@ class Job:
 def job_of(
     directory: Path, checkpoints: Sequence[Path], seed: int | None, calibration: str | None
 ) -> tuple[Job, list[str]]:
-    """The job that a directory's manifest tells of, and notes for the user; raises ArtifactError, WeightsError.
+    """The job of a directory's manifest, and notes for the user; raises ArtifactError, WeightsError.
 
-    Target and network are today's of the names that were asked for, with the `--set` of then: what the manifest says of
-    them vouches for nothing. Weights from files have to be named again: a manifest keeps no paths.
+    Target and network are today's of the names that were asked for, with the `--set` of then: the manifest's own copies
+    vouch for nothing. Weights from files have to be named again: a manifest keeps no paths.
     """
     manifest = read_manifest(directory)
     where = directory / MANIFEST_NAME

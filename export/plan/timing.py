@@ -178,7 +178,7 @@ def _point(target: Target, model: str, graph: str, stage: str, precision: Precis
     """The newest measurement of exactly this, the last one listed among equals."""
     policy = target.graphs[graph]
     threads = policy.threads or 1
-    # A whole language model's points say by their unit which of its two stages they are.
+    # The unit of a whole language model's point tells prefill (ms) from decoding (tokens/s).
     per_token = {"prefill": False, "decode": True}.get(stage)
     found = [
         point

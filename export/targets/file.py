@@ -203,7 +203,7 @@ def parse_target(content: Mapping[str, object], where: str) -> Target:
 
 
 def for_model(target: Target, model: str, where: str | None = None) -> Target:
-    """The target with what its file (`where` in errors) says of that model; raises TargetError."""
+    """The target with what its file (`where` in errors) changes for that model; raises TargetError."""
     changes = target.models.get(model)
     base = {**target.to_dict(), "models": {}}
     if changes is None:

@@ -279,8 +279,8 @@ class TaskGate:
     warn_waypoint_cm: float | None = None
     warn_heading_deg: float | None = None
     relative: float = 1.0
-    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres say
-    little about a model whose plans are short, as those of untrained weights are."""
+    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres
+    mean little for a model whose plans are short, as those of untrained weights are."""
     warn_relative: float = 0.5
     kv_cosine: float = 0.9
     """Least cosine of the semantic state to the exact one."""
@@ -289,8 +289,8 @@ class TaskGate:
     """Least share of the text before the first other token, for trained weights."""
     warn_token_agreement: float = 0.5
     min_semantic: float = 0.01
-    """Least share of the plans' own spread that another semantic state has to move them by: below it, nothing here can
-    tell a language model that works from one that does not."""
+    """Least share of the plans' own spread that another semantic state has to move them by: below it, no figure here
+    separates a language model that works from one that does not."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:

@@ -146,7 +146,7 @@ class Run:
 
 
 def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: bool = True) -> Run:
-    """Drive the governor on the modelled device for that long; `governed` off: nobody reads what it says."""
+    """Drive the governor on the modelled device for that long; `governed` off: its budget is ignored."""
     stages, power = orin()
     budget_w = power.budget_w or math.nan
     factor = load_factor(load, stages, budget_w)

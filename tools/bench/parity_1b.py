@@ -50,7 +50,7 @@ GRAPHS = ("vision_encoder", "language_model")
 
 @dataclass(frozen=True)
 class Work:
-    """What every process is told."""
+    """Arguments of every process."""
 
     directory: Path
     model: str

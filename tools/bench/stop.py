@@ -1,4 +1,4 @@
-"""How soon the robot hears zero velocity when the runner is killed or frozen while it drives.
+"""How soon the robot receives zero velocity when the runner is killed or frozen while it drives.
 
     python -m tools.bench.stop --artifacts out/demo/artifacts --runs 20 --json out/bench/stop.json
 

@@ -1,4 +1,4 @@
-"""The `nano` tokenizer: byte-level BPE trained on the words a navigating robot hears and says.
+"""The `nano` tokenizer: byte-level BPE trained on the words of instructions and reasoning texts.
 
 A word is about one token and a coordinate two, sign and whole metres apart from the tenths, because in so small a model
 every token costs time twice: it is prefilled or decoded, and the action expert reads its keys. `python -m
@@ -31,7 +31,7 @@ PIECES = (
 )
 """What a token is at most (the expression is Oniguruma's); every character is in one piece."""
 FARTHEST_M = 30
-"""Whole metres that are one token; farther ones are told in two or three."""
+"""Whole metres that are one token; farther ones take two or three."""
 
 _SPLIT = pre_tokenizers.Sequence(
     [

@@ -60,7 +60,7 @@ def test_a_chosen_token_alone_counts_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
         ({}, "gives no 'visual_tokens'"),
         ({"visual_tokens": np.zeros((1, 5))}, r"visual_tokens is \[1, 5\], PyTorch gives \[1, 4\]"),
@@ -68,8 +68,8 @@ def test_a_chosen_token_alone_counts_too() -> None:
         ({"visual_tokens": np.full((1, 4), np.inf)}, "not finite"),
     ],
 )
-def test_outputs_that_cannot_be_compared_are_named(answer: Arrays, said: str) -> None:
-    with pytest.raises(ParityError, match=f"vision_encoder: .*{said}"):
+def test_outputs_that_cannot_be_compared_are_named(answer: Arrays, message: str) -> None:
+    with pytest.raises(ParityError, match=f"vision_encoder: .*{message}"):
         compare("vision_encoder", samples(), lambda _: answer)
 
 
@@ -82,7 +82,7 @@ def test_one_input_is_not_enough_for_the_negative_control() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"cosine": 0.98}, "cosine 0.98 (≥ 0.99)"),
         ({"max_abs": 0.2}, "max-abs 0.2 (≤ 0.1)"),
@@ -92,10 +92,10 @@ def test_one_input_is_not_enough_for_the_negative_control() -> None:
         ({"max_abs": float("nan")}, "max-abs nan (≤ 0.1)"),
     ],
 )
-def test_every_tensor_threshold_fails_alone(change: dict[str, float], said: str) -> None:
+def test_every_tensor_threshold_fails_alone(change: dict[str, float], message: str) -> None:
     verdict = judge(replace(GOOD, **change), STEADY, GATE, TASK_GATE)
     assert verdict.level == "FAIL"
-    assert said in verdict.reasons
+    assert message in verdict.reasons
 
 
 def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_model() -> None:
@@ -106,7 +106,7 @@ def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_m
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"waypoint_cm": 6}, "waypoint error in cm 6 (≤ 5)"),
         ({"heading_deg": 3}, "heading error in deg 3 (≤ 2)"),
@@ -119,13 +119,13 @@ def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_m
         ({"token_agreement": 0.0}, "share of the same text 0 (≥ 0.1)"),
     ],
 )
-def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -> None:
+def test_every_task_threshold_fails_alone(change: dict[str, float], message: str) -> None:
     verdict = judge(GOOD, replace(STEADY, **change), GATE, TASK_GATE)
-    assert verdict == Verdict("FAIL", (said,))
+    assert verdict == Verdict("FAIL", (message,))
 
 
 @pytest.mark.parametrize(
-    ("parity", "task", "said"),
+    ("parity", "task", "message"),
     [
         (replace(GOOD, cosine=0.995), STEADY, "cosine 0.995 (≥ 0.999)"),
         (GOOD, replace(STEADY, waypoint_cm=3), "waypoint error in cm 3 (≤ 2)"),
@@ -135,8 +135,8 @@ def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -
         (GOOD, replace(STEADY, token_agreement=0.3), "share of the same text 0.3 (≥ 0.5)"),
     ],
 )
-def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, said: str) -> None:
-    assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (said,))
+def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, message: str) -> None:
+    assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (message,))
 
 
 def test_another_token_from_untrained_weights_only_warns() -> None:

@@ -56,7 +56,7 @@ def test_a_configuration_reads_back_and_one_from_before_there_were_heads_is_the_
 
 
 @pytest.mark.parametrize(
-    ("fields", "says"),
+    ("fields", "message"),
     [
         ({"head": "guess"}, "head 'guess': expected one of"),
         ({"ddim_steps": 101}, "ddim_steps 101 are more than the 100"),
@@ -65,8 +65,8 @@ def test_a_configuration_reads_back_and_one_from_before_there_were_heads_is_the_
         ({"couplings": 0}, "couplings is 0"),
     ],
 )
-def test_a_head_that_cannot_be_is_refused(fields: dict, says: str) -> None:
-    with pytest.raises(ModelConfigError, match=says):
+def test_a_head_that_cannot_be_is_refused(fields: dict, message: str) -> None:
+    with pytest.raises(ModelConfigError, match=message):
         dataclasses.replace(TINY.action, **fields)
 
 

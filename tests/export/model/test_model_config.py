@@ -27,7 +27,7 @@ def test_what_a_file_leaves_out_has_the_size_of_the_paper(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "not JSON"),
         ("[" * 100_000, "not JSON"),
@@ -47,10 +47,10 @@ def test_what_a_file_leaves_out_has_the_size_of_the_paper(tmp_path: Path) -> Non
         ('{"name": "x", "vision": {"token_dim": 64}}', "token_dim 64 must equal"),
     ],
 )
-def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "model.json"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ModelConfigError, match=says) as caught:
+    with pytest.raises(ModelConfigError, match=message) as caught:
         config_from_file(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
@@ -82,7 +82,7 @@ def test_overrides_are_read_as_what_the_field_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "text", "says"),
+    ("key", "text", "message"),
     [
         ("action.layer", "3", "action.layer is not a number of the model; did you mean action.layers"),
         ("name", "x", "name is not a number of the model"),
@@ -94,6 +94,6 @@ def test_overrides_are_read_as_what_the_field_is() -> None:
         ("vision.stem_channels", "8,x", "expected a whole number, found 'x'"),
     ],
 )
-def test_an_override_that_fits_no_field_is_refused(key: str, text: str, says: str) -> None:
-    with pytest.raises(ModelConfigError, match=says):
+def test_an_override_that_fits_no_field_is_refused(key: str, text: str, message: str) -> None:
+    with pytest.raises(ModelConfigError, match=message):
         with_overrides(NANO, {key: text})

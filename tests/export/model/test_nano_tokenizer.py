@@ -62,7 +62,7 @@ WAYS = (
 )  # fmt: skip
 
 
-def tolds() -> Iterator[RouteDescription]:
+def routes() -> Iterator[RouteDescription]:
     """Ways with every kind of step, on either side, counted, at an end and at a landmark, and with none."""
     near, past = (Passed("bench 1", "blue bench", "left"),), (Passed("sofa 1", "sofa", "right"),)
     for (kind, name), side, (ordinal, at_end, by) in itertools.product(
@@ -79,7 +79,7 @@ def tolds() -> Iterator[RouteDescription]:
 
 
 def test_every_word_of_the_grammar_of_training_is_one_token() -> None:
-    texts = [text for seed, told in enumerate(tolds()) for text in wordings(told, 12, seed, held_out=False)]
+    texts = [text for seed, route in enumerate(routes()) for text in wordings(route, 12, seed, held_out=False)]
     words = {word for text in texts for word in re.findall(r"[A-Za-z]+", text)}
     assert len(texts) > 500 and len(words) > 100 and in_pieces(words) == []
 

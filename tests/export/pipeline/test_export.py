@@ -119,9 +119,9 @@ def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
 ) -> None:
     monkeypatch.setattr("export.evaluation.gates.LanguageModel", Blind)
     assert main([*RANDOM, "--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "language_model: not the same model: deviation as a share of the plans' spread" in said
-    assert "cosine of the semantic state" in said
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "language_model: not the same model: deviation as a share of the plans' spread" in message
+    assert "cosine of the semantic state" in message
     assert not (tmp_path / "blind").exists()
 
 
@@ -149,9 +149,9 @@ def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
 ) -> None:
     arguments = [*RANDOM, "--out", str(tmp_path / "out"), "--set", "gates.task.waypoint_cm=1e-9"]
     assert main([*arguments, "--set", "gates.task.warn_waypoint_cm=1e-10"]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "vision_encoder: not the same model: waypoint error in cm" in said
-    assert said.endswith("; nothing was written")
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "vision_encoder: not the same model: waypoint error in cm" in message
+    assert message.endswith("; nothing was written")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -190,9 +190,9 @@ def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM], ids=lambda told: told.name)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
-    artifacts_dir: Path, tmp_path: Path, told: signal.Signals
+    artifacts_dir: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
@@ -207,7 +207,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
         for line in process.stderr:
             if "gate vision_encoder · " in line:
                 break
-        process.send_signal(told)
+        process.send_signal(number)
         assert process.wait(timeout=60) == 130
     finally:
         process.kill()

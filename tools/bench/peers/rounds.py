@@ -129,7 +129,7 @@ class MemoryWatch:
             try:
                 self._sample()
             except (OSError, WorkerError):
-                return  # the process is gone; `peak` says so
+                return  # the process is gone; `peak` raises
             time.sleep(SAMPLE_S)
 
     def _sample(self) -> None:
@@ -256,7 +256,7 @@ def run_rounds(
         foreign = wait_for_quiet(quiet_wait_s)
         load = os.getloadavg()
         names = list(alive)
-        # Every contender gets every place in the order: whoever comes after a hot neighbour is not always the same.
+        # Every contender gets every place in the order: no contender always follows the same hot neighbour.
         order = names[index % len(names) :] + names[: index % len(names)]
         samples: list[Sample] = []
         for name in order:

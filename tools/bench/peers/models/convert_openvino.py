@@ -150,7 +150,7 @@ def language_model(workload: Workload, reference: Path) -> ov.Model:
 
 
 def _reset_caches_to_batch(model: ov.Model, c: LanguageConfig) -> None:
-    """A cache starts empty at the batch size of the ids, which the fused attention needs to be told."""
+    """A cache starts empty at the batch size of the ids, which the fused attention requires."""
     from openvino import opset13 as ops
 
     ids = model.input("input_ids")

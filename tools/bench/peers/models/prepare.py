@@ -44,7 +44,7 @@ def stamp(packages: tuple[str, ...]) -> dict[str, Any]:
 
 
 def make(folder: Path, content: dict[str, Any], fill: Callable[[Path], None]) -> bool:
-    """Fill a folder unless its stamp says that it is as wanted; returns whether there was work to do."""
+    """Fill a folder unless its stamp has this content; returns whether there was work to do."""
     seal = folder / "stamp.json"
     if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == content:
         return False
