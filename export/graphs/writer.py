@@ -13,7 +13,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from export.quantize.precision import Precision, block_size
-from export.quantize.weights import quantise_blocks, quantise_channels
+from export.quantize.rounding import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
 Constant = Array | np.generic | Sequence[int] | Sequence[Sequence[int]] | int

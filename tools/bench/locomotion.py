@@ -10,7 +10,6 @@ processor buys. `--rate` is the physics' rate: 500 Hz is edge-hil's. Exit code 1
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 from collections.abc import Callable, Sequence
@@ -146,20 +145,16 @@ def _speeds(speeds: Sequence[Speed]) -> dict[int, list[Speed]]:
     return {rate: chosen for rate in SPEED_RATES_HZ if (chosen := [s for s in speeds if s.rate_hz == rate])}
 
 
-def _parser() -> argparse.ArgumentParser:
+@command_line("locomotion")
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
     p = command_parser(__doc__)
     p.add_argument("--rate", type=int, default=500, metavar="HZ", help="steps of physics a second (default 500)")
     p.add_argument("--minutes", type=float, default=30.0, metavar="M", help="of random commands per seed (default 30)")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="random walks (default 3)")
     p.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements of speed (default 5, 0: none)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    return p
-
-
-@command_line("locomotion")
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = _parser().parse_args(argv)
+    args = p.parse_args(argv)
     try:
         if not 200 <= args.rate <= 1000:
             raise ValueError(f"--rate: expected 200..1000, found {args.rate}")

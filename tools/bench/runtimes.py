@@ -93,17 +93,8 @@ class Bench:
         options = dict(contender.options)
         if contender.stack == OURS:
             options = {"artifacts": str(self.args.artifacts.resolve())}
-        answer = worker.ask(
-            {
-                "load": {
-                    "model": self.model,
-                    "cache": str(self.args.cache.resolve()),
-                    "threads": self.args.threads,
-                    "parts": contender.parts,
-                    "options": options,
-                }
-            }
-        )
+        load = {"model": self.model, "cache": str(self.args.cache.resolve()), "threads": self.args.threads}
+        answer = worker.ask({"load": {**load, "parts": contender.parts, "options": options}})
         self.versions[contender.name] = answer["versions"]
         return list(answer["tasks"])
 

@@ -44,15 +44,6 @@ def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> Non
     assert made.tagged == MODELLED
 
 
-@pytest.mark.parametrize("name", ["orin", "rtx4060", "cpu"])
-def test_more_tokens_take_longer_and_make_the_state_older(name: str) -> None:
-    few, many = (planned(name, "runtime.tick_period_ms=5000", tokens=n) for n in (8, 64))
-    assert few.generation is not None and many.generation is not None
-    assert few.generation.ms < many.generation.ms
-    assert few.delay_s is not None and many.delay_s is not None
-    assert few.delay_s < many.delay_s
-
-
 @pytest.mark.slow
 def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
     made = planned("orin", "power.mode=25W")

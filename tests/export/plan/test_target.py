@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from export.targets.file import for_model, load_target, parse_target, with_settings
+from export.targets.file import load_target, parse_target, with_settings
 from export.targets.sections import MEASURED, MODELLED, Figure, TargetError
 
 PAIR = ("language_model.prefill", "language_model.decode")
@@ -69,11 +69,6 @@ def test_the_small_model_stays_exact_on_a_cpu() -> None:
     assert target.graph_names == ("vision_encoder", "language_model", "semantic_context", "action_expert")
     assert {graph.precision for graph in target.graphs.values()} == {"fp32"}
     assert all(target.gate(name).max_abs <= 1e-4 for name in target.graph_names)
-
-
-def test_a_model_that_the_file_does_not_name_gets_the_file_as_it_is() -> None:
-    target = load_target("orin")
-    assert for_model(target, "other") == dataclasses.replace(target, models={})
 
 
 def test_an_unknown_target_is_refused_with_the_names() -> None:

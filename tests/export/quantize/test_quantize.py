@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from onnx import TensorProto, helper, numpy_helper
 
 from export.quantize.precision import PRECISIONS, Precision, PrecisionError, bits, block_size, weight_bytes
-from export.quantize.weights import quantise_blocks, quantise_channels
+from export.quantize.rounding import quantise_blocks, quantise_channels
 
 BLOCKED = [p for p in PRECISIONS if block_size(p)]
 weights = arrays(
