@@ -39,9 +39,9 @@ from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter
 from edge.power.meters.modelled import ModelledMeter
 from edge.power.meters.select import open_meter
 from export.core.typed import plain
-from export.plan.measure import measured_point
-from export.target.file import Target, TargetError, parse_target
-from export.target.sections import Figure, Measured
+from export.plan.timing import measured_point
+from export.targets.file import Target, parse_target
+from export.targets.sections import Figure, Measured, TargetError
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")
 

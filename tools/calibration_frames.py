@@ -141,7 +141,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n  python -m tools.calibration_frames --out export/calibration_sets",
+        epilog="example:\n  python -m tools.calibration_frames --out export/evaluation/calibration_sets",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write corridor-go2/ into")
     args = parser.parse_args(argv)

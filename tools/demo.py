@@ -27,9 +27,9 @@ from edge.core.cli import (
     messages,
     write_result,
 )
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import shipped_weights
+from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
+from export.model.weights import CheckpointError
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir

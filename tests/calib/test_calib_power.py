@@ -25,9 +25,9 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REF
 from edge.power.governor.plan import power_plan
 from edge.power.meters.meter import MeterError, PowerSample
 from export.model.config import PRESETS
-from export.plan.measure import measured_point
 from export.plan.plan import plan
-from export.target.file import for_model, list_targets, load_target, parse_target, with_settings
+from export.plan.timing import measured_point
+from export.targets.file import for_model, list_targets, load_target, parse_target, with_settings
 
 TREES = Path(__file__).parents[1] / "data/sysfs"
 SECOND = 1_000_000_000

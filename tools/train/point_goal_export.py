@@ -19,8 +19,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, named_file
-from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.vision import VisionEncoder
 from sim_hil.benchmark.policies.point_goal_net import FORMAT, KEY
 from tools.train.config.checks import TrainError

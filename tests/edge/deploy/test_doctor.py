@@ -25,7 +25,7 @@ from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, p
 from edge.deploy.doctor.robot import bridge, robot_link
 from edge.deploy.install import main as install
 from edge.inference.graph import CPU_PROVIDER
-from export.target.file import load_target
+from export.targets.file import load_target
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus

@@ -25,7 +25,7 @@ from edge.deploy.unit_check import UnitVerdict
 from edge.deploy.unit_text import UnitError
 from edge.deploy.units import BRIDGE_UNIT, FIREWALL_FILE, FIREWALL_UNIT, RUNNER_UNIT, SOCKET
 from edge.signature import keygen
-from export.target.file import load_target
+from export.targets.file import load_target
 from firmware_bridge.core.config import DdsConfig
 from tests.support.processes import REPOSITORY
 

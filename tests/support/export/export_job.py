@@ -11,7 +11,7 @@ from export.evaluation.calibration import load_calibration
 from export.model.config import PRESETS
 from export.pipeline.build import build_stages
 from export.pipeline.job import Job, WeightSource
-from export.target.file import load_target
+from export.targets.file import load_target
 from reporting.progress import BuildProgress
 
 NANO = PRESETS["nano"]

@@ -13,10 +13,16 @@ from zlib import crc32
 import numpy as np
 import tomli_w
 
-from export.core.settings import MODEL_PREFIX, model_settings
 from export.core.typed import FieldError, build, field_types, from_text, near, plain
-from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, config_from_dict, with_overrides
+from export.model.config import (
+    MODEL_PREFIX,
+    ModelConfigError,
+    TicVlaConfig,
+    config_for,
+    config_from_dict,
+    model_settings,
+    with_overrides,
+)
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
 from tools.train.config.imitate import ImitateConfig

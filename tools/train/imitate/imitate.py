@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
 from tools.train.config.imitate import POINT_GOAL, DelayConfig, ImitateConfig, SampleConfig
 from tools.train.drives.drive import Dataset

@@ -25,7 +25,7 @@ import torch
 from edge.artifacts.manifest import load_artifacts
 from edge.core.geometry import SE2
 from edge.motion.controller import grown, scale_to_limits
-from export.model.config_file import config_from_dict
+from export.model.config import config_from_dict
 from export.model.network import TicVla
 from firmware_bridge.core.config import LimitsConfig
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler

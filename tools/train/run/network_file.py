@@ -16,8 +16,7 @@ from safetensors import SafetensorError, safe_open
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.checkpoint.load import load_checkpoint
-from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
 from sim_hil.processes.child_process import last_lines

@@ -17,7 +17,7 @@ import torch
 from tokenizers import Tokenizer
 
 from edge.state.reasoning_text import format_text
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
 from tools.train.collect.collection import build_tours, tour_anchors
 from tools.train.config.checks import OptimConfig, TrainError

@@ -13,12 +13,10 @@ import torch
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from edge.inference.latency_profile import LatencyProfile
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import shipped_weights
-from export.model.config import PRESETS
-from export.model.config_file import with_overrides
+from export.checkpoint.load import shipped_weights
+from export.model.config import PRESETS, with_overrides
 from export.model.network import build
-from export.model.weights import WeightsInfo, save_weights
+from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from tools.train import cli
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
-from export.core.typed import FieldError, build, convert, field_types, from_text, near, plain
+from export.core.typed import FieldError, SettingText, build, near, plain, tomllib
+from export.model.config import MODEL_PREFIX
 from export.quantize.precision import Precision, block_size
-from export.target.sections import (
+from export.targets.sections import (
     Device,
-    Figure,
     GraphGate,
     GraphPolicy,
     Measured,
@@ -32,26 +25,21 @@ from export.target.sections import (
     TaskGate,
 )
 
-__all__ = [
-    "GraphGate",
-    "Target",
-    "TargetError",
-    "TaskGate",
-    "for_model",
-    "list_targets",
-    "load_target",
-    "parse_target",
-    "with_settings",
-]
-
 SCHEMA = 2
-TARGETS_DIR = Path(__file__).parents[1] / "targets"
+TARGETS_DIR = Path(__file__).parent
 TASK_GATE = "task"
 OTHER_GRAPHS = ("vision_encoder", "semantic_context", "action_expert")
 CHOOSING = (*LANGUAGE_WHOLE, LANGUAGE_PAIR[1])
 """Graphs that choose a token."""
 MODEL_SECTIONS = ("graphs", "gates", "runtime")
+LEAVES = ("overrides", "profile", "options", "requires")
+"""Tables whose keys may hold dots: layer patterns and option names."""
 FIXED_KEYS = ("schema", "name", "measured", "models")
+
+
+def graph_names(*, pair: bool) -> tuple[str, ...]:
+    """Names of a directory's graphs in the order in which they are built, with one language model or with a pair."""
+    return ("vision_encoder", *(LANGUAGE_PAIR if pair else LANGUAGE_WHOLE), "semantic_context", "action_expert")
 
 
 @dataclass(frozen=True)
@@ -114,8 +102,7 @@ class Target:
     @property
     def graph_names(self) -> tuple[str, ...]:
         """Names of the graphs in the order in which they are built."""
-        language = LANGUAGE_WHOLE if LANGUAGE_WHOLE[0] in self.graphs else LANGUAGE_PAIR
-        return ("vision_encoder", *language, "semantic_context", "action_expert")
+        return graph_names(pair=LANGUAGE_WHOLE[0] not in self.graphs)
 
     @property
     def half(self) -> bool:
@@ -216,7 +203,7 @@ def parse_target(content: Mapping[str, object], where: str) -> Target:
 
 
 def for_model(target: Target, model: str, where: str | None = None) -> Target:
-    """The target with what its file (`where` in errors) says of that model; raises TargetError."""
+    """The target with what its file (`where` in errors) changes for that model; raises TargetError."""
     changes = target.models.get(model)
     base = {**target.to_dict(), "models": {}}
     if changes is None:
@@ -248,82 +235,56 @@ def _merged(base: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
 
 
 def with_settings(target: Target, settings: Iterable[str]) -> Target:
-    """The target with `key=value` settings (`--set`), typed by the field; raises TargetError naming near keys."""
+    """The target with `key=value` settings (`--set`), typed by the field; raises TargetError naming near keys.
+
+    Settings of the network (`model.…`) are left out. A graph's precision also ends the search for a better one.
+    """
     content = target.to_dict()
-    for setting in settings:
-        path, sign, text = setting.partition("=")
-        path, text = path.strip(), text.strip()
+    for setting in _expanded(settings):
+        path, sign, text = (part.strip() for part in setting.partition("="))
         if not sign or not path:
             raise TargetError(f"--set {setting}: expected KEY=VALUE, e.g. --set power.mode=15W")
         if path.split(".")[0] in FIXED_KEYS:
             raise TargetError(f"--set {path}: cannot be set; write a target file of your own")
-        try:
-            for keys, kind in _places(content, path):
-                table = content
-                for key in keys[:-1]:
-                    table = table.setdefault(key, {})
-                table[keys[-1]] = _value(kind, text, path)
-        except FieldError as error:
-            raise TargetError(f"--set {error}") from error
+        for parts in _places(content, path.split(".")):
+            _set(content, parts, SettingText(text), path)
     return parse_target(content, f"{target.name} with --set")
 
 
-def _value(kind: object, text: str, path: str) -> Any:
-    options = [option for option in typing.get_args(kind) if option is not type(None)]
-    if kind is Figure or options == [Figure]:
-        return {"value": from_text(float, text, path), "source": "set on the command line"}
-    return convert(kind, from_text(kind, text, path), path)
+def _expanded(settings: Iterable[str]) -> Iterator[str]:
+    for setting in settings:
+        path = setting.partition("=")[0].strip()
+        if path.startswith(MODEL_PREFIX):
+            continue
+        yield setting
+        if path.startswith("graphs.") and path.endswith(".precision"):
+            yield f"{path.removesuffix('precision')}candidates="
 
 
-def _places(content: Mapping[str, Any], path: str) -> list[tuple[list[str], Any]]:
-    """Key lists and type of what a dotted path names; `language_model` means both halves where there is a pair."""
-    parts = path.split(".")
+def _places(content: Mapping[str, Any], parts: list[str]) -> list[list[str]]:
+    """What a dotted path names; `language_model` means both halves where there is a pair."""
     whole = len(parts) > 2 and parts[0] in ("graphs", "gates") and parts[1] == LANGUAGE_WHOLE[0]
     if whole and LANGUAGE_WHOLE[0] not in content[parts[0]] and parts[2] not in ("prefill", "decode"):
         halves = [name for name in LANGUAGE_PAIR if parts[2] != "top1" or name in CHOOSING]
-        return [_place(content, [parts[0], name, *parts[2:]], path) for name in halves]
-    return [_place(content, parts, path)]
+        return [[parts[0], name, *parts[2:]] for name in halves]
+    return [parts]
 
 
-def _place(content: Mapping[str, object], parts: list[str], path: str) -> tuple[list[str], Any]:
-    kind: Any = Target
-    keys: list[str] = []
-    table: Any = content
-    while parts:
-        if _optional(kind):
-            kind = next((option for option in typing.get_args(kind) if dataclasses.is_dataclass(option)), kind)
-        if dataclasses.is_dataclass(kind):
-            known = {name: hint for name, hint in field_types(typing.cast(type, kind)).items() if name != "task_gate"}
-            if parts[0] not in known:
-                raise FieldError(f"{path}: unknown key {parts[0]!r}; {near(parts[0], known)}")
-            kind, key, parts = known[parts[0]], parts[0], parts[1:]
-        elif _is_mapping(kind):
-            below = typing.get_args(kind)[1]
-            if not dataclasses.is_dataclass(below):
-                # A layer pattern or an option name may hold dots: all that is left is the key.
-                key, parts, kind = ".".join(parts), [], below
-            else:
-                key, parts = _entry(table, parts, path)
-                kind = TaskGate if keys == ["gates"] and key == TASK_GATE else below
-        else:
-            raise FieldError(f"{path}: {keys[-1]} is not a table")
-        keys.append(key)
-        table = table.get(key, {}) if isinstance(table, Mapping) else {}
-    return keys, kind
-
-
-def _entry(table: Mapping[str, object], parts: list[str], path: str) -> tuple[str, list[str]]:
-    """The longest start of `parts` that is a key of the table (names of graphs hold dots), and what follows it."""
-    for end in range(len(parts), 0, -1):
-        if ".".join(parts[:end]) in table:
-            return ".".join(parts[:end]), parts[end:]
-    raise FieldError(f"{path}: unknown key {parts[0]!r}; {near(parts[0], table)}")
-
-
-def _optional(kind: object) -> bool:
-    return type(None) in typing.get_args(kind)
-
-
-def _is_mapping(kind: object) -> bool:
-    origin = typing.get_origin(kind)
-    return isinstance(origin, type) and issubclass(origin, Mapping)
+def _set(table: dict[str, Any], parts: list[str], text: SettingText, path: str) -> None:
+    """Set a value below a table; its type is checked where the tables are built. Raises TargetError."""
+    while True:
+        # Names of graphs hold dots: the longest start that is a key.
+        ends = [end for end in range(len(parts), 0, -1) if ".".join(parts[:end]) in table]
+        key, rest = ".".join(parts[: ends[0]]) if ends else parts[0], parts[ends[0] if ends else 1 :]
+        if not rest:
+            table[key] = text
+            return
+        if not ends and table and all(isinstance(value, dict) for value in table.values()):
+            raise TargetError(f"--set {path}: unknown key {key!r}; {near(key, table)}")
+        below = table.setdefault(key, {})
+        if not isinstance(below, dict):
+            raise TargetError(f"--set {path}: {key} is not a table")
+        if key in LEAVES:
+            below[".".join(rest)] = text
+            return
+        table, parts = below, rest

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from edge.state.switches import Decoding, RecoverySwitch
-from export.core.typed import near
+from export.core.typed import from_text, near
 from export.quantize.precision import PRECISIONS, Precision, block_size
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 MODELLED, MEASURED = "modelled", "measured"
 FORMS = ("fused", "plain")
+"""`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""
 ROOFS = ("fp32", "fp16", "int8")
 KV_DTYPES = {"fp32": 4, "fp16": 2}
 METERS = ("ina3221", "nvml", "rapl", "none")
@@ -45,6 +46,11 @@ class Figure:
     tag: str = MODELLED
     error: float | None = None
     """Half width of the error bar as a fraction of the value; None: the source gives none."""
+
+    @classmethod
+    def from_setting(cls, text: str, where: str) -> Figure:
+        """A number of the command line; raises FieldError."""
+        return cls(from_text(float, text, where), "set on the command line")
 
     def __post_init__(self) -> None:
         _require(0 <= self.value < 1e9, f"value {self.value} must be between 0 and 1e9")
@@ -273,8 +279,8 @@ class TaskGate:
     warn_waypoint_cm: float | None = None
     warn_heading_deg: float | None = None
     relative: float = 1.0
-    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres say
-    little about a model whose plans are short, as those of untrained weights are."""
+    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres
+    mean little for a model whose plans are short, as those of untrained weights are."""
     warn_relative: float = 0.5
     kv_cosine: float = 0.9
     """Least cosine of the semantic state to the exact one."""
@@ -283,8 +289,8 @@ class TaskGate:
     """Least share of the text before the first other token, for trained weights."""
     warn_token_agreement: float = 0.5
     min_semantic: float = 0.01
-    """Least share of the plans' own spread that another semantic state has to move them by: below it, nothing here can
-    tell a language model that works from one that does not."""
+    """Least share of the plans' own spread that another semantic state has to move them by: below it, no figure here
+    separates a language model that works from one that does not."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
