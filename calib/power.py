@@ -15,7 +15,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-from calib.power_fit import STAGES, Fit, FitError, Phase, fit_energy
+from calib.power_fit import Fit, FitError, Phase, fit_energy
 from calib.power_load import Counts, EnergyLog, Load, run_phases
 from edge.artifacts.files import ArtifactError, read_manifest
 from edge.artifacts.manifest import Artifacts, load_artifacts
@@ -32,9 +32,8 @@ from edge.core.cli import (
 from edge.core.device import read_device
 from edge.core.sysfs import SYSFS
 from edge.inference.graph import GraphError
-from edge.power.governor.plan import PowerModel, PowerPlan, read_power_plan
-from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter
-from edge.power.meters.modelled import ModelledMeter
+from edge.power.governor.plan import STAGES, PowerModel, PowerPlan, read_power_plan
+from edge.power.meters.meter import MEASURED, MODELLED, MeterError, ModelledMeter, PowerMeter
 from edge.power.meters.select import open_meter
 from export.core.typed import plain
 from export.plan.measure import measured_point

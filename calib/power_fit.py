@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
-"""What is counted: calls, calls, whole prompts, new tokens, calls."""
+from edge.power.governor.plan import STAGES
+
 MIN_R2: Final = 0.9
 MAX_CHECK_ERROR: Final = 0.15
 """Thresholds of ours: below, the fit says too little of what a run will draw."""

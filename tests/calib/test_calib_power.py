@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from calib.power import add_arguments, measured_target, run, stage_ms, target_text
-from calib.power_fit import STAGES, FitError, Phase, fit_energy, non_negative
+from calib.power_fit import FitError, Phase, fit_energy, non_negative
 from calib.power_load import EnergyLog
 from edge.artifacts.files import MANIFEST_NAME, read_manifest, seal
 from edge.artifacts.manifest import Artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
-from edge.power.governor.plan import power_plan
+from edge.power.governor.plan import STAGES, power_plan
 from edge.power.meters.meter import MeterError, PowerSample
 from export.model.config import PRESETS
 from export.plan.measure import measured_point
