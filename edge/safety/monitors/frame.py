@@ -146,7 +146,7 @@ class FrameMonitor:
             self._judge_content(picture, T_odom_base)
 
     def _defect(self, picture: Picture) -> str:
-        """What is wrong with the picture itself, in words; empty when it is good."""
+        """What is wrong with the picture itself, for the operator; empty when it is good."""
         pixels, px = picture.pixels, self._config.image_px
         if pixels.ndim != 4 or pixels.dtype != np.uint8 or (px is not None and pixels.shape != (1, px, px, 3)):
             return f"expected {px}×{px} RGB, found {pixels.dtype}{list(pixels.shape)}"

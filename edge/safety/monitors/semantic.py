@@ -8,7 +8,7 @@ from edge.safety.faults.findings import Finding
 from edge.state.semantic import SemanticState
 
 INVALID_IN_A_ROW = 3
-_FAILURES_TOLD = 5
+_MAX_REPORTED_FAILURES = 5
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class SemanticConfig:
             raise ValueError(f"semantic ages must be 0 to 600 s, found {self.trained_delay_s} and {self.fade_s}")
 
     def given_delay_s(self, delay_s: float) -> float:
-        """Δt as the action expert is told it: never beyond what it was trained for, never negative."""
+        """Δt as the action expert receives it, s: never beyond what it was trained for, never negative."""
         return min(max(delay_s, 0.0), self.trained_delay_s)
 
 
@@ -46,7 +46,7 @@ class SemanticMonitor:
         never given such a text, so it cannot be seen in the state.
         """
         findings: list[Finding] = []
-        for _ in range(min(failed - self._failed, _FAILURES_TOLD)):
+        for _ in range(min(failed - self._failed, _MAX_REPORTED_FAILURES)):
             findings.append(Finding("reasoning-failed", f"{failed} in this run"))
         self._failed = max(self._failed, failed)
         self._count(semantic)

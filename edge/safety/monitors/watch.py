@@ -97,7 +97,7 @@ class Watch:
         self._robot.begin(self._sources.malformed())
 
     def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
-        """Before the encoder: whether the newest picture may be used. What was found is told by `tick`."""
+        """Before the encoder: whether the newest picture may be used. `tick` returns what was found."""
         self._pictures = self._frame.step(picture, T_odom_base, now_ns)
         return self._pictures.usable
 
