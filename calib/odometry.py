@@ -24,8 +24,8 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_named,
     write_result,
 )
@@ -60,7 +60,7 @@ class LogError(ValueError):
 
 
 class NoFitError(ValueError):
-    """The fit led to a calibration that no robot has; one line."""
+    """The fit is not good enough, or led to a calibration that no robot has; one line."""
 
 
 @dataclass(frozen=True)
@@ -331,39 +331,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
 
+@command_line(
+    "edge-calib odometry",
+    {
+        NoFitError: EXIT_CHECK_FAILED,
+        **dict.fromkeys((LogError, RecordingError, ConfigError, OSError), EXIT_BAD_INPUT),
+    },
+)
 def run(args: argparse.Namespace) -> int:
     """Fit and write; returns the exit code."""
-    try:
-        check_result_target(args.json)
-        if args.out is not None:
-            check_result_target(str(args.out), "--out")
-        drive = read_drive(args.log)
-        prior = OdometryCalibration()
-        fitted = fit(drive, _references(args, drive), prior)
-        if fitted.good and args.out is not None:
-            comment = (
-                f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
-            )
-            write_named(args.out, fitted.calibration.to_toml(comment))
-        write_result(args.json, {"good": fitted.good, **asdict(fitted)})
-    except NoFitError as error:
-        sys.stderr.write(f"edge-calib odometry: {error}\n")
-        return EXIT_CHECK_FAILED
-    except (LogError, RecordingError, ConfigError, OSError) as error:
-        sys.stderr.write(f"edge-calib odometry: {error}\n")
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        sys.stderr.write("edge-calib odometry: interrupted\n")
-        return EXIT_INTERRUPTED
+    check_result_target(args.json)
+    if args.out is not None:
+        check_result_target(str(args.out), "--out")
+    drive = read_drive(args.log)
+    fitted = fit(drive, _references(args, drive), OdometryCalibration())
+    if fitted.good and args.out is not None:
+        comment = (
+            f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
+        )
+        write_named(args.out, fitted.calibration.to_toml(comment))
+    write_result(args.json, {"good": fitted.good, **asdict(fitted)})
     sys.stderr.write(_table(fitted))
-    if fitted.good:
-        return EXIT_DONE
-    sys.stderr.write(
-        f"edge-calib odometry: the fit is not good enough to be used: {fitted.intervals} intervals over "
-        f"{fitted.distance_m:.1f} m, {100 * fitted.unexplained:.0f} % of the motion unexplained; expected at least "
-        f"{MIN_INTERVALS} over {MIN_DISTANCE_M:g} m and at most {100 * MAX_UNEXPLAINED:.0f} %: drive on, in light\n"
-    )
-    return EXIT_CHECK_FAILED
+    if not fitted.good:
+        raise NoFitError(
+            f"the fit is not good enough to be used: {fitted.intervals} intervals over {fitted.distance_m:.1f} m, "
+            f"{100 * fitted.unexplained:.0f} % of the motion unexplained; expected at least {MIN_INTERVALS} over "
+            f"{MIN_DISTANCE_M:g} m and at most {100 * MAX_UNEXPLAINED:.0f} %: drive on, in light"
+        )
+    return EXIT_DONE
 
 
 def _references(args: argparse.Namespace, drive: Drive) -> list[Reference]:

@@ -25,9 +25,9 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.core.device import available_providers
@@ -82,32 +82,21 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-doctor: {line}\n")
-    sys.stderr.flush()
-
-
-@command_line("edge-doctor")
+@command_line("edge-doctor", {OSError: EXIT_BAD_INPUT, ConfigError: EXIT_BAD_INPUT})
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
-    try:
-        check_result_target(args.json)
-        if args.ticks < 0:
-            raise ConfigError(f"--ticks {args.ticks}: expected 0 or more")
-        checks = list(examine(args))
-    except (OSError, ConfigError) as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted")
-        return EXIT_INTERRUPTED
+    check_result_target(args.json)
+    if args.ticks < 0:
+        raise ConfigError(f"--ticks {args.ticks}: expected 0 or more")
+    checks = list(examine(args))
     # The table is for people; with --json - standard output is the JSON's alone.
     Console(stderr=args.json == "-").print(table(checks))
     counts = {level.value: sum(check.level is level for check in checks) for level in Level}
     wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
-    _say(", ".join(f"{number} {level}" for level, number in counts.items()) + f" in {wall_s:.1f} s")
+    numbers = ", ".join(f"{number} {level}" for level, number in counts.items())
+    messages("edge-doctor")(f"{numbers} in {wall_s:.1f} s")
     result: dict[str, Any] = {"ok": not failed(checks), "counts": counts, "wall_s": wall_s}
     result["checks"] = [check.to_dict() for check in checks]
     write_result(args.json, result)
