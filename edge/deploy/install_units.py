@@ -23,9 +23,16 @@ from edge.artifacts.target_facts import TargetFacts, target_facts
 from edge.artifacts.trust import STATE_DIRECTORY, Trust
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.deploy import units
-from edge.deploy.service_users import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER, SYSUSERS_FILE, ServiceUsers, sysusers
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
-from edge.deploy.unit_text import UnitError
+from edge.deploy.unit_text import (
+    BRIDGE_USER,
+    OPERATOR_GROUP,
+    RUNNER_USER,
+    SYSUSERS_FILE,
+    ServiceUsers,
+    UnitError,
+    sysusers,
+)
 from edge.inference import engines
 from edge.run.instructions import check_first_instruction
 from firmware_bridge.core.config import DdsConfig, load_robot_config

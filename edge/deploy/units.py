@@ -17,8 +17,7 @@ from typing import Final
 from edge.artifacts.trust import STATE_DIRECTORY
 from edge.core.device import CUDA, OPENVINO, TENSORRT
 from edge.deploy import firewall
-from edge.deploy.service_users import ServiceUsers
-from edge.deploy.unit_text import Setting, UnitError, argument, bound, render, word
+from edge.deploy.unit_text import ServiceUsers, Setting, UnitError, argument, bound, render, word
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
@@ -97,9 +96,8 @@ class ServiceInputs:
             if not getattr(self, name).is_absolute():
                 raise UnitError(f"{name} {getattr(self, name)}: expected an absolute path")
         for program in (self.programs, self.python):
-            if not set(str(program)) & set("'\"\\"):
-                continue
-            raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
+            if set(str(program)) & set("'\"\\"):
+                raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
         if not self.networks:
             raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
         for network in collapse_addresses(self.networks):
@@ -150,7 +148,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
         ("CPUSchedulingPolicy", "fifo"),
         ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
-        *_cores(inputs.bridge_cores),
+        *([("CPUAffinity", " ".join(map(str, inputs.bridge_cores)))] if inputs.bridge_cores else []),
         ("LimitRTPRIO", str(BRIDGE_PRIORITY)),
         "A loop that spins: killed after this much computing without a pause (start-up takes less).",
         ("LimitRTTIME", "5s"),
@@ -237,10 +235,11 @@ def runner_unit(inputs: ServiceInputs) -> str:
         "connection ends with the old bridge. After: at shutdown the runner stops first.",
         ("Wants", BRIDGE_UNIT),
         ("After", BRIDGE_UNIT),
-        *_network(inputs),
+        *([] if inputs.over_loopback else [("Wants", "network-online.target"), ("After", "network-online.target")]),
         *_behind_firewall(inputs),
         # A start that fails slowly must be counted too, so the window holds several of the longest starts.
-        *_restarts(900),
+        ("StartLimitIntervalSec", "900"),
+        ("StartLimitBurst", "5"),
     ]
     return _render("runner", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
 
@@ -292,18 +291,12 @@ def firewall_unit(inputs: ServiceInputs) -> str:
 def firewall_rules(inputs: ServiceInputs) -> str:
     """Text of the nftables file; raises UnitError for an interface without a name."""
     users = (inputs.users.bridge, inputs.users.runner)
-    return firewall.ruleset(firewall.CableRules(inputs.interface, inputs.networks, inputs.domain, users))
+    return firewall.ruleset(inputs.interface, inputs.networks, inputs.domain, users)
 
 
 def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
     comment = [f"Made by edge-install units: the {which} of one robot. Write it anew instead of editing it; see also"]
     return render([*comment, "systemctl edit, which keeps changes of yours apart."], sections)
-
-
-def _network(inputs: ServiceInputs) -> list[Setting | str]:
-    if inputs.over_loopback:
-        return []
-    return [("Wants", "network-online.target"), ("After", "network-online.target")]
 
 
 def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
@@ -320,10 +313,6 @@ def _back_off(systemd: int | None) -> list[Setting | str]:
     return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
 
 
-def _restarts(window_s: int) -> list[Setting | str]:
-    return [("StartLimitIntervalSec", str(window_s)), ("StartLimitBurst", "5")]
-
-
 def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str]:
     return [
         ("TimeoutStartSec", str(start_s)),
@@ -335,10 +324,6 @@ def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str
         ("KillMode", "mixed"),
         ("TimeoutStopSec", str(stop_s)),
     ]
-
-
-def _cores(cores: Sequence[int]) -> list[Setting | str]:
-    return [("CPUAffinity", " ".join(str(core) for core in cores))] if cores else []
 
 
 def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:

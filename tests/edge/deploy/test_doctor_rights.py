@@ -13,14 +13,22 @@ import pytest
 
 from edge.core.device import CUDA
 from edge.deploy.doctor.check import Check, Level
-from edge.deploy.doctor.rights import device_access, locked_memory, power_meter, real_time, socket_folder, temperatures
-from edge.deploy.doctor.user import Whom, user_named
+from edge.deploy.doctor.rights import (
+    UserRights,
+    device_access,
+    locked_memory,
+    power_meter,
+    real_time,
+    socket_folder,
+    temperatures,
+    user_named,
+)
 from edge.inference.graph import CPU_PROVIDER
 from edge.power.meters.meter import MeterError, PowerSample
 from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
 from tests.edge.deploy.test_doctor_machine import write
 
-ME = Whom("somebody", 1000, frozenset({1000}), other=False)
+ME = UserRights("somebody", 1000, frozenset({1000}), other=False)
 
 
 def test_real_time_that_is_refused_is_told() -> None:
@@ -57,7 +65,7 @@ def test_a_device_that_its_group_may_only_read_is_open_to_that_group(tmp_path: P
     node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
     node.chmod(0o440)  # as on the Orin of NVIDIA/NemoClaw #4231
     chgrp_to_a_group_of_no_power(node)
-    member = Whom("service", 4242, frozenset({node.stat().st_gid}), other=True)
+    member = UserRights("service", 4242, frozenset({node.stat().st_gid}), other=True)
     assert device_access([CUDA], tmp_path, member).level is Level.OK
     assert device_access([CUDA], tmp_path, replace(member, groups=frozenset())).level is Level.WARN
 
@@ -66,7 +74,7 @@ def test_a_device_that_the_units_groups_open_only_warns_for_the_services_user(tm
     node = write(tmp_path, {"dev/nvmap": ""}) / "dev/nvmap"
     node.chmod(0o660)
     chgrp_to_a_group_of_no_power(node)
-    service = Whom("service", 4242, frozenset({4242}), other=True)
+    service = UserRights("service", 4242, frozenset({4242}), other=True)
     assert device_access([CUDA], tmp_path, service).level is Level.WARN
     member = replace(service, groups=frozenset({node.stat().st_gid}))
     assert device_access([CUDA], tmp_path, member).level is Level.OK
@@ -75,8 +83,8 @@ def test_a_device_that_the_units_groups_open_only_warns_for_the_services_user(tm
 def test_another_users_right_to_a_file_is_that_of_its_class(tmp_path: Path) -> None:
     file = write(tmp_path, {"x": ""}) / "x"
     status = file.stat()
-    owner = Whom("owner", status.st_uid or 4242, frozenset(), other=True)
-    stranger = Whom("stranger", status.st_uid + 1, frozenset({status.st_gid + 1}), other=True)
+    owner = UserRights("owner", status.st_uid or 4242, frozenset(), other=True)
+    stranger = UserRights("stranger", status.st_uid + 1, frozenset({status.st_gid + 1}), other=True)
     member = replace(stranger, groups=frozenset({status.st_gid}))
     file.chmod(0o604)
     assert [stranger.may(file), member.may(file), stranger.may(file, write=True)] == [True, False, False]
@@ -92,7 +100,7 @@ def test_what_cannot_be_tried_for_another_user_is_said_to_be_skipped() -> None:
         assert (check.level, "service" in check.found) == (Level.SKIP, True)
 
 
-def test_the_line_says_for_whom_it_was_judged(tmp_path: Path) -> None:
+def test_the_line_says_for_user_it_was_judged(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     mine = replace(ME, uid=tmp_path.stat().st_uid)
     checks = (
@@ -150,8 +158,8 @@ class TestServiceSockets:
 
     groups: ClassVar[dict[Path, int]] = {}
 
-    def runner(self, path: Path, *groups: int) -> Whom:
-        return Whom("runner", path.parent.stat().st_uid + 4000, frozenset(groups), other=True)
+    def runner(self, path: Path, *groups: int) -> UserRights:
+        return UserRights("runner", path.parent.stat().st_uid + 4000, frozenset(groups), other=True)
 
     def test_the_runner_reaches_its_own_socket_only(self, path: Path) -> None:
         assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.OK
@@ -196,8 +204,8 @@ class FakeMeter:
         return PowerSample(now_ns, 12.5)
 
 
-def meter(kind: str, open_it, sysfs_root: Path = Path("/nowhere"), whom: Whom = ME) -> Check:
-    return power_meter(kind, open_it, sysfs_root, whom, clock=lambda: 1, sleep=lambda _seconds: None)
+def meter(kind: str, open_it, sysfs_root: Path = Path("/nowhere"), user: UserRights = ME) -> Check:
+    return power_meter(kind, open_it, sysfs_root, user, clock=lambda: 1, sleep=lambda _seconds: None)
 
 
 def test_a_meter_says_what_it_reads_and_what_that_leaves_out() -> None:

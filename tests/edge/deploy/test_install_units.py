@@ -20,9 +20,8 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REF
 from edge.core.device import CUDA, TENSORRT
 from edge.deploy.install import main
 from edge.deploy.install_units import Host, robot_networks, unreadable
-from edge.deploy.service_users import SYSUSERS_FILE
 from edge.deploy.unit_check import UnitVerdict
-from edge.deploy.unit_text import UnitError
+from edge.deploy.unit_text import SYSUSERS_FILE, UnitError
 from edge.deploy.units import BRIDGE_UNIT, FIREWALL_FILE, FIREWALL_UNIT, RUNNER_UNIT, SOCKET
 from edge.signature import keygen
 from export.target.file import load_target

@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.device import CUDA
-from edge.deploy.service_users import ServiceUsers, sysusers
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
-from edge.deploy.unit_text import UnitError, argument, bound, word
+from edge.deploy.unit_text import ServiceUsers, UnitError, argument, bound, sysusers, word
 from edge.deploy.units import (
     BRIDGE_UNIT,
     FIREWALL_UNIT,
