@@ -34,9 +34,7 @@ def ruleset(interface: str, networks: Sequence[IPv4Network], domain: int, users:
     `users`: those that may send to the robot, root besides.
     """
     if interface[:1].isdigit():
-        raise UnitError(
-            f"dds.interface: expected an interface's name for the firewall, such as eth0, found {interface}"
-        )
+        raise UnitError(f"dds.interface: expected a name for the firewall, such as eth0, found {interface}")
     if not networks or not users:
         raise UnitError("the firewall needs the robot's network and the users that may send to it")
     cable, (first, last) = f'"{interface}"', ports(domain)
