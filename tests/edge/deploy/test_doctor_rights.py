@@ -5,13 +5,15 @@ from __future__ import annotations
 import grp
 import os
 import resource
+import stat
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
-from edge.core.device import CUDA
+from edge.artifacts.device_nodes import device_nodes, group_of
+from edge.core.device import CUDA, TENSORRT
 from edge.deploy.doctor.check import Check, Level
 from edge.deploy.doctor.rights import (
     UserRights,
@@ -232,3 +234,39 @@ def test_an_energy_counter_that_only_root_may_read_is_a_warning_for_the_services
     assert meter("rapl", lambda: rapl, tmp_path, service).level is Level.WARN
     counter.chmod(0o444)
     assert meter("rapl", lambda: rapl, tmp_path, service).level is Level.OK
+
+
+def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> None:
+    (tmp_path / "dev").mkdir()
+    (tmp_path / "dev" / "nvmap").touch()
+    (tmp_path / "dev" / "nvmap").chmod(0o660)
+    chgrp_to_a_group_of_no_power(tmp_path / "dev" / "nvmap")
+    (node,) = device_nodes((CUDA,), tmp_path)
+    assert node.path == Path("/dev/nvmap")
+    assert node.group == grp.getgrgid((tmp_path / "dev" / "nvmap").stat().st_gid).gr_name
+
+
+def test_a_node_of_the_root_group_does_not_put_the_runner_into_that_group() -> None:
+    assert group_of(os.stat_result((stat.S_IFCHR | 0o660, 0, 0, 1, 0, 0, 0, 0, 0, 0))) is None
+
+
+TRACED_CUDA_OPENS = (
+    *("nvmap", "host1x-fence", "dri/renderD128", "dri/renderD129", "nvsciipc", "nvidia0", "nvidiactl"),
+    *(f"nvgpu/igpu0/{name}" for name in ("as", "channel", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
+    *(f"nvhost-{name}-gpu" for name in ("as", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
+)
+"""Nodes that public traces of CUDA on an Orin name; not tried on a board by this project."""
+
+
+@pytest.mark.parametrize("provider", [CUDA, TENSORRT])
+def test_nodes_that_cuda_opens_on_an_orin_are_let_through(tmp_path: Path, provider: str) -> None:
+    write(tmp_path, dict.fromkeys((f"dev/{name}" for name in TRACED_CUDA_OPENS), ""))
+    found = {str(node.path.relative_to("/dev")) for node in device_nodes((provider,), tmp_path)}
+    assert found == set(TRACED_CUDA_OPENS)
+
+
+def test_other_nodes_stay_closed_and_a_processor_needs_none(tmp_path: Path) -> None:
+    write(tmp_path, dict.fromkeys((f"dev/{name}" for name in ["dri/card0", "sda", "video0", "mem", "nvme0n1"]), ""))
+    assert device_nodes((CUDA, TENSORRT), tmp_path) == []
+    write(tmp_path, dict.fromkeys((f"dev/{name}" for name in TRACED_CUDA_OPENS), ""))
+    assert device_nodes(("CPUExecutionProvider",), tmp_path) == []
