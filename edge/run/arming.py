@@ -65,11 +65,11 @@ class _Gate:
         self._clock = clock
         self._say = say
         self._since_ns: int | None = None
-        self._said = ""
+        self._reported = ""
         self.why = ""
 
-    def look(self, status: BridgeStatus | None) -> bool:
-        """One look. Raises RefusedError when it is in the way for long and somebody wants the robot to be armed."""
+    def is_open(self, status: BridgeStatus | None) -> bool:
+        """Whether to ask now. Raises RefusedError when something blocks for long and the robot is to be armed."""
         now_ns, self.why = self._clock(), self._in_the_way()
         permitted = not self._operator or (status is not None and status.blocked_by == "none")
         if not self.why or not permitted or self._since_ns is None:
@@ -77,8 +77,8 @@ class _Gate:
         elif now_ns - self._since_ns > LASTS_S * 1e9:
             # An operator's word is not kept for later: the robot would start when nobody expects it.
             raise RefusedError(f"not armed: {self.why}")
-        if self.why and self.why != self._said:
-            self._said = self.why
+        if self.why and self.why != self._reported:
+            self._reported = self.why
             self._say(f"not armed yet: {self.why}")
         return not self.why
 
@@ -103,7 +103,7 @@ def arm(
     StoppedEarlyError or BridgeUnavailable.
     """
     gate = _Gate(in_the_way, operator, clock, say)
-    while not gate.look(bridge.poll()):
+    while not gate.is_open(bridge.poll()):
         if stop_requested():
             raise StoppedEarlyError("stopped before the robot was armed")
         if operator:
@@ -131,7 +131,7 @@ def arm(
         if stop_requested():
             raise StoppedEarlyError("stopped while waiting to be armed" if waits else "stopped while arming")
         passed_s = (clock() - asked_ns) / 1e9
-        clear = not waits or gate.look(status)
+        clear = not waits or gate.is_open(status)
         if waits and clear and passed_s >= ASK_AGAIN_S:
             asked_ns, begun = _ask(bridge, clock), False
         elif not waits and passed_s > limit_s:

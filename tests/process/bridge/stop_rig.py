@@ -11,13 +11,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from cyclonedds.domain import DomainParticipant
 
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.operate import operate
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
-from tests.support.processes import GO2_SIM, REPOSITORY, HostStall, Running, running, wait_for
+from tests.support.processes import GO2_SIM, REPOSITORY, Running, running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
 
 ZERO = (0.0, 0.0, 0.0)
@@ -25,6 +26,10 @@ STANDING_UP = frozenset({ids.STAND_UP, ids.RECOVERY_STAND, ids.BALANCE_STAND})
 REST_MPS = 0.05
 L2, B = 1 << 5, 1 << 9
 SPEED_MPS = 0.8
+MANY = 20
+REPETITIONS = pytest.mark.parametrize(
+    "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
+)
 
 
 class Peer(Bus):
@@ -172,6 +177,3 @@ def report(name: str, values: dict[str, list[float]]) -> None:
     path.parent.mkdir(exist_ok=True)
     table = json.loads(path.read_text()) if path.exists() else {}
     path.write_text(json.dumps({**table, name: found}, indent=2) + "\n")
-
-
-__all__ = ["L2", "REST_MPS", "SPEED_MPS", "B", "Driver", "FakeGo2", "HostStall", "Peer", "Rig", "report"]

@@ -52,13 +52,6 @@ def test_with_neither_a_runner_nor_a_bridge_it_fails_and_names_the_remote(tmp_pa
 # A robot at the wire, the real bridge, the smallest driver
 
 
-@pytest.fixture
-def robot(dds_domain: int) -> Iterator[FakeGo2]:
-    robot = FakeGo2(dds_domain)
-    yield robot
-    robot.close()
-
-
 @dataclass(frozen=True)
 class Side:
     """The bridge's side of one robot."""
