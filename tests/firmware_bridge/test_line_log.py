@@ -9,7 +9,7 @@ from firmware_bridge.line_log import LineLog
 
 
 class StalledStream(io.StringIO):
-    """A stream that takes nothing until it is told to."""
+    """A stream that takes nothing until `flowing` is set."""
 
     def __init__(self) -> None:
         super().__init__()
