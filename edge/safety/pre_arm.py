@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from edge.safety.monitors.frame import Picture
 from edge.safety.monitors.watch import Watch
 from edge.safety.supervisor import State, Supervisor, SupervisorInputs
+from edge.state.frame import Frame
 from edge.state.pose_history import StampedPose
 
 STOPPED_NS: Final = 2_000_000_000
@@ -21,7 +21,7 @@ class PreArm:
         self,
         watch: Watch,
         *,
-        picture: Callable[[], Picture | None],
+        picture: Callable[[], Frame | None],
         pose: Callable[[], StampedPose | None],
         clock: Callable[[], int],
     ) -> None:

@@ -24,10 +24,6 @@ class Attitude(Protocol):
     """What the monitor reads of the robot's state."""
 
     @property
-    def received_ns(self) -> int:
-        """When it arrived."""
-
-    @property
     def roll_rad(self) -> float:
         """About the forward axis."""
 

@@ -100,7 +100,7 @@ class Rig:
         self.socket, self.latch = folder / "bridge.sock", folder / "bridge.sock.latch"
 
     def reset(self) -> None:
-        """A robot that stands, walks as commanded and has heard nothing."""
+        """A robot that stands, walks as commanded and has received nothing."""
         self.robot.reset()
         self.robot.mode, self.robot.walks = ids.MODE_BALANCE_STAND, True
 
@@ -139,16 +139,16 @@ class Rig:
     def moved_since(self, since_ns: int) -> bool:
         """Whether the robot has received a command that moves it."""
         return any(
-            heard.received_ns > since_ns and (heard.api_id in STANDING_UP or heard.velocity not in (None, ZERO))
-            for heard in list(self.robot.heard)
+            one.received_ns > since_ns and (one.api_id in STANDING_UP or one.velocity not in (None, ZERO))
+            for one in list(self.robot.received)
         )
 
     def zero_after_ms(self, since_ns: int, timeout_s: float = 3.0) -> float:
         """From `since_ns` until the first zero Move after which only zeros came for 0.3 s."""
-        heard = self.robot.heard
+        received = self.robot.received
 
         def first() -> int | None:
-            moves = [one for one in list(heard) if one.velocity is not None and one.received_ns > since_ns]
+            moves = [one for one in list(received) if one.velocity is not None and one.received_ns > since_ns]
             last = max((index for index, one in enumerate(moves) if one.velocity != ZERO), default=-1)
             return moves[last + 1].received_ns if last + 1 < len(moves) else None
 

@@ -30,30 +30,23 @@ STOP_BOUND_NS = 300_000_000
 ZERO = (0.0, 0.0, 0.0)
 
 
-def lasting_zero_ns(robot: FakeGo2, since_ns: int, bound_ns: int, host: HostStall, wait_s: float = 0.6) -> int:
-    """Check that the robot heard zero within the bound of `since_ns` and nothing but zeros after it; how soon, ns."""
-    latency_ns = latency_to_zero_ns(robot, since_ns, wait_s)
-    check_stop_latency(latency_ns, bound_ns, since_ns, host)
-    return latency_ns
+def check_lasting_zero(robot: FakeGo2, since_ns: int, bound_ns: int, host: HostStall, wait_s: float = 0.6) -> None:
+    """Check that the robot received zero within the bound of `since_ns`, and nothing but zeros after it."""
+    time.sleep(wait_s)
+    moves = robot.moves()
+    last_moving = max(i for i, command in enumerate(moves) if command.velocity != ZERO)
+    assert last_moving + 1 < len(moves), "no zero velocity was ever received"
+    check_stop_latency(moves[last_moving + 1].received_ns - since_ns, bound_ns, since_ns, host)
 
 
-def wait_for_heard(robot: FakeGo2, api_id: int) -> int:
-    """When the robot heard the first such request that it still remembers, ns."""
-    wait_for(lambda: any(heard.api_id == api_id for heard in list(robot.heard)), 10, f"request {api_id}")
-    return next(heard.received_ns for heard in list(robot.heard) if heard.api_id == api_id)
+def wait_for_request(robot: FakeGo2, api_id: int) -> int:
+    """When the robot received the first such request that it still remembers, ns."""
+    wait_for(lambda: any(command.api_id == api_id for command in list(robot.received)), 10, f"request {api_id}")
+    return next(command.received_ns for command in list(robot.received) if command.api_id == api_id)
 
 
 def driver(socket_path: Path, folder: Path):
     return running("tests.support.robot.bridge_driver", socket_path, 0.5, folder=folder)
-
-
-def latency_to_zero_ns(robot: FakeGo2, since_ns: int, wait_s: float = 0.6) -> int:
-    """From `since_ns` until the robot heard its first zero velocity with nothing but zeros after it."""
-    time.sleep(wait_s)
-    moves = robot.moves()
-    last_moving = max(i for i, heard in enumerate(moves) if heard.velocity != ZERO)
-    assert last_moving + 1 < len(moves), "no zero velocity was ever heard"
-    return moves[last_moving + 1].received_ns - since_ns
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
@@ -65,9 +58,8 @@ def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(
         time.sleep(0.25)
         since_ns = time.monotonic_ns()
         os.kill(runner.pid, number)
-        latency_ns = latency_to_zero_ns(robot, since_ns)
-        check_stop_latency(latency_ns, STOP_BOUND_NS, since_ns, host)
-        assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard if heard.received_ns > since_ns]
+        check_lasting_zero(robot, since_ns, STOP_BOUND_NS, host)
+        assert ids.STOP_MOVE in [command.api_id for command in robot.received if command.received_ns > since_ns]
         runner.process.kill()
 
 
@@ -79,10 +71,10 @@ def test_a_frozen_runner_that_thaws_does_not_drive_again(
         wait_for(robot.is_driven, 20, "the robot is driven")
         os.kill(runner.pid, signal.SIGSTOP)
         time.sleep(0.5)
-        robot.heard.clear()
+        robot.received.clear()
         os.kill(runner.pid, signal.SIGCONT)
         time.sleep(0.5)
-        assert robot.moves() and all(heard.velocity == ZERO for heard in robot.moves())
+        assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
 
 def test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move(
@@ -90,10 +82,10 @@ def test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move(
 ) -> None:
     with driver(socket_path, tmp_path):
         wait_for(robot.is_driven, 20, "the robot is driven")
-        robot.heard.clear()
+        robot.received.clear()
         assert bridge.end() == 0
     wait_for(lambda: robot.moves() and robot.moves()[-1].velocity == ZERO, 20, "zero as the last command")
-    assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard]
+    assert ids.STOP_MOVE in [command.api_id for command in robot.received]
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["zero_after_stop"] and result["last_command"] == [0.0, 0.0, 0.0]
     assert not socket_path.exists()
@@ -120,7 +112,7 @@ def test_nothing_is_sent_before_arm(robot: FakeGo2, bridge: Running, socket_path
     client.stop()
     client.close()
     time.sleep(0.2)
-    assert robot.heard == []
+    assert robot.received == []
 
 
 @pytest.mark.slow
@@ -187,7 +179,7 @@ def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
         wait_for(rogue.connected, 5, "the rogue to find the robot")
         since_ns = time.monotonic_ns()
         rogue.send(ids.MOVE, move_parameter(0.7, 0.0, 0.0), noreply=True)
-        lasting_zero_ns(robot, since_ns, 500_000_000, host)
+        check_lasting_zero(robot, since_ns, 500_000_000, host)
     assert "another client commands the robot (sport 1008)" in bridge.stderr()
 
 
@@ -217,7 +209,7 @@ def test_a_hand_on_the_remote_is_zero_within_60_ms(
         wait_for(robot.is_driven, 20, "the robot is driven")
         since_ns = time.monotonic_ns() + 20_000_000  # the fake robot reports every 20 ms
         robot.remote = remote
-        lasting_zero_ns(robot, since_ns, 60_000_000, host)
+        check_lasting_zero(robot, since_ns, 60_000_000, host)
     assert said in bridge.stderr()
 
 
@@ -235,12 +227,12 @@ def test_a_late_move_is_answered_within_40_ms_and_motion_after_a_stop_by_another
         wait_for(lambda: client.poll().state == "stopped", 20, "stopped")
         late.send(ids.MOVE, move_parameter(0.5, 0.0, 0.0), noreply=True)
         # Not whether it is driven: the answer may be there before anybody looks.
-        wait_for(lambda: any(heard.velocity != ZERO for heard in robot.moves()), 5, "the late Move")
-        since_ns = next(heard.received_ns for heard in robot.moves() if heard.velocity != ZERO)
-        lasting_zero_ns(robot, since_ns, 40_000_000, host)
-    robot.heard.clear()
+        wait_for(lambda: any(command.velocity != ZERO for command in robot.moves()), 5, "the late Move")
+        since_ns = next(command.received_ns for command in robot.moves() if command.velocity != ZERO)
+        check_lasting_zero(robot, since_ns, 40_000_000, host)
+    robot.received.clear()
     robot.truth, robot.mode = {"velocity_world_mps": np.array((0.3, 0.0, 0.0))}, ids.MODE_LOCOMOTION
-    wait_for_heard(robot, ids.STOP_MOVE)
+    wait_for_request(robot, ids.STOP_MOVE)
     client.close()
 
 
@@ -253,9 +245,11 @@ def test_a_stop_move_that_is_never_answered_holds_nothing_up(
         wait_for(robot.is_driven, 20, "the robot is driven")
         since_ns = time.monotonic_ns()
         runner.process.kill()
-        lasting_zero_ns(robot, since_ns, STOP_BOUND_NS, host)
+        check_lasting_zero(robot, since_ns, STOP_BOUND_NS, host)
         zeros = [
-            heard.received_ns for heard in robot.moves() if heard.velocity == ZERO and heard.received_ns > since_ns
+            command.received_ns
+            for command in robot.moves()
+            if command.velocity == ZERO and command.received_ns > since_ns
         ]
         for earlier_ns, later_ns in pairwise(zeros):
             check_stop_latency(later_ns - earlier_ns, 40_000_000, earlier_ns, host)
@@ -270,11 +264,11 @@ def test_a_killed_bridges_successor_stops_the_moving_robot_first(
         robot.truth, robot.mode = {"velocity_world_mps": np.array((0.5, 0.0, 0.0))}, ids.MODE_LOCOMOTION
         bridge.process.kill()
         bridge.process.wait()
-    robot.heard.clear()
+    robot.received.clear()
     arguments = ("--robot", GO2_SIM, "--domain", dds_domain, "--socket", socket_path)
     with running("firmware_bridge.bridge", *arguments, folder=tmp_path / "again") as successor:
-        wait_for_heard(robot, ids.STOP_MOVE)
-        assert robot.heard[0].velocity == ZERO
+        wait_for_request(robot, ids.STOP_MOVE)
+        assert robot.received[0].velocity == ZERO
         wait_for(lambda: "the robot was moving" in successor.stderr(), 5, "the reason")
 
 
@@ -286,10 +280,10 @@ def test_a_bridge_that_was_frozen_does_not_drive_on(
         wait_for(robot.is_driven, 20, "the robot is driven")
         os.kill(bridge.pid, signal.SIGSTOP)
         time.sleep(0.6)
-        robot.heard.clear()
+        robot.received.clear()
         os.kill(bridge.pid, signal.SIGCONT)
         time.sleep(0.5)
-        assert robot.moves() and all(heard.velocity == ZERO for heard in robot.moves())
+        assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
 
 def test_another_robot_than_the_files_is_not_armed(robot: FakeGo2, bridge: Running, socket_path: Path) -> None:
@@ -297,7 +291,7 @@ def test_another_robot_than_the_files_is_not_armed(robot: FakeGo2, bridge: Runni
     client = BridgeClient(socket_path)
     client.arm()
     wait_for(lambda: client.poll().cause == "wrong_robot", 10, "the refusal")
-    assert {heard.api_id for heard in robot.heard} == {ids.API_VERSION}
+    assert {command.api_id for command in robot.received} == {ids.API_VERSION}
     client.close()
 
 
@@ -314,7 +308,7 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
         assert status("status")["state"] == "armed"
         since_ns = time.monotonic_ns()
         stopped = status("stop")
-        lasting_zero_ns(robot, since_ns, 100_000_000, host, wait_s=0.3)
+        check_lasting_zero(robot, since_ns, 100_000_000, host, wait_s=0.3)
     assert (stopped["state"], stopped["cause"]) == ("stopped", "estop")
     with driver(socket_path, tmp_path):
         wait_for(lambda: "arm refused" in bridge.stderr(), 10, "the refusal")
@@ -340,7 +334,7 @@ def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
 
         client.arm()
         wait_for(lambda: told("disarmed", "operator"), 10, "the refusal")
-        assert robot.heard == []
+        assert robot.received == []
         assert operate("arm", socket_path)[0] == 0
         client.arm()
         wait_for(lambda: told("armed", "none"), 20, "armed")

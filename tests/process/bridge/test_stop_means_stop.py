@@ -241,7 +241,7 @@ class TestNotAlone:
                 time.sleep(0.5)
                 assert not rig.moved_since(since_ns)
                 assert runner.status is not None and runner.status.blocked_by == "second_publisher"
-            driven = [one for one in second.heard if one.velocity not in (None, (0.0, 0.0, 0.0))]
+            driven = [one for one in second.received if one.velocity not in (None, (0.0, 0.0, 0.0))]
             assert all(one.received_ns < since_ns for one in driven), "the second robot was driven"
             second.close()
             wait_for(lambda: rig.operate("status")[1]["blocked_by"] != "second_publisher", 15, "a robot alone again")

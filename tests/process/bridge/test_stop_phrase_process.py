@@ -83,7 +83,7 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         assert "stopped" in done.stdout and "`edge-bridge arm`" in done.stdout
         first_zero = next(heard for heard in robot.moves() if heard.velocity == ZERO and _lasts(robot, heard))
         check_stop_latency(first_zero.received_ns - ended_ns, 0, ended_ns, host)
-        assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard]
+        assert ids.STOP_MOVE in [heard.api_id for heard in robot.received]
     with side.drive():
         wait_for(lambda: "arm refused" in side.bridge.stderr(), 10, "the refusal")
         time.sleep(0.5)
