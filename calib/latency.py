@@ -34,7 +34,7 @@ from edge.run.reasoning_loop import Mode
 from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20
-"""Generations that a profile is made of at least: fewer say nothing of the slow ones."""
+"""Generations that a profile is made of at least: fewer show too little of the slow ones."""
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 
 EXAMPLES: Final = """examples:

@@ -1,4 +1,4 @@
-"""`edge-calib odometry`: fits a robot's odometry to what its gyro and camera, or a measured truth, say of a drive.
+"""`edge-calib odometry`: fits a robot's odometry to what its gyro and camera, or a measured truth, show of a drive.
 
 The drive is cut into intervals: between two answers of the camera, or by time where there is a truth. For each, the
 robot's own motion is compared with the reference. Scales and bias come from least squares with the calibration of an
@@ -36,7 +36,7 @@ from edge.odometry.camera_geometry import Attitude, CameraGeometry
 from edge.odometry.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.odometry.drift_rate import Comparison, DriftMonitor
 from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
-from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
+from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from firmware_bridge.core.config import ConfigError, load_robot_config
 
 Array = npt.NDArray[np.float64]
@@ -65,7 +65,7 @@ class NoFitError(ValueError):
 
 @dataclass(frozen=True)
 class Drive:
-    """What a log says: reports in the order of their stamps, and pictures (stamp, JPEG)."""
+    """A log's content: reports in the order of their stamps, and pictures (stamp, JPEG)."""
 
     reports: tuple[OdometryInputs, ...]
     pictures: tuple[tuple[int, bytes], ...]
@@ -166,15 +166,11 @@ def gyro_bias(drive: Drive, prior: OdometryCalibration) -> tuple[float, float]:
         and abs(report.gyro_wz_radps) < STILL_RADPS
         and (report.commanded is None or not any(report.commanded))
     ]
-    seconds = len(rates) * _period_s(drive)
+    span_ns = drive.reports[-1].received_ns - drive.reports[0].received_ns
+    seconds = len(rates) * span_ns / 1e9 / max(1, len(drive.reports) - 1)
     if seconds < 0.5:
         return prior.gyro_bias_radps, prior.gyro_bias_sigma_radps
     return float(np.mean(rates)), GYRO_NOISE_RADPS_RTHZ / math.sqrt(seconds)
-
-
-def _period_s(drive: Drive) -> float:
-    span_ns = drive.reports[-1].received_ns - drive.reports[0].received_ns
-    return span_ns / 1e9 / max(1, len(drive.reports) - 1)
 
 
 def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]:
@@ -189,13 +185,10 @@ def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]
         report = drive.reports[min(bisect_right(stamps, stamp_ns), len(stamps) - 1)]
         motion = eye.step(grey, stamp_ns, Attitude(report.roll_rad, report.pitch_rad))
         if motion is not None:
-            found.append(_reference(motion))
+            c = motion.covariance
+            variance_m2 = 0.5 * (c[0] + c[4])
+            found.append(Reference(motion.start_ns, motion.end_ns, motion.T_start_end, variance_m2, c[8]))
     return found
-
-
-def _reference(motion: VisualMotion) -> Reference:
-    c = motion.covariance
-    return Reference(motion.start_ns, motion.end_ns, motion.T_start_end, 0.5 * (c[0] + c[4]), c[8])
 
 
 def truth_references(path: Path, begin_ns: int, end_ns: int) -> list[Reference]:
@@ -365,7 +358,7 @@ def _references(args: argparse.Namespace, drive: Drive) -> list[Reference]:
     if args.truth is not None:
         return truth_references(args.truth, drive.reports[0].received_ns, drive.reports[-1].received_ns)
     if args.robot is None:
-        raise LogError("expected --robot FILE.toml, whose [mount] says how the camera looks at the floor, or --truth")
+        raise LogError("expected --robot FILE.toml, whose [mount] describes how the camera sees the floor, or --truth")
     mount = load_robot_config(args.robot).mount
     if mount is None:
         raise LogError(f"{args.robot}: has no [mount]: add how the camera is mounted, or give --truth")

@@ -50,7 +50,7 @@ class Counts:
 
 
 class EnergyLog:
-    """Reads a meter all the time and says the energy between two instants."""
+    """Reads a meter all the time and integrates its power between two instants."""
 
     def __init__(self, meter: PowerMeter, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._meter = meter

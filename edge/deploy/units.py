@@ -34,7 +34,7 @@ RESTART_STEPS_SINCE: Final = 254
 """First version of systemd with RestartSteps= (its NEWS file)."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
-"""Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
+"""Of the machine's memory, where the target gives none: the rest is left to everything else; a choice of ours."""
 WIDEST_PREFIX: Final = 16
 """Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
@@ -142,7 +142,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         "It gives its sockets to these groups; the runner is not in the second, so it can take back no emergency stop.",
         ("SupplementaryGroups", f"{users.runner} {users.operators}"),
         *_ending(watchdog_s=1, start_s=20, stop_s=2),
-        "Always, also after a clean exit: without it the robot has nobody that can stop it.",
+        "Always, also after a clean exit: without it nothing can stop the robot.",
         ("Restart", "always"),
         *_back_off(inputs.systemd),
         "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
@@ -247,12 +247,12 @@ def runner_unit(inputs: ServiceInputs) -> str:
 def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
     if not inputs.operator_arm:
         return [
-            "A runner that arms by itself would drive on after a crash, before anybody has looked at the robot.",
+            "A runner that arms by itself would drive on after a crash, before a person has seen the robot.",
             ("Restart", "no"),
         ]
     return [
         "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
-        "nobody but the operator starts the robot again after it.",
+        "only the operator starts the robot again after it.",
         ("Restart", "on-abnormal"),
         ("RestartSec", "2s"),
     ]
@@ -339,7 +339,7 @@ def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | 
         ("CapabilityBoundingSet", ""),
         ("ProtectHome", "tmpfs" if hidden else "yes"),
         *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
-        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which anybody else could have put there.",
+        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which another user could have put there.",
         *_confinement(),
     ]
 

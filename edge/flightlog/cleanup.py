@@ -2,7 +2,7 @@
 start.
 
 A recording bounds itself, but every start makes another. Whole runs are deleted, the oldest first, until the rest fits;
-the newest runs stay whatever they take, so that what happened last can always be looked at.
+the newest runs stay whatever they take, so that the last events can always be read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EXAMPLES = """examples:
   python -m edge.flightlog.cleanup /var/lib/tic-vla-edge
   python -m edge.flightlog.cleanup /var/lib/tic-vla-edge --keep-bytes 2000000000
 
-Only files named flight-ID.mcap and flight-ID.NNN.mcap are looked at.
+Only files named flight-ID.mcap and flight-ID.NNN.mcap are considered.
 exit codes: 0 done, 2 bad arguments or a folder that cannot be read or written, 130 interrupted
 """
 

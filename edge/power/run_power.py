@@ -1,4 +1,4 @@
-"""The power side of a run: the target's meter, its governor, and what the program tells them it is doing."""
+"""The power side of a run: the target's meter, its governor, and what both know of the program's activity."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def make_power_monitor(
 ) -> PowerMonitor:
     """The monitor of a target's power plan; raises ArtifactError.
 
-    Without the meter that the target names, its model stands in and the operator is told.
+    Without the meter that the target names, its model stands in and `say` gets a line.
     """
     plan = read_power_plan(artifacts)
     return PowerMonitor(

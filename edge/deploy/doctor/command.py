@@ -262,7 +262,7 @@ def _tick(args: argparse.Namespace, artifacts: Artifacts, plan: PlanFacts | None
             artifacts, args.ticks, TICK_BUDGET_S, min(prompt, artifacts.runtime.max_context)
         )
     except (ArtifactError, GraphError) as error:
-        return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR says what is wrong")
+        return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR names what is wrong")
     return doctor_graphs.judge_ticks(times_ms, plan, artifacts.runtime.tick_period_ms)
 
 

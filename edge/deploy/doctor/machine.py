@@ -63,13 +63,13 @@ def power_mode(wanted: str, root: Path, query: Query) -> Check:
         return Check(name, Level.FAIL, problem, wanted, advice)
     asked, online = mode_cores(conf, wanted), core_numbers(_text(root / "sys/devices/system/cpu/online"))
     if asked and online and asked != online:
-        found = f"nvpmodel says {wanted}, but cores {_listed(online)} are online"
+        found = f"nvpmodel reports {wanted}, but cores {_listed(online)} are online"
         return Check(name, Level.FAIL, found, f"cores {_listed(asked)}", "reboot: this mode is taken at start-up only")
     return Check(name, Level.OK, wanted, wanted)
 
 
 def mode_cores(conf: str, mode: str) -> set[int]:
-    """Processor cores that a mode of an nvpmodel configuration has online; empty if it does not say."""
+    """Processor cores that a mode of an nvpmodel configuration has online; empty if it names none."""
     block = re.search(rf"<\s*POWER_MODEL\s+ID=\d+\s+NAME={re.escape(mode)}\s*>([^<]*)", conf)
     entries = re.findall(r"^\s*CPU_ONLINE\s+CORE_(\d+)\s+([01])\s*$", block[1] if block else "", re.MULTILINE)
     return {int(core) for core, on in entries if on == "1"}
@@ -200,7 +200,7 @@ def memory(plan: PlanFacts | None, root: Path, *, own_memory: bool = False) -> C
         return skipped(name, "the artifacts have no plan")
     found = re.search(r"^MemAvailable:\s+(\d+) kB$", _text(root / "proc/meminfo"), re.MULTILINE)
     if found is None:
-        return skipped(name, "/proc/meminfo does not say what is available")
+        return skipped(name, "/proc/meminfo has no MemAvailable")
     free, need = int(found[1]) * 1024, plan.memory_bytes
     if own_memory:
         return skipped(

@@ -38,7 +38,7 @@ class UserRights:
     uid: int
     groups: frozenset[int]
     other: bool
-    """Not the user who runs this: nothing can be tried, only read."""
+    """Not the user that runs this: nothing can be tried, only read."""
 
     def may(self, path: Path, *, write: bool = False) -> bool:
         """Whether the user may read (and write) a file: by owner, groups and mode, without access lists for another."""
@@ -89,7 +89,7 @@ def user_named(name: str | None) -> UserRights:
 
 
 def try_priority(priority: int) -> list[str]:
-    """Ask for real time in a thread that then ends; lines that say what was refused."""
+    """Ask for real time in a thread that then ends; lines about what was refused."""
     lines: list[str] = []
     thread = threading.Thread(target=lambda: lines.extend(enter(Role("control", (), priority))))
     thread.start()
@@ -140,7 +140,7 @@ def device_access(providers: Sequence[str], root: Path, user: UserRights) -> Che
 
 
 def _is_for_writing(node: Path) -> bool:
-    """Whether the driver lets anybody but root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    """Whether the driver lets other users than root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
     return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
 
 
@@ -157,7 +157,7 @@ def socket_folder(socket: Path, user: UserRights) -> Check:
     if mode == SHARED_FOLDER_MODE:
         return _service_sockets(socket, user, found.st_uid)
     if mode & 0o077:
-        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: anybody could command the robot"
+        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: any user could command the robot"
         return Check(name, Level.FAIL, text, expected, advice)
     if found.st_uid != user.uid and user.uid != 0:
         expected = f"user {user.uid} ({user.name})"
@@ -200,7 +200,7 @@ def power_meter(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Check:
-    """Whether the meter that the target names can be read, and what it says."""
+    """Whether the meter that the target names can be read, and its reading."""
     name = "power meter"
     if kind in ("none", "modelled"):
         return skipped(name, f"the target's meter is {kind!r}")

@@ -106,7 +106,7 @@ def bridge(robot: RobotConfig, ask: Callable[[RobotConfig], BridgeStatus | None]
         return Check(name, Level.OK, f"{found}; waits for `edge-bridge arm`", "ready to arm")
     if status.blocked_by != "none":
         advice = _ADVICE.get(
-            status.blocked_by, f"arming is refused because of {status.blocked_by}; edge-bridge status says more"
+            status.blocked_by, f"arming is refused because of {status.blocked_by}; edge-bridge status shows more"
         )
         return Check(name, Level.FAIL, f"{found}; blocked by {status.blocked_by}", "ready to arm", advice)
     return Check(name, Level.OK, found, "ready to arm")

@@ -45,7 +45,7 @@ input, 3 refused (artifacts), 130 interrupted
 """
 
 LEAST_SHARE = 0.9
-"""Of the ticks with a plan that must have been run again: agreement of a few says nothing of the run."""
+"""Of the ticks with a plan that must have been run again: agreement of a few proves nothing about the run."""
 _PROGRESS_PERIOD_NS = 2_000_000_000
 
 

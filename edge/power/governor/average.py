@@ -19,7 +19,7 @@ class PowerHistory:
     """Energy of the last seconds, at any rate of samples, with bounded memory.
 
     A sample holds until the next one, but not longer than `hold_s`: a gap beyond that belongs to no sample and is left
-    out of averages. Before the first sample everything is taken to have been as the first sample says.
+    out of averages. Before the first sample the power is taken to be that of the first sample.
     """
 
     def __init__(self, keep_s: float, hold_s: float = 1.0, capacity: int = 4096) -> None:

@@ -197,7 +197,7 @@ class Governor:
             self._history.add(now_ns, levels.at(share))
 
     def _aim(self, budget_w: float, average_w: float | None, now_ns: int) -> float:
-        """The budget less what experience says that the computed pause lacks."""
+        """The budget less what the computed pause has lacked so far."""
         dt_s = 0.0 if self._last is None else min(1.0, (now_ns - self._last[0]) / 1e9)
         over_w = 0.0 if average_w is None else max(0.0, average_w - budget_w)
         self._trim_w += (over_w * _TRIM_PER_S - self._trim_w / _TRIM_FORGET_S) * dt_s
@@ -211,7 +211,7 @@ class Governor:
         if measured is None:
             return None if model is None else model.generation_s(self._tokens(cap))
         if model is None:
-            # Without a plan nothing says how much of a generation is text: half of a full one.
+            # Without a plan the share of decoding in a generation is unknown: half of a full one.
             return measured[1] * (1 + _SHARES[cap]) / (1 + _SHARES[measured[0]])
         return measured[1] * model.generation_s(self._tokens(cap)) / model.generation_s(self._tokens(measured[0]))
 

@@ -1,4 +1,4 @@
-"""What an artifact directory's manifest says of power: the meter, the budget and the modelled energy of every stage."""
+"""The power plan in a manifest: the meter, the budget and the modelled energy of every stage."""
 
 from __future__ import annotations
 

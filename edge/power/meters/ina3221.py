@@ -40,7 +40,7 @@ class Rail:
 
 
 class Ina3221Meter:
-    """All labelled rails; the total is the rail that feeds the module, or without one a sum that says so."""
+    """All labelled rails; the total is the rail that feeds the module, or without one a sum with a caveat."""
 
     def __init__(self, rails: tuple[Rail, ...], rail: str | None = None) -> None:
         """`rail` names the total's rail; one that the board lacks is replaced as above. Raises MeterError."""

@@ -28,7 +28,7 @@ class NvmlMeter:
 
     @classmethod
     def open(cls, module: Any = None, index: int = 0) -> NvmlMeter:
-        """The card's meter; raises MeterError that says what is missing."""
+        """The card's meter; raises MeterError that names what is missing."""
         if module is None:
             try:
                 module = importlib.import_module("pynvml")

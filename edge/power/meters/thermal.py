@@ -19,7 +19,7 @@ JUNCTION: Final = ("tj-thermal", "tj-therm", "Tj-therm")
 LOWEST_C, HIGHEST_C = -40.0, 150.0
 """A disabled Jetson zone reads -256 °C."""
 LOWEST_TRIP_C: Final = 50.0
-"""A passive trip below it is a user's trip that nobody has set."""
+"""A passive trip below it is a user's trip that is not set."""
 WARNS_ONLY: Final = "hot-surface-alert"
 """Jetson's cooling device that says "do not touch" from a passive trip at 70 °C on, and slows nothing down."""
 # A fan that turns is no throttling, and some boards cap devfreq at rest.
@@ -31,7 +31,7 @@ _EVENT_FOLDERS = "devices/platform/**/soctherm-oc-event/hwmon/hwmon*"
 
 @dataclass(frozen=True)
 class ThermalState:
-    """One reading; None for what the board does not say."""
+    """One reading; None for what the board does not report."""
 
     stamp_ns: int
     zones_c: Mapping[str, float] = field(default_factory=dict)

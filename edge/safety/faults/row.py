@@ -58,7 +58,7 @@ class Fault:
     clear_ms: int = 1000
     """An unlatched fault ends when it has not been found for this long."""
     speed_scale: float = 1.0
-    """A limit's share of the speed limit; 1 keeps the speed and only tells the operator."""
+    """A limit's share of the speed limit; 1 keeps the speed and only shows the message."""
     escalation: Escalation | None = None
 
     def __post_init__(self) -> None:

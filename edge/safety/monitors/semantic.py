@@ -70,5 +70,5 @@ class SemanticMonitor:
         self._generation = semantic.generation
         if semantic.waypoints is not None:
             self._invalid = 0
-        elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
+        elif semantic.text_complete:  # a text that the budget cut short proves nothing about the model
             self._invalid += 1

@@ -48,13 +48,13 @@ def test_ten_thousand_hostile_datagrams_neither_crash_it_nor_move_the_robot_too_
             if seq % 100 == 0:
                 sent(client, encode(Velocity(seq, time.monotonic_ns(), 0.3, 0.0, 0.0)))
                 time.sleep(0.01)
-        moves = [heard for heard in robot.moves() if heard.received_ns > since_ns]
+        moves = [command for command in robot.moves() if command.received_ns > since_ns]
         for earlier, later in pairwise(moves):
             gap_ns = later.received_ns - earlier.received_ns
             check_stop_latency(gap_ns, 40_000_000, earlier.received_ns, host)
     assert bridge.process.poll() is None
     assert len(moves) > 30
-    for vx_mps, vy_mps, wz_radps in (heard.velocity for heard in moves):
+    for vx_mps, vy_mps, wz_radps in (command.velocity for command in moves):
         assert limits.vx_min_mps <= vx_mps <= limits.vx_max_mps
         assert abs(vy_mps) <= limits.vy_max_mps and abs(wz_radps) <= limits.wz_max_radps
     client.close()

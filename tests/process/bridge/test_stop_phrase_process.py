@@ -81,9 +81,9 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         ended_ns = time.monotonic_ns()
         assert done.returncode == 0, done.stderr
         assert "stopped" in done.stdout and "`edge-bridge arm`" in done.stdout
-        first_zero = next(heard for heard in robot.moves() if heard.velocity == ZERO and _lasts(robot, heard))
+        first_zero = next(command for command in robot.moves() if command.velocity == ZERO and _lasts(robot, command))
         check_stop_latency(first_zero.received_ns - ended_ns, 0, ended_ns, host)
-        assert ids.STOP_MOVE in [heard.api_id for heard in robot.received]
+        assert ids.STOP_MOVE in [command.api_id for command in robot.received]
     with side.drive():
         wait_for(lambda: "arm refused" in side.bridge.stderr(), 10, "the refusal")
         time.sleep(0.5)
@@ -92,10 +92,10 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 
-def _lasts(robot: FakeGo2, heard: object) -> bool:
+def _lasts(robot: FakeGo2, command: object) -> bool:
     """Whether nothing but zero came after this one."""
     moves = robot.moves()
-    return all(later.velocity == ZERO for later in moves[moves.index(heard) :])  # type: ignore[arg-type]
+    return all(later.velocity == ZERO for later in moves[moves.index(command) :])  # type: ignore[arg-type]
 
 
 def test_a_bridge_that_hangs_is_no_confirmed_stop(robot: FakeGo2, side: Side) -> None:
