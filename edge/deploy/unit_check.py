@@ -84,14 +84,12 @@ def _check(tool: str, paths: Sequence[Path], run: Runner) -> UnitVerdict:
             exposure[path.name] = float(found[2])
         else:
             reason = next((line.strip() for line in text.splitlines() if line.strip()), "nothing")
-            not_checked.append(
-                f"{path.name}: its exposure was not scored ({reason}); systemd 250 and later score files"
-            )
+            not_checked.append(f"{path.name}: no score of its exposure ({reason}); systemd 250 and later score files")
     return UnitVerdict(tuple(complaints), tuple(others), exposure, tuple(not_checked))
 
 
 def _verify(tool: str, paths: Sequence[Path], run: Runner) -> tuple[list[str], list[str]]:
-    """Lines about these units, and about others. An unknown key is a line and status 0: the status alone is not enough."""
+    """Lines about these units, and about others. An unknown key is a line, with status 0."""
     status, text = run([tool, "verify", "--man=no", *(str(path) for path in paths)])
     ours = {path.name for path in paths}
     complaints: list[str] = []

@@ -140,7 +140,7 @@ def device_access(providers: Sequence[str], root: Path, user: UserRights) -> Che
 
 
 def _is_for_writing(node: Path) -> bool:
-    """Whether the driver lets other users than root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    """Whether not only root may write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
     return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
 
 
