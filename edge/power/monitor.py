@@ -16,8 +16,8 @@ from edge.power.governor.average import PowerStatistics
 from edge.power.governor.governor import LEVELS, OFF, Governor, GovernorInputs, GovernorOutputs
 from edge.power.meters.meter import MEASURED, MODELLED, BatteryReading, MeterError, PowerMeter, PowerSample, ReadBattery
 from edge.power.meters.thermal import OverCurrentEvents, ThermalReader, ThermalState
+from edge.reasoning.generation_cycle import ReasoningBudget
 from edge.safety.faults.findings import Finding
-from edge.state.reasoning_budget import ReasoningBudget
 
 PERIOD_S: Final = 0.1
 STALE_NS: Final = 500_000_000

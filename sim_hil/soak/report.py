@@ -14,9 +14,9 @@ from reporting import page
 from reporting.plot_style import delay_histogram
 from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak import figures
+from sim_hil.soak.analysis import Moment, read_moments
 from sim_hil.soak.run import SoakFolder
-from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED
-from sim_hil.soak.verdict.moments import Moment, read_moments
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED
 
 REPORT: Final = "report.html"
 SHOWN_MAPS: Final = 12
@@ -30,7 +30,7 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
     parts = [
         "<h1>Soak</h1>",
         _verdict(result),
-        _untrained(result),
+        "" if result["options"]["trained"] else UNTRAINED,
         page.tiles(_headline(result)),
         "<h2>Budget</h2>",
         _budget(result["budget"]),
@@ -82,6 +82,12 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
     return path
 
 
+UNTRAINED: Final = (
+    '<p class="notice"><b>The weights are untrained</b>: the robot moves but does not navigate. Success and '
+    "collisions below are meaningless; timing, memory, faults and stops are valid.</p>"
+)
+
+
 def _verdict(result: Mapping[str, Any]) -> str:
     kind = "good" if result["verdict"] == PASS else "bad"
     lines = result["budget"]
@@ -95,15 +101,6 @@ def _verdict(result: Mapping[str, Any]) -> str:
         f'<p><span class="verdict {kind}">{result["verdict"]}</span> {text}{more}.{cut}</p>'
         '<p class="quiet">Positions, contacts and success are ground truth, not the robot\'s odometry. '
         "All numbers are measured on this machine unless tagged as modelled.</p>"
-    )
-
-
-def _untrained(result: Mapping[str, Any]) -> str:
-    if result["options"]["trained"]:
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b>: the robot moves but does not navigate. Success and '
-        "collisions below are meaningless; timing, memory, faults and stops are valid.</p>"
     )
 
 
@@ -242,8 +239,7 @@ def _stops(legs: Sequence[Mapping[str, Any]]) -> str:
                 continue
             at_s = (end["t_ns"] - leg["begin_ns"]) / 1e9
             why = end["cause"] or f"ended with code {end['code']}"
-            explained = end["explained"] or '<span class="fail">unexplained</span>'
-            cause = page.text_html(end["explained"]) if end["explained"] else explained
+            cause = page.text_html(end["explained"]) or '<span class="fail">unexplained</span>'
             rows.append((str(leg["leg"]["number"]), f"{at_s:.0f}", cause, page.text_html(why, limit=300)))
     if not rows:
         return ""

@@ -12,7 +12,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
 from edge.safety.faults.table import FAULTS
-from sim_hil.protocols.fault_client import FaultClient, FaultError
+from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from tools.faults import __main__ as command
 from tools.faults import circle
 from tools.faults.measure import Sample

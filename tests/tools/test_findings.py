@@ -25,8 +25,9 @@ from tools.findings import __main__ as findings
 from tools.findings.__main__ import main, plan_lines, plan_of, rows_of
 from tools.findings.rows import CLAIMS, ROWS, RUNS, Finding, Level, runs_of
 from tools.findings.verdict import FAILS, HOLDS, OPEN, judge, judge_all, verdict_of
-from tools.train.config.evaluate import EvaluateConfig
-from tools.train.pipeline.evaluate import EvaluateError, write_suite
+from tools.train.config.checks import TrainError
+from tools.train.config.rl import EvaluateConfig
+from tools.train.pipeline.evaluate import write_suite
 
 TWO_S = LatencyProfile.constant(2.0)
 
@@ -311,7 +312,7 @@ def test_a_suite_of_other_numbers_is_not_taken_for_this_one(tmp_path: Path) -> N
     path = write_suite(tmp_path, few)
     before = path.stat().st_mtime_ns
     assert write_suite(tmp_path, replace(few, latency_s=1.0)) == path and path.stat().st_mtime_ns == before
-    with pytest.raises(EvaluateError, match="delete"):
+    with pytest.raises(TrainError, match="delete"):
         write_suite(tmp_path, replace(few, episodes=2))
 
 

@@ -11,8 +11,7 @@ from safetensors.numpy import save_file
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
 from tools.findings.models import main, models_of
-from tools.train.config.recipe import load_recipe
-from tools.train.config.variants import VARIANTS
+from tools.train.config.recipe import VARIANTS, load_recipe
 
 
 def run_of(folder: Path, *stages: str, variant: str = "full", policy: float | None = None) -> Path:

@@ -28,7 +28,7 @@ from edge.core.cli import (
     write_result,
 )
 from edge.flightlog.recorder import space_refusal
-from sim_hil.protocols.fault_client import FaultError
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.stack import free_domain, socket_dir
 from tools.faults.host_stall import HostStall

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
-from sim_hil.protocols.fault_client import FaultClient, FaultError
+from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
 from tools.demo import INSTRUCTION

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from edge.safety.faults.table import FAULTS, Action
-from sim_hil.protocols.fault_client import TIMEOUT_S
+from sim_hil.protocols.fault_socket import TIMEOUT_S
 from tools.faults.rig import Rig
 
 BRIDGE_STOP_MS = 300

@@ -15,8 +15,7 @@ from safetensors import SafetensorError, safe_open
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from tools.findings.rows import AFTER, BEFORE
 from tools.train.config.recipe import Recipe, RecipeError, load_recipe
-from tools.train.run.exported import COMMAND, ExportError, export_artifacts
-from tools.train.run.network_file import stage_weights
+from tools.train.run.network_file import COMMAND, ExportError, export_artifacts, stage_weights
 
 EXAMPLES: Final = """examples:
   edge-train all --preset nano --out out/run

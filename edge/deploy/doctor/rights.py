@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from edge.artifacts.device_nodes import device_nodes
+from edge.artifacts.providers import device_nodes
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.unit_text import RUNNER_USER
 from edge.deploy.units import NEED_DEVICES

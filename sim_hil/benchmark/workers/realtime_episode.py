@@ -101,9 +101,9 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
     )
     with _asked_to_end(), Stack(options) as stack:
         drive = _run(stack, task, tell)
-        stack.end_runner()
-        stack.end_bridge()
-        stack.end_robot()
+        stack.end("runner")
+        stack.end("bridge")
+        stack.end("robot")
     fell = bool(_json(stack.result("edge-hil")).get("fell", False))
     if fell and drive.end != "reached":
         drive.end = "fell"

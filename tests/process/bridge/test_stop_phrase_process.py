@@ -52,6 +52,14 @@ def test_with_neither_a_runner_nor_a_bridge_it_fails_and_names_the_remote(tmp_pa
 # A robot at the wire, the real bridge, the smallest driver
 
 
+@pytest.fixture
+def robot(dds_domain: int) -> Iterator[FakeGo2]:
+    """Gone at the end of its test: the simulated robot below must be the only one."""
+    robot = FakeGo2(dds_domain)
+    yield robot
+    robot.close()
+
+
 @dataclass(frozen=True)
 class Side:
     """The bridge's side of one robot."""
@@ -129,8 +137,10 @@ class Stack:
 
     def drive(self, ready: str = "driving") -> object:
         where = ("--robot", GO2_SIM, "--socket", self.bridge, "--domain", self.domain)
-        told = ("--instruction", "walk down the corridor", "--instructions", self.instructions)
-        return running("edge.runner", "--artifacts", self.artifacts, *where, *told, folder=self.folder, ready=ready)
+        texts = ("--instruction", "walk down the corridor", "--instructions", self.instructions)
+        return running(
+            "edge.run.command", "--artifacts", self.artifacts, *where, *texts, folder=self.folder, ready=ready
+        )
 
     def say(self, text: str) -> subprocess.CompletedProcess[str]:
         return say(text, "--to", self.instructions, folder=self.folder)

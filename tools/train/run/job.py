@@ -1,15 +1,26 @@
-"""The interface of a stage: `StageJob` with recipe, folder, device, seed, ranks and progress display."""
+"""The interface of a stage, `StageJob`, and its progress display: a bar on a terminal, otherwise lines."""
 
 from __future__ import annotations
 
 import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TextIO
 from zlib import crc32
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from reporting.build_progress import duration
 from tools.train.config.recipe import Recipe
@@ -72,15 +83,11 @@ class PlainProgress:
         sys.stderr.write(f"edge-train: {self._stage}: {line}\n")
 
 
+@dataclass
 class StopFlag:
-    """A flag that a signal handler sets and a stage reads between steps."""
+    """A flag that a signal handler sets: the running stage ends at its next step, with a checkpoint."""
 
-    def __init__(self) -> None:
-        self.asked = False
-
-    def ask(self) -> None:
-        """Request that the running stage ends at its next step, with a checkpoint."""
-        self.asked = True
+    asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,8 @@ class StageJob:
 
     def rng(self, *tags: int | str) -> np.random.Generator:
         """Return a numpy generator for this stage's seed and `tags`."""
-        return np.random.default_rng((self.seed, *map(_number, tags)))
+        numbers = (tag if isinstance(tag, int) else crc32(tag.encode()) for tag in tags)
+        return np.random.default_rng((self.seed, *numbers))
 
     def generator(self, *tags: int | str) -> torch.Generator:
         """Return a torch generator on the CPU for this stage's seed and `tags`."""
@@ -116,5 +124,45 @@ class StageJob:
         return self.ranks.any(self.stop.asked)
 
 
-def _number(tag: int | str) -> int:
-    return tag if isinstance(tag, int) else crc32(tag.encode())
+class StageBar(AbstractContextManager["StageBar"]):
+    """A progress bar with the newest values; a `StageProgress`."""
+
+    def __init__(self, stage: str, console: Console) -> None:
+        self._stage, self._console = stage, console
+        self._bar = Progress(
+            TextColumn(f"[bold]edge-train[/bold] {stage}"), BarColumn(bar_width=24), MofNCompleteColumn(),
+            TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False), console=console,
+        )  # fmt: skip
+        self._task: TaskID | None = None
+        self._total = 0
+
+    def __enter__(self) -> StageBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(self, done: int, total: int, **numbers: float) -> None:
+        """Move the bar."""
+        if self._task is None:
+            self._task, self._total = self._bar.add_task("", total=total, completed=done), total
+        if total != self._total:  # a stage may have several parts
+            self._bar.reset(self._task, total=total)
+            self._total = total
+        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=done, total=total, description=values)
+
+    def say(self, line: str) -> None:
+        """Write a line above the bar."""
+        self._console.print(f"edge-train: {self._stage}: {line}", markup=False)
+
+
+def progress_for(
+    stage: str, *, quiet: bool = False, stream: TextIO | None = None
+) -> AbstractContextManager[StageProgress]:
+    """Return the progress display for a stage: a bar, lines, or with `quiet` nothing."""
+    if quiet:
+        return nullcontext(QuietProgress())
+    console = Console(file=stream if stream is not None else sys.stderr, highlight=False, soft_wrap=True)
+    return StageBar(stage, console) if console.is_terminal else nullcontext(PlainProgress(stage))

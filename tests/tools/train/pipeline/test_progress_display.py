@@ -10,11 +10,9 @@ import pytest
 from rich.console import Console
 
 from tools.train.config.recipe import load_recipe
-from tools.train.pipeline.budget import Line, budget_of, lines_of
-from tools.train.pipeline.chain import steps_of
-from tools.train.run.curves import draw_curves, panels_of, smoothed
-from tools.train.run.job import PlainProgress
-from tools.train.run.progress_display import StageBar
+from tools.train.pipeline.chain import Line, budget_of, lines_of, steps_of
+from tools.train.run.curves import draw_curves
+from tools.train.run.job import PlainProgress, StageBar
 from tools.train.run.run_dir import RunDir
 
 TINY = load_recipe("tiny")
@@ -34,14 +32,6 @@ def test_curves_are_drawn_of_every_stage_that_has_more_than_a_point(run_dir: Run
     first = (run_dir.curves / "sft.png").read_bytes()
     draw_curves(run_dir)
     assert (run_dir.curves / "sft.png").read_bytes() == first
-
-
-def test_numbers_of_a_kind_share_an_axis() -> None:
-    assert panels_of(["loss", "lr", "val_loss", "success"]) == [["loss", "val_loss"], ["success"], ["lr"]]
-
-
-def test_a_jagged_line_is_averaged_over_what_came_before() -> None:
-    assert smoothed([4.0, 2.0]) == [4.0, 3.0] and smoothed([1.0] * 100)[-1] == 1.0
 
 
 def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
