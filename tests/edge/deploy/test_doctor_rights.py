@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import pytest
 
-from edge.artifacts.device_nodes import device_nodes, group_of
+from edge.artifacts.providers import device_nodes, group_of
 from edge.core.device import CUDA, TENSORRT
 from edge.deploy.doctor.check import Check, Level
 from edge.deploy.doctor.rights import (
