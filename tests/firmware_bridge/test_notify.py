@@ -79,7 +79,9 @@ def test_a_manager_that_comes_back_gets_messages_again_until_the_end(tmp_path: P
         assert manager.messages() == []
 
 
-@pytest.mark.parametrize(("pid", "period_ns"), [(os.getpid(), 500_000_000), (os.getpid() + 1, None)])
+@pytest.mark.parametrize(
+    ("pid", "period_ns"), [(os.getpid(), 500_000_000), (os.getpid() + 1, None)], ids=["own", "other"]
+)
 def test_the_watchdog_is_due_at_half_its_time_if_it_is_meant_for_this_process(
     manager: NotifySocket, pid: int, period_ns: int | None
 ) -> None:
