@@ -14,12 +14,13 @@ from edge.core.cli import EXIT_CHECK_FAILED
 from edge.core.stats import Samples
 from edge.flightlog.replay.command import Tolerance, verdict
 from edge.flightlog.replay.policy import Comparison
+from edge.reasoning.generation_cycle import GenerationCycle, ReasoningConfig
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import run_result
 from edge.state.switches import Switches
 from sim_hil.benchmark import cli as bench_cli
+from sim_hil.benchmark import runs
 from sim_hil.benchmark.suite import validate
-from sim_hil.benchmark.workers.bench_run import BenchRun
 from tests.support.processes import GO2_SIM
 from tests.support.runner import synthetic_run
 from tools.faults.report import RowResult, result
@@ -62,7 +63,7 @@ def test_a_demo_without_ticks_and_generations_fails_by_both(tmp_path: Path) -> N
 def test_a_benchmark_without_a_result_does_not_pass(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(BenchRun, "run", lambda *_: True)
+    monkeypatch.setattr(runs, "run_all", lambda *_, **__: True)
     arguments = ["--suite", "dynanav", "--policy", "expert", "--episodes", "*hospital*", "--json", "-"]
     assert bench_cli.main(arguments) == EXIT_CHECK_FAILED
     assert "nothing was measured" in capsys.readouterr().err
@@ -76,9 +77,10 @@ def test_a_run_without_a_finite_plan_is_a_fault_with_exit_code_1(
         supervision=SimpleNamespace(state=SimpleNamespace(value="zero")),
     )
     reasoning = SimpleNamespace(
-        generations=1, failed=0, cancelled=0, missed_frames=0, invalid_texts=0, gave_way_ns=0,
-        generation_ms=Samples(), anchor_to_ready_ms=Samples(), late_anchor_ms=Samples(),
-    )  # fmt: skip
+        cycle=GenerationCycle(ReasoningConfig((), 0)),
+        times=SimpleNamespace(generation_ms=Samples(), anchor_to_ready_ms=Samples(), late_anchor_ms=Samples()),
+        gave_way_ns=0,
+    )
     inputs = SimpleNamespace(
         camera=SimpleNamespace(frames=1, failures=0), odometry=None, states=1,
         estimator=SimpleNamespace(rejected={}, visual_used=0, visual_rejected=0),

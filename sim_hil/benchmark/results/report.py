@@ -14,8 +14,7 @@ from reporting import page
 from reporting.plot_style import delay_histogram
 from sim_hil.benchmark.conditions.conditions import Conditions
 from sim_hil.benchmark.results import report_figures
-from sim_hil.benchmark.results.episode_log import read_log
-from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.results.record import EpisodeResult, read_log
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS, ResultStore
 from sim_hil.benchmark.results.summary import METRICS, grouped_by
 from sim_hil.benchmark.results.video import last_picture
