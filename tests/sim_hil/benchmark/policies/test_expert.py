@@ -183,7 +183,7 @@ NARROW = hall(block(0.0, 0.0, 1.0, 1.0))
 
 
 def _prescribed(points: tuple[Vec2, ...]) -> np.ndarray:
-    return RoutePlanner(BLOCKED, GOAL, 0.3, 0.05, told=points).route(START, NOBODY, 20.0)
+    return RoutePlanner(BLOCKED, GOAL, 0.3, 0.05, prescribed=points).route(START, NOBODY, 20.0)
 
 
 def test_without_a_prescribed_route_it_takes_the_shorter_one() -> None:
