@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import tomli_w
 
 from edge.core.cli import (
     EXIT_BAD_INPUT,
@@ -33,9 +34,9 @@ from edge.core.geometry import SE2, interpolate, wrap_angle
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from edge.odometry.calibration import CalibrationError, OdometryCalibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
-from edge.odometry.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.odometry.drift_rate import Comparison, DriftMonitor
 from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
+from edge.odometry.pose_chain import Interval, OdometryModel, integrate, split
 from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
 from firmware_bridge.core.config import ConfigError, load_robot_config
 
@@ -331,6 +332,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
 
+def calibration_text(calibration: OdometryCalibration, source: str) -> str:
+    """Return a calibration file with six digits a value; `source` is one line of text for its first comment."""
+    values = {name: float(f"{value:.6g}") for name, value in asdict(calibration).items()}
+    return f"# Odometry of one robot, by {source}.\n{tomli_w.dumps(values)}"
+
+
 def run(args: argparse.Namespace) -> int:
     """Fit and write; returns the exit code."""
     try:
@@ -341,10 +348,8 @@ def run(args: argparse.Namespace) -> int:
         prior = OdometryCalibration()
         fitted = fit(drive, _references(args, drive), prior)
         if fitted.good and args.out is not None:
-            comment = (
-                f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
-            )
-            write_named(args.out, fitted.calibration.to_toml(comment))
+            source = f"edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven"
+            write_named(args.out, calibration_text(fitted.calibration, source))
         write_result(args.json, {"good": fitted.good, **asdict(fitted)})
     except NoFitError as error:
         sys.stderr.write(f"edge-calib odometry: {error}\n")

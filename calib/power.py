@@ -15,6 +15,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+import tomli_w
+
 from calib.power_fit import STAGES, Fit, FitError, Phase, fit_energy
 from calib.power_load import Counts, EnergyLog, Load, run_phases
 from edge.artifacts.files import ArtifactError, read_manifest
@@ -40,7 +42,6 @@ from export.core.typed import plain
 from export.plan.measure import measured_point
 from export.target.file import Target, TargetError, parse_target
 from export.target.sections import Figure, Measured
-from reporting.toml_text import toml_text
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")
 
@@ -209,7 +210,7 @@ def target_text(target: Target) -> str:
     """The target as a file that the exporter reads back as the same target; raises TargetError if it would not."""
     content = target.to_dict()
     content["measured"] = [{k: v for k, v in plain(point).items() if v != {}} for point in target.measured]
-    text = "# Written by edge-calib power. Figures tagged measured are this device's.\n" + toml_text(content)
+    text = "# Written by edge-calib power. Figures tagged measured are this device's.\n" + tomli_w.dumps(content)
     if parse_target(tomllib.loads(text), target.name) != target:
         raise TargetError(f"{target.name}: cannot be written as a file that reads back as the same target")
     return text

@@ -41,7 +41,7 @@ from export.pipeline.verify import job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
 from export.target.file import Target, TargetError, list_targets, load_target, with_settings
-from reporting.build_progress import Progress, peak_rss_bytes
+from reporting.progress import BuildProgress, peak_rss_bytes
 
 COMMAND = "edge-export"
 DEFAULT_TARGET, DEFAULT_MODEL = "cpu", "nano"
@@ -171,7 +171,7 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _asked(args))
     with _cache(args, out.parent) as cache:
         run = f"{target.name} {config.name}"
-        progress = Progress(COMMAND, build_stages(job, cache.timings(run)))
+        progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run)))
         try:
             with progress:
                 report = build_artifacts(job, out, cache, progress)
@@ -209,7 +209,7 @@ def _verify(args: argparse.Namespace) -> dict[str, Any]:
         _say(note)
     with _cache(args, None) as cache:
         run = f"verify {job.target.name} {job.config.name}"
-        progress = Progress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
+        progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
         with progress:
             report = verify_directory(job, args.directory, cache, progress)
         cache.remember_timings(run, progress.built_s)

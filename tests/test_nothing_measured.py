@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from edge import runner
 from edge.core.cli import EXIT_CHECK_FAILED
 from edge.core.stats import Samples
 from edge.flightlog.replay.command import Tolerance, verdict
 from edge.flightlog.replay.policy import Comparison
 from edge.reasoning.generation_cycle import GenerationCycle, ReasoningConfig
+from edge.run import command as runner
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import run_result
 from edge.state.switches import Switches

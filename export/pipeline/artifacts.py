@@ -23,7 +23,7 @@ from export.pipeline.report import report_html
 from export.pipeline.verify import first_difference
 from export.plan.plan import Plan, plan
 from export.target.file import Target
-from reporting.build_progress import Progress
+from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
@@ -58,7 +58,7 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
     }
 
 
-def build_artifacts(job: Job, out: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+def build_artifacts(job: Job, out: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
     """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
     nothing behind but finished stages in the cache."""
     check_replaceable(out)
@@ -145,7 +145,7 @@ def _swap(made: Path, out: Path, retired: Path) -> None:
     fsync_path(out.parent)
 
 
-def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, Any]:
+def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, Any]:
     job = pipeline.job
     weights = pipeline.weights()
     (directory / TOKENIZER_NAME).write_bytes(pipeline.tokenizer())
@@ -221,7 +221,7 @@ def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
     _write_json(directory / MANIFEST_NAME, seal(manifest))
 
 
-def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, GateResult]:
+def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, GateResult]:
     """The gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
     artifacts = load_artifacts(directory)
     results: dict[str, GateResult] = {}
@@ -233,7 +233,7 @@ def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> 
     return results
 
 
-def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+def verify_directory(job: Job, directory: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
     """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
     manifest = read_manifest(directory)
     pipeline = Pipeline(job, cache, progress, run_gates=True)

@@ -33,7 +33,7 @@ from export.model.weights import weights_sha256
 from export.pipeline.job import Job
 from export.quantize.precision import PRECISIONS, Precision
 from export.quantize.ranges import activation_ranges
-from reporting.build_progress import Progress, Stage
+from reporting.progress import BuildProgress, Stage
 
 WEIGHTS_FILE = "weights.json"
 TOKENIZER_FILE = "tokenizer.json"
@@ -130,7 +130,7 @@ class Pipeline:
     With `run_gates`, gates run even where the same bytes have passed before: that is what `verify` is for.
     """
 
-    def __init__(self, job: Job, cache: StageCache, progress: Progress, *, run_gates: bool = False) -> None:
+    def __init__(self, job: Job, cache: StageCache, progress: BuildProgress, *, run_gates: bool = False) -> None:
         self.job = job
         self._run_gates = run_gates
         self._cache = cache

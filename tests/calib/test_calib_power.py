@@ -28,7 +28,6 @@ from export.model.config import PRESETS
 from export.plan.measure import measured_point
 from export.plan.plan import plan
 from export.target.file import for_model, list_targets, load_target, parse_target, with_settings
-from reporting.toml_text import toml_text
 
 TREES = Path(__file__).parents[1] / "data/sysfs"
 SECOND = 1_000_000_000
@@ -143,13 +142,6 @@ def test_a_token_takes_what_a_generation_takes_beyond_its_prompt() -> None:
 def test_every_target_reads_back_from_what_is_written(name: str) -> None:
     target = load_target(name)
     assert parse_target(tomllib.loads(target_text(target)), name) == target
-
-
-@pytest.mark.parametrize(
-    "value", [{"a": {"b": [1, 2.5, "x\n\"'"], "c d": True}}, {"t": [{"x": 1}, {"x": 2}]}, {"e": []}]
-)
-def test_toml_that_is_written_reads_back(value: dict[str, object]) -> None:
-    assert tomllib.loads(toml_text(value)) == value
 
 
 def test_a_plan_with_the_measured_target_has_the_measured_energies(artifacts_dir: Path, artifacts: Artifacts) -> None:

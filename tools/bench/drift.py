@@ -26,7 +26,9 @@ import numpy as np
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.drift_rate import Comparison, DriftMonitor
-from edge.odometry.estimator import DriftConfig, DriftEstimator, OdometryInputs
+from edge.odometry.estimator import DriftEstimator
+from edge.odometry.gate import OdometryInputs
+from reporting.progress import Progress
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.scene.scene import load_scene
 from tools.bench.sim.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
@@ -81,7 +83,7 @@ class DriftRun:
 def replay(walk: Walk, level: str, seed: int) -> DriftRun:
     """Let the odometry of a walk drift and the estimator work against it."""
     noise = OdometryNoise(LEVELS[level], seed, walk.samples[0].T_world_base)
-    estimator = DriftEstimator(config=DriftConfig(stamp_sigma_s=SensorNoise().stamp_ns / 1e9))
+    estimator = DriftEstimator(stamp_sigma_s=SensorNoise().stamp_ns / 1e9)
     truth_monitor = _TrueDrift()
     raws: list[SE2] = []
     windows: list[Window] = []
@@ -322,13 +324,14 @@ def main(argv: list[str] | None = None) -> int:
     runs: list[DriftRun] = []
     cameras: list[dict[str, float]] = []
     # Spawned, not forked: a physics client does not survive a fork.
-    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+    with (
+        ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool,
+        Progress("drift: ", bar=True) as progress,
+    ):
         for done, (walked, camera) in enumerate(pool.map(job, seeds), 1):
             runs += walked
             cameras.append(camera)
-            sys.stderr.write(f"\rwalk {done}/{args.walks}")
-            sys.stderr.flush()
-    sys.stderr.write("\n")
+            progress.show("walks", done, args.walks)
     summary: dict[str, Any] = {level: summarise([run for run in runs if run.level == level]) for level in TESTED}
     summary["camera"] = {
         "frames": sum(camera["frames"] for camera in cameras),

@@ -21,10 +21,8 @@ from math import degrees
 from multiprocessing import get_context
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from reporting.progress import Progress
 from tools.bench.sim.locomotion_runs import (
     PUSHES,
     ROUTES,
@@ -77,21 +75,19 @@ def _run(job: Job) -> object:
     return job.call(*job.args)
 
 
-def run_all(jobs: Sequence[Job], processes: int, console: Console) -> dict[str, list[Any]]:
+def run_all(jobs: Sequence[Job], processes: int) -> dict[str, list[Any]]:
     """Results by part, in the order of the jobs; nothing else runs beside the measurements of speed."""
     results: dict[str, list[Any]] = {part: [] for part in ("flat", "ground", "endurance", "pushes", "speed")}
-    columns = (TextColumn("{task.description:10s}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console) as progress:
+    with Progress("locomotion: ", bar=True) as progress:
         for together in (True, False):
             chosen = [job for job in jobs if (job.part != "speed") == together]
             if not chosen:
                 continue
-            bar = progress.add_task("walks" if together else "speed", total=len(chosen))
             # Spawned, not forked: a physics client does not survive a fork.
             with ProcessPoolExecutor(processes if together else 1, mp_context=get_context("spawn")) as pool:
-                for job, result in zip(chosen, pool.map(_run, chosen), strict=True):
+                for done, (job, result) in enumerate(zip(chosen, pool.map(_run, chosen), strict=True), 1):
                     results[job.part].append(result)
-                    progress.advance(bar)
+                    progress.show("walks" if together else "speed", done, len(chosen))
     return results
 
 
@@ -170,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write(f"locomotion: {error}\n")
         return EXIT_BAD_INPUT
     jobs = plan(args.rate, args.minutes, range(args.seeds), args.repeats)
-    results = run_all(jobs, args.jobs, Console(stderr=True))
+    results = run_all(jobs, args.jobs)
     kept = all(result.kept for part in ("flat", "ground", "endurance", "pushes") for result in results[part])
     (sys.stderr if args.json == "-" else sys.stdout).write(table(results) + "\n")
     rows = {part: [{**asdict(result), "kept": getattr(result, "kept", None)} for result in results[part]]

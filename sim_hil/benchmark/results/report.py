@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.cli import write_whole
-from reporting import page
+from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import BAD, GOOD, INK, MUTED, TRUTH, delay_histogram, legend_above, new_figure, png, tidy
 from sim_hil.benchmark.conditions.conditions import Conditions
 from sim_hil.benchmark.results.record import EpisodeResult, read_log
@@ -45,69 +45,54 @@ def write_report(store: ResultStore, summary: Mapping[str, object], title: str) 
     """Write the page into the run's directory and return its path. Raises OSError."""
     path = store.directory / REPORT
     results = sorted(store.results, key=lambda result: result.id)
-    write_whole(path, page.document(title, "\n".join(part for part in _parts(store, results, summary, title) if part)))
+    conditions = Conditions.of_json(store.config["conditions"])
+    failed = [(run.id, str(run.attempts), run.why) for run in store.failed]
+    page = render(
+        "benchmark",
+        title=title,
+        conditions=conditions.describe(),
+        suite=store.config["suite"],
+        finished=len(results),
+        requested=len(store.config["episodes"]),
+        untrained=not store.config.get("trained", True),
+        tiles=_headline(summary),
+        failed=Table(("episode", "attempts", "why"), failed, numeric=frozenset({1})),
+        **(_results(store, results, summary, conditions) if results else {}),
+    )
+    write_whole(path, page)
     return path
 
 
-def _parts(
-    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], title: str
-) -> list[str]:  # fmt: skip
-    conditions = Conditions.of_json(store.config["conditions"])
+def _results(
+    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], conditions: Conditions
+) -> dict[str, object]:
+    """Return the values of the part of the page about finished episodes."""
     logs = {result.id: _log(store.directory, result.id) for result in results}
-    requested = len(store.config["episodes"])
-    parts = [
-        f"<h1>{page.text_html(title)}</h1>",
-        f'<p class="quiet">{page.text_html(conditions.describe())}; suite “{page.text_html(store.config["suite"])}”, '
-        f"{len(results)} of {requested} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
-        "over tasks and their episodes. Paths and collisions are ground truth, not the robot's odometry.</p>",
-        _untrained(store.config),
-        page.tiles(_headline(summary)),
-        _failed(store),
-    ]
-    if not results:
-        return parts
     delays = np.array([d for log in logs.values() if log for d in log["columns"]["delay_s"] if d is not None], float)
-    return [
-        *parts,
-        "<h2>Success and collisions</h2>",
-        page.figure(
+    caption = "Age of the semantic state in every control period that had one."
+    return {
+        "rates": Figure(
             rates(results), "Bars of success and collision rate",
             "The number of episodes is below each name.", wide=True,
         ),
-        _group_tables(summary),
-        *_distributions(results, delays),
-        "<h2>Where the robot went</h2>",
-        *_maps(results, logs),
-        _endings(store.directory, results),
-        _texts(results, logs),
-        "<h2>Episodes</h2>",
-        _episode_table(store.directory, results),
-        "<h2>Conditions and versions</h2>",
-        page.table(
-            ("what", "value"),
-            [(page.text_html(key), page.text_html(str(value))) for key, value in _facts(store.config, conditions)],
+        "groups": _group_table(summary),
+        "error_and_time": Figure(
+            error_and_time(results, width_in=5.4 if len(delays) else 11.0),
+            "Distance to the goal against time used", "One point per episode.", wide=not len(delays),
         ),
-    ]  # fmt: skip
-
-
-def _distributions(results: Sequence[EpisodeResult], delays: NDArray[np.float64]) -> list[str]:
-    labels = ("Distance to the goal against time used", "One point per episode.")
-    if not len(delays):
-        return [page.figure(error_and_time(results, width_in=11.0), *labels, wide=True)]
-    caption = "Age of the semantic state in every control period that had one."
-    return [
-        '<div class="pair">',
-        page.figure(error_and_time(results, width_in=5.4), *labels),
-        page.figure(delay_histogram(delays), "Histogram of the delay", caption),
-        "</div>",
-    ]
+        "delays": Figure(delay_histogram(delays), "Histogram of the delay", caption) if len(delays) else None,
+        "maps": _maps(results, logs),
+        "endings": _endings(store.directory, results),
+        "texts": _texts(results, logs),
+        "episodes": _episode_table(store.directory, results),
+        "facts": Table(("what", "value"), [(key, str(value)) for key, value in _facts(store.config, conditions)]),
+    }  # fmt: skip
 
 
 def _hits(result: EpisodeResult) -> str:
     """Return the first few labels of what the robot hit."""
     more = len(result.collisions) - SHOWN_HITS
-    shown = [*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])]
-    return page.text_html(", ".join(shown))
+    return ", ".join([*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])])
 
 
 def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
@@ -115,15 +100,6 @@ def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
         return read_log(directory / EPISODES / f"{episode_id}.json")
     except (OSError, ValueError):
         return None  # results do not depend on it; the map's caption gives the number of paths
-
-
-def _untrained(config: Mapping[str, object]) -> str:
-    if config.get("trained", True):
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed): the robot moves at random. '
-        "This run shows that the benchmark works, not how good a policy is.</p>"
-    )
 
 
 def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -136,25 +112,18 @@ def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [*tiles, (str(summary["episodes"]), "episodes")]
 
 
-def _failed(store: ResultStore) -> str:
-    if not store.failed:
-        return ""
-    rows = [(page.text_html(run.id), str(run.attempts), page.text_html(run.why)) for run in store.failed]
-    return (
-        '<p class="notice"><b>Some episodes have no result</b>: their process died in every attempt. '
-        "No rate above includes them; <code>--resume</code> tries them again.</p>"
-        + page.table(("episode", "attempts", "why"), rows, numeric=frozenset({1}))
-    )
-
-
-def _group_tables(summary: Mapping[str, Any]) -> str:
-    rows = []
-    for group in ("by_scene", "by_crowd", "by_robot"):
-        for key, means in summary[group].items():
-            cells = [_with_interval(means, name) for name in METRICS]
-            rows.append((f"{group.removeprefix('by_')}: {page.text_html(key)}", str(means["episodes"]), *cells))
+def _group_table(summary: Mapping[str, Any]) -> Table:
+    rows = [
+        (
+            f"{group.removeprefix('by_')}: {key}",
+            str(means["episodes"]),
+            *(_with_interval(means, name) for name in METRICS),
+        )
+        for group in ("by_scene", "by_crowd", "by_robot")
+        for key, means in summary[group].items()
+    ]
     head = ("group", "episodes", "SR %", "SPL %", "NE m", "CR %")
-    return page.table(head, rows, numeric=frozenset({1, 2, 3, 4, 5}))
+    return Table(head, rows, numeric=frozenset({1, 2, 3, 4, 5}))
 
 
 def _with_interval(means: Mapping[str, Any], name: str) -> str:
@@ -163,14 +132,15 @@ def _with_interval(means: Mapping[str, Any], name: str) -> str:
     return f"{means[name]:.1f}{span}"
 
 
-def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[str]:
-    parts = []
+def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[Figure | str]:
+    """Return the map of each scene, or the name of a scene that is not on this machine."""
+    parts: list[Figure | str] = []
     for name, members in grouped_by(results, "scene"):
         shown = [(result, log) for result in members if (log := logs[result.id]) is not None]
         try:
             scene = load_scene(name)
         except SceneError:
-            parts.append(f"<p>Scene {page.text_html(name)} is not on this machine: no map.</p>")
+            parts.append(name)
             continue
         ended, logged = [result for result, _ in shown], [log for _, log in shown]
         goals = [log["goal_xy"] for log in logged]
@@ -179,7 +149,7 @@ def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | 
             f"{name}: {len(shown)} of {len(members)} episodes. Blue: start; green ring: goal. Paths: green reached "
             "without a collision, orange reached with one, red not reached."
         )
-        parts.append(page.figure(picture, f"Map of {name} with the paths", caption, wide=True))
+        parts.append(Figure(picture, f"Map of {name} with the paths", caption, wide=True))
     return parts
 
 
@@ -188,62 +158,50 @@ def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
     return np.column_stack([np.array(columns["x_m"], float), np.array(columns["y_m"], float)])
 
 
-def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
+def _endings(directory: Path, results: Sequence[EpisodeResult]) -> list[dict[str, object]]:
     """Return the last frames of some videos; failed episodes come first, then those with collisions."""
-    cards: list[str] = []
+    endings: list[dict[str, object]] = []
     for result in sorted(results, key=lambda result: (result.success, not result.collided)):
         path = directory / VIDEOS / f"{result.id}.mp4"
-        picture = last_picture(path, _CARD_PX) if len(cards) < SHOWN_ENDINGS and path.is_file() else None
+        picture = last_picture(path, _CARD_PX) if len(endings) < SHOWN_ENDINGS and path.is_file() else None
         if picture is None:
             continue
-        name = page.text_html(result.id)
         hit = f", collided with {_hits(result)}" if result.collided else ""
-        cards.append(
-            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last frame of {name}">'
-            f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
-            f"{result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}</div></figure>"
-        )
-    return f'<h2>How episodes ended</h2><div class="sheet">{"".join(cards)}</div>' if cards else ""
+        text = f"{result.end} after {result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}"
+        endings.append({"id": result.id, "jpeg": picture, "video": f"{VIDEOS}/{path.name}", "text": text})
+    return endings
 
 
-def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> str:
-    cards = []
+def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[tuple[str, str]]:
+    """Return facts and text of the middle generation of some episodes."""
+    texts = []
     for result in results:
         log = logs[result.id]
         if log is None or not log["generations"]:
             continue
         generation = log["generations"][len(log["generations"]) // 2]
-        text = page.text_html(str(generation.get("text", ""))) or "(empty)"
-        released_s = generation["released_s"] - generation["anchor_s"]
-        cards.append(
-            f'<figure><div class="meta">{page.text_html(result.id)} · generation {generation["generation"]} · anchor '
-            f"{generation['anchor_s']:.1f} s · Δt {released_s:.1f} s at release</div>"
-            f'<pre class="vlm">{text}</pre></figure>'
+        meta = (
+            f"{result.id} · generation {generation['generation']} · anchor {generation['anchor_s']:.1f} s · "
+            f"Δt {generation['released_s'] - generation['anchor_s']:.1f} s at release"
         )
-    if not cards:
-        return ""
-    step = max(1, len(cards) // SHOWN_TEXTS)
-    shown = "".join(cards[::step][:SHOWN_TEXTS])
-    return f'<h2>Reasoning text of the VLM</h2><div class="sheet">{shown}</div>'
+        texts.append((meta, str(generation.get("text", ""))))
+    return texts[:: max(1, len(texts) // SHOWN_TEXTS)][:SHOWN_TEXTS]
 
 
-def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> str:
+def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> Table:
     rows = []
     for r in results:
-        mark = (
-            '<span class="pass">reached</span>' if r.success else f'<span class="fail">{page.text_html(r.end)}</span>'
-        )
-        video = directory / VIDEOS / f"{r.id}.mp4"
-        name = page.text_html(r.id)
-        link = f'<a href="{VIDEOS}/{name}.mp4">{name}</a>' if video.is_file() else name
+        video = f"{VIDEOS}/{r.id}.mp4"
+        name = Cell(r.id, link=video) if (directory / video).is_file() else r.id
         delay = "" if r.delay_s is None else f"{r.delay_s['mean']:.1f}"
         numbers = (f"{r.ne_m:.1f}", f"{r.spl:.0f}", f"{r.path_m:.1f}", f"{r.shortest_m:.1f}", f"{r.time_s:.0f}", delay)
-        rows.append((link, r.scene, r.robot, str(r.people), mark, _hits(r), *numbers))
+        end = mark(r.success, "reached" if r.success else r.end)
+        rows.append((name, r.scene, r.robot, str(r.people), end, _hits(r), *numbers))
     head = (
         "episode", "scene", "robot", "people", "end", "collided with", "NE m", "SPL %", "path m", "shortest m",
         "time s", "mean Δt s",
     )  # fmt: skip
-    return page.table(head, rows, numeric=frozenset({3, *range(6, 12)}))
+    return Table(head, rows, numeric=frozenset({3, *range(6, 12)}))
 
 
 def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str, object]]:

@@ -13,6 +13,8 @@ from math import degrees, hypot, isfinite, radians
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from sim_hil.scene.table import Table
 
 if sys.version_info >= (3, 11):
@@ -25,6 +27,9 @@ ROBOTS = ("go2", "carter")
 FORMAT = 1  # of the file; `version` in the file identifies the suite's data
 MIN_WORDINGS = 4
 MAX_PEOPLE = 200
+
+_TASK_KEYS = ("task", "scene", "goal_xy", "threshold_m", "goal_landmark", "landmarks", "instructions")
+_EPISODE_KEYS = ("id", "robot", "people", "seed", "timeout_s", "shortest_m")
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -156,50 +161,14 @@ def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
     return episodes
 
 
-def _text(value: str) -> str:
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
-
-
-def _array(values: Sequence[str]) -> str:
-    return "[" + ", ".join(values) + "]"
-
-
 def suite_to_toml(name: str, version: int, episodes: Sequence[Episode]) -> str:
     """Format a suite as TOML for `parse_suite`; the episodes of one task must be adjacent."""
-    lines = [
-        "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.",
-        f"format = {FORMAT}",
-        f"name = {_text(name)}",
-        f"version = {version}",
-    ]
-    last = ""
+    tasks: list[dict[str, Any]] = []
     for episode in episodes:
-        if episode.task != last:
-            last = episode.task
+        if not tasks or tasks[-1]["task"] != episode.task:
             x, y, theta = episode.start
-            heading_deg = round(degrees(theta), 6)
-            lines += [
-                "",
-                "[[tasks]]",
-                f"task = {_text(episode.task)}",
-                f"scene = {_text(episode.scene)}",
-                f"start_deg = [{x!r}, {y!r}, {heading_deg!r}]",
-                f"goal_xy = [{episode.goal_xy[0]!r}, {episode.goal_xy[1]!r}]",
-                f"threshold_m = {episode.threshold_m!r}",
-                f"goal_landmark = {_text(episode.goal_landmark)}",
-                f"landmarks = {_array([_text(label) for label in episode.landmarks])}",
-                "instructions = [",
-                *(f"  {_text(text)}," for text in episode.instructions),
-                "]",
-            ]
-        lines += [
-            "[[tasks.episodes]]",
-            f"id = {_text(episode.id)}",
-            f"robot = {_text(episode.robot)}",
-            f"people = {episode.people}",
-            f"seed = {episode.seed}",
-            f"timeout_s = {episode.timeout_s!r}",
-            f"shortest_m = {episode.shortest_m!r}",
-        ]
-    return "\n".join(lines) + "\n"
+            task = {key: getattr(episode, key) for key in _TASK_KEYS}
+            tasks.append({**task, "start_deg": (x, y, round(degrees(theta), 6)), "episodes": []})
+        tasks[-1]["episodes"].append({key: getattr(episode, key) for key in _EPISODE_KEYS})
+    head = "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.\n"
+    return head + tomli_w.dumps({"format": FORMAT, "name": name, "version": version, "tasks": tasks})

@@ -98,9 +98,9 @@ def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     )
     with _asked_to_end(), Stack(options) as stack:
         drive = _run(stack, task, on_time)
-        stack.end_runner()
-        stack.end_bridge()
-        stack.end_robot()
+        stack.end("runner")
+        stack.end("bridge")
+        stack.end("robot")
     fell = bool(_json(stack.result("edge-hil")).get("fell", False))
     if fell and drive.end != "reached":
         drive.end = "fell"

@@ -25,7 +25,7 @@ from sim_hil.benchmark.language.instructions import wordings
 from sim_hil.benchmark.language.route import Passed, RouteDescription, Step
 from sim_hil.benchmark.suite.episode import load_suite
 from sim_hil.scene.scene import load_scene, scene_names
-from tools.train.scenes import trace_sentences as trace_words
+from tools.train.drives import trace_sentences as trace_words
 
 TOKENIZER = Tokenizer.from_file(str(NANO_TOKENIZER))
 LANGUAGE = PRESETS["nano"].language

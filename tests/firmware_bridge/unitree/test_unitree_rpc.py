@@ -27,8 +27,9 @@ from firmware_bridge.unitree.messages.idl import (
 )
 from firmware_bridge.unitree.messages.idl_low import LowState_
 from firmware_bridge.unitree.rpc import MAX_BINARY_BYTES, Response, RpcClient, RpcError
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.service import ServiceServer
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from tests.support.processes import GO2_SIM, wait_for
 from tests.support.robot.fake_go2 import standing
 

@@ -16,9 +16,10 @@ from firmware_bridge.client import BridgeClient
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_, WirelessController_
 from firmware_bridge.unitree.rpc import RpcClient
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
-from sim_hil.protocols.unitree.services.leases import APPLY
-from sim_hil.protocols.unitree.state import OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.services.service import APPLY
+from sim_hil.protocols.unitree.state import sport_mode_state
 from tests.process.bridge.stop_rig import L2, REST_MPS, B, HostStall, Peer, Rig, report
 from tests.support.processes import Running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2, standing

@@ -14,10 +14,10 @@ from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from sim_hil.protocols.unitree.services.leases import APPLY, ERROR_DENIED, RENEW, Lease
-from sim_hil.protocols.unitree.services.service import LeaseServer, ServiceServer
+from sim_hil.protocols.unitree.odometry import OdometryFrame
+from sim_hil.protocols.unitree.services.service import APPLY, ERROR_DENIED, RENEW, Lease, LeaseServer, ServiceServer
 from sim_hil.protocols.unitree.services.sport import handle_sport, parse_move
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from sim_hil.robots.go2.body import RobotTruth
 from sim_hil.robots.go2.sport import SportAction
 

@@ -18,7 +18,7 @@ from sim_hil.benchmark.policies.point_goal_net import PointGoalNetPolicy
 from sim_hil.benchmark.policies.select import robot_config
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tests.support.train.train_drives import tiny_model
-from tools.train.imitate.point_goal_net import build_point_goal
+from tools.train.imitate.trainable_policies import build_point_goal
 from tools.train.point_goal_export import PointGoalModel, export
 
 
