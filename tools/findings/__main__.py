@@ -30,9 +30,8 @@ from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, p
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 from sim_hil.benchmark.results.store import StoreError, read_results
-from sim_hil.benchmark.runs import RESULT, RunsError, read_result, run_episodes
+from sim_hil.benchmark.runs import RESULT, RunsError, choose, read_result, run_episodes
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
-from sim_hil.benchmark.workers.bench_run import choose
 from sim_hil.benchmark.workers.jobs import RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
 from sim_hil.scene.scene import SceneError

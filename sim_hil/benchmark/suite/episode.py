@@ -89,33 +89,28 @@ class Episode:
 
 
 def _task(table: Table) -> list[Episode]:
-    task, scene = table.text("task"), table.text("scene")
-    x, y, heading_deg = table.vector("start_deg", 3)
-    goal_x, goal_y = table.vector("goal_xy", 2)
-    threshold_m = table.number("threshold_m")
-    landmarks, goal_landmark = table.texts("landmarks"), table.text("goal_landmark")
+    task, (x, y, heading_deg) = table.text("task"), table.vector("start_deg", 3)
     instructions = table.texts("instructions")
     if len(instructions) < MIN_WORDINGS:
         raise SuiteError(f"task {task!r}: expected {MIN_WORDINGS} wordings or more, found {len(instructions)}")
+    shared: dict[str, Any] = {
+        "task": task,
+        "scene": table.text("scene"),
+        "start": (x, y, radians(heading_deg)),
+        "goal_xy": table.vector("goal_xy", 2),
+        "instructions": instructions,
+        "threshold_m": table.number("threshold_m"),
+        "landmarks": table.texts("landmarks"),
+        "goal_landmark": table.text("goal_landmark"),
+    }
     episodes = []
     for row in table.tables("episodes"):
         row.what = f"task {task!r}, {row.what}"
+        name, robot, people, seed = row.text("id"), row.text("robot"), row.whole("people"), row.whole("seed")
+        timeout_s, shortest_m = row.number("timeout_s"), row.number("shortest_m")
         episodes.append(
             Episode(
-                id=row.text("id"),
-                task=task,
-                scene=scene,
-                robot=row.text("robot"),
-                people=row.whole("people"),
-                seed=row.whole("seed"),
-                start=(x, y, radians(heading_deg)),
-                goal_xy=(goal_x, goal_y),
-                instructions=instructions,
-                timeout_s=row.number("timeout_s"),
-                threshold_m=threshold_m,
-                shortest_m=row.number("shortest_m"),
-                landmarks=landmarks,
-                goal_landmark=goal_landmark,
+                id=name, robot=robot, people=people, seed=seed, timeout_s=timeout_s, shortest_m=shortest_m, **shared
             )
         )
         row.done()

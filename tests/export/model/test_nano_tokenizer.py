@@ -19,9 +19,9 @@ from edge.state.ring import EncodedFrame
 from export.model.config import PRESETS
 from export.model.tokenizers.nano import FARTHEST_M, NANO_TOKENIZER, train
 from export.targets.file import list_targets, load_target
-from sim_hil.benchmark.language.instruction_words import AREAS, NOUNS, ORDINALS
+from sim_hil.benchmark.language.instruction_words import AREAS, COLOUR_WORDS, NOUNS, ORDINALS
 from sim_hil.benchmark.language.instructions import wordings
-from sim_hil.benchmark.language.route import COLOUR_WORDS, Passed, RouteDescription, Step
+from sim_hil.benchmark.language.route import Passed, RouteDescription, Step
 from sim_hil.benchmark.suite.episode import load_suite
 from sim_hil.scene.scene import load_scene, scene_names
 from tools.train.drives import trace_sentences as trace_words

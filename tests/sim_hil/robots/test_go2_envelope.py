@@ -11,8 +11,7 @@ import pytest
 from sim_hil.robots.go2.body import FOOT_GRIP, HALF_LENGTH_M, SHELL_GRIP
 from sim_hil.robots.go2.sport import MODE_DAMPING
 from sim_hil.robots.go2.urdf import LEGS, TORQUE_LIMITS_NM, TOTAL_MASS_KG, VELOCITY_LIMITS_RADPS
-from tools.bench.sim.locomotion_course import Command, Course
-from tools.bench.sim.locomotion_runs import PUSHES, as_row, endure, push_over, track
+from tools.bench.sim.locomotion_runs import PUSHES, Command, Course, as_row, endure, push_over, track
 
 WEIGHT_N = TOTAL_MASS_KG * 9.81
 

@@ -165,7 +165,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     expert = ExpertPolicy(
         margin_m=config.margin_m,
         speed_mps=config.speed_mps,
-        told=scenario.task.path,
+        prescribed=scenario.task.path,
         patient=plan.policy_drives or detour is not None,
         rests=True,
         wall_m=config.wall_m,

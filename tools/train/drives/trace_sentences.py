@@ -119,8 +119,7 @@ def aspects_of_json(table: Mapping[str, Any]) -> ReasoningText:
 def landmarks() -> list[str]:
     """Return the names of all objects that a text may name: each kind's noun, with and without each colour."""
     # Imported here: code that only reads drives needs no simulator.
-    from sim_hil.benchmark.language.instruction_words import NOUNS
-    from sim_hil.benchmark.language.route import COLOUR_WORDS
+    from sim_hil.benchmark.language.instruction_words import COLOUR_WORDS, NOUNS
 
     return [*sorted(NOUNS), *(f"{colour} {noun}" for noun in sorted(NOUNS) for colour in sorted(COLOUR_WORDS))]
 
