@@ -1,6 +1,6 @@
 """The work of one generation: its frames, its prompt, its result, and the semantic state that the result becomes.
 
-The robot's reasoning thread and the benchmark's virtual time do this work alike; when each part happens is theirs.
+The robot's reasoning thread and the benchmark's virtual time share this work; each decides when a part runs.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class GenerationTask:
         run.feed([self._models.language.prompt.frame(number, frame, self.job.instruction)])
 
     def set_anchor(self, anchor: EncodedFrame, ring: TokenRing) -> None:
-        """Take the newest frame, and what is remembered of the instruction up to its capture."""
+        """Set the newest frame, and read the instruction's memory up to its capture."""
         self.anchor = anchor
         self._way, self._context = self.job.memory.way(ring, anchor), self.job.memory.context(anchor)
 
@@ -99,7 +99,7 @@ class GenerationTask:
         return GenerationResult(generation, constraint, context, parse_waypoints(generation.text))
 
     def publish(self, result: GenerationResult, *, number: int, ready_ns: int, text_complete: bool) -> SemanticState:
-        """The semantic state of a result that the robot will drive by; its text is remembered for the next one."""
+        """Return the semantic state of a result that will drive the robot; store its text for the next generation."""
         assert self.anchor is not None
         self.job.memory.update(result.generation.text, result.constraint, self.anchor)
         return SemanticState(
@@ -116,7 +116,7 @@ class GenerationTask:
         )
 
     def record(self, result: GenerationResult) -> dict[str, Any]:
-        """What a log keeps of the prompt and the result; call it after `publish`."""
+        """Return the log record of prompt and result; call it after `publish`."""
         stop = self.job.memory.stop
         return {
             "way": self._way,

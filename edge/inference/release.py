@@ -1,4 +1,4 @@
-"""Release delays: how long a finished generation is held back, as slower hardware would (paper §3.3, appendix D)."""
+"""Release delays: they hold a finished generation back to emulate slower hardware (paper §3.3, appendix D)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReleaseDelay:
             raise ReleaseDelayError(f"expected low ≤ mean ≤ high ≤ {MAX_DELAY_S} s, found {values}")
 
     def sampler(self) -> Callable[[], float]:
-        """A source of delays in s; the same seed gives the same sequence."""
+        """Return a source of delays, s; the same seed gives the same sequence."""
         generator = random.Random(self.seed)
         if self.sd_s == 0 or self.mean_s == 0:
             return lambda: self.mean_s

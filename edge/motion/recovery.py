@@ -70,7 +70,7 @@ class BackOffConfig:
     stands_s: float = 1.0
     """Time without motion after which the robot stops backing off, s."""
     further: int = 3
-    """Largest multiple of the distance: stuck again at one place, the robot backs off twice, then three times as far."""
+    """Largest multiple of the distance: stuck again at one place, it backs off twice as far, then three times."""
     failures: int = 3
     """Number of failures at one place after which the robot no longer backs off there."""
     apart_m: float = 1.0

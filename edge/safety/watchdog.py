@@ -12,9 +12,9 @@ from typing import Final
 
 WINDOW_TICKS: Final = 10
 NEEDED_ON_TIME: Final = 8
-"""Late ticks of the last WINDOW_TICKS that are no reason to restart: the bridge's deadman covers them."""
+"""Required ticks on time of the last WINDOW_TICKS; one or two late ticks are left to the bridge's deadman."""
 CALL_MS: Final = 10_000.0
-"""Time that every call may take."""
+"""Shortest time limit of a call, ms."""
 GENERATIONS: Final = 3.0
 """Multiple of the longest generation so far that a call may take: a single call is a part of one."""
 GIVE_UP_NS: Final = 20_000_000_000
