@@ -19,7 +19,7 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.power.governor.plan import STAGES
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
-from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState
 
@@ -122,7 +122,7 @@ class Load:
         tokens = self._policy.encode(self._image).copy()
         frames = [EncodedFrame(i, here, tokens) for i in range(len(runtime.frame_offsets_s))]
         self._tokens, self._here = tokens, here
-        self._segments = self._language.prompt.build(frames, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE)
+        self._segments = self._language.prompt.build(frames, INSTRUCTION, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE)
         generation = self._language.generate(
             self._segments, max_new_tokens=runtime.max_new_tokens, cancelled=lambda: False
         )

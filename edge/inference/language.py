@@ -17,7 +17,7 @@ from edge.core.geometry import SE2
 from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
+from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_PAST_PATH, InstructionError, PromptBuilder, PromptIds, Segment
 from edge.state.reasoning_text import MAX_TEXT_CHARS
 from edge.state.ring import EncodedFrame
 
@@ -165,7 +165,7 @@ class LanguageModel:
         """
         frames = range(len(self.runtime.frame_offsets_s))
         filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in frames]
-        prompt = self.prompt.build(filler, instruction, LONGEST_WAY, LONGEST_BEFORE)
+        prompt = self.prompt.build(filler, instruction, LONGEST_PAST_PATH, LONGEST_BEFORE)
         needed = sum(len(segment.ids) for segment in prompt)
         room = self.runtime.max_context - self.runtime.max_new_tokens
         if needed > room:

@@ -14,7 +14,7 @@ from typing import Final
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.reasoning.decoding_rules import DONE, DecodingContext, TextConstraint, TurnEstimator
-from edge.reasoning.path_memory import PERIOD_NS, PathMemory, Way
+from edge.reasoning.path_memory import PERIOD_NS, PastPath, PathMemory
 from edge.state.reasoning_text import ReasoningText, Stop, parse_text
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.switches import Decoding
@@ -117,12 +117,12 @@ class InstructionMemory:
         if newest_ns is not None and (seen_ns is None or newest_ns >= seen_ns + PERIOD_NS):
             self._take(ring, newest_ns)
 
-    def way(self, ring: TokenRing, anchor: EncodedFrame) -> Way:
+    def past_path(self, ring: TokenRing, anchor: EncodedFrame) -> PastPath:
         """Return the path up to a generation's newest frame, in its robot frame; the next call takes later frames."""
         self._take(ring, anchor.stamp_ns)
         # The ring may have dropped the frame during the generation's wait.
         self._put(anchor.stamp_ns, anchor.T_odom_base)
-        return self._path.way(anchor.T_odom_base)
+        return self._path.past_path(anchor.T_odom_base)
 
     def update(self, text: str, constraint: TextConstraint, anchor: EncodedFrame) -> None:
         """Take a published text's progress, and the model's own turn and stop."""

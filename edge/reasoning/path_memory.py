@@ -17,7 +17,7 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 
 Point: TypeAlias = tuple[float, float]
-Way: TypeAlias = tuple[Point, ...]
+PastPath: TypeAlias = tuple[Point, ...]
 """(x m, y m) with one decimal in the newest robot frame, oldest first; without the robot itself, which is at (0, 0)."""
 
 MAX_POINTS = 8
@@ -117,7 +117,7 @@ class PathMemory:
         if len(self._points) >= CAPACITY:
             self._points = simplified(self._points, CAPACITY // 2, 0.0)
 
-    def way(self, T_odom_base: SE2) -> Way:
+    def past_path(self, T_odom_base: SE2) -> PastPath:
         """Return the path up to the newest pose, in that robot frame; () before the first pose."""
         here = (T_odom_base.x_m, T_odom_base.y_m)
         # One point more than in the prompt: the last is the robot itself.
@@ -134,10 +134,10 @@ def prompt_point(T_base_point: SE2) -> Point:
     return (x_m, y_m)
 
 
-def way_of(poses: Iterable[tuple[int, SE2]]) -> Way:
+def past_path_of(poses: Iterable[tuple[int, SE2]]) -> PastPath:
     """Return the path of (stamp ns, `T_odom_base`), oldest first, in the last pose's robot frame."""
     memory = PathMemory()
     newest: SE2 | None = None
     for stamp_ns, newest in poses:
         memory.put(stamp_ns, newest)
-    return () if newest is None else memory.way(newest)
+    return () if newest is None else memory.past_path(newest)

@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from tokenizers import Tokenizer
 
-from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, Way
+from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PastPath
 from edge.state.reasoning_text import MAX_COUNT, Progress, format_progress
 from edge.state.ring import EncodedFrame
 
 SYSTEM = "Drive through people. Describe the situation, then waypoints."
 MAX_INSTRUCTION_CHARS = 400
-EXAMPLE_WAY: Way = (
+EXAMPLE_PAST_PATH: PastPath = (
     (-31.6, 16.6), (-31.1, 4.0), (-20.3, 1.9), (-12.0, -0.8), (-8.2, 0.4), (-6.1, 0.7), (-2.4, 0.1), (0.0, 1.5)
 )  # fmt: skip
 EXAMPLE_BEFORE = Progress(2, 3, 1)
 """Past motion of a prompt of usual length, for timing and planning: all points of an indoor path."""
-LONGEST_WAY: Way = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
+LONGEST_PAST_PATH: PastPath = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
 LONGEST_BEFORE = Progress(MAX_COUNT, MAX_COUNT, MAX_COUNT)
 """Past motion of the longest possible prompt."""
 
@@ -74,10 +74,10 @@ class PromptBuilder:
         return list(self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def build(
-        self, frames: Sequence[EncodedFrame], instruction: str, way: Way = (), before: Progress | None = None
+        self, frames: Sequence[EncodedFrame], instruction: str, past_path: PastPath = (), before: Progress | None = None
     ) -> list[Segment]:
         """Return one segment per frame, oldest first, then the tail; without a path: an instruction's first prompt."""
-        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(way, before)]
+        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(past_path, before)]
 
     def frame(self, number: int, frame: EncodedFrame, instruction: str) -> Segment:
         """Return the segment of frame `number`, from 1, oldest first; the first includes the prompt's start.
@@ -92,17 +92,20 @@ class PromptBuilder:
         image = [ids.img_start, *[ids.img_context] * self._frame_tokens, ids.img_end]
         return Segment((*head, *self._text(f"Frame {number}:"), *image, *self._text("\n")), frame.tokens)
 
-    def tail(self, way: Way, before: Progress | None) -> Segment:
+    def tail(self, past_path: PastPath, before: Progress | None) -> Segment:
         """Return the segment after the frames: the path since the instruction began, in the newest frame's robot
         frame, the previous text's progress (None: none), and the assistant's turn."""
         ids = self._ids
-        text = [*self._text(f"Past motion: {format_past_motion(way)}\nBefore: {format_before(before)}"), ids.im_end]
+        text = [
+            *self._text(f"Past motion: {format_past_motion(past_path)}\nBefore: {format_before(before)}"),
+            ids.im_end,
+        ]
         return Segment((*text, *self._text("\n"), ids.im_start, *self._text("assistant\n")), None)
 
 
-def format_past_motion(way: Way) -> str:
+def format_past_motion(past_path: PastPath) -> str:
     """Format the path in the current robot frame, m, oldest first: "(-1.4, 0.0) (0.0, 2.1)"."""
-    return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in way) or "none"
+    return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in past_path) or "none"
 
 
 def format_before(before: Progress | None) -> str:

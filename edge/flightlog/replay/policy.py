@@ -18,7 +18,7 @@ from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
 from edge.motion.recovery import MOVING
-from edge.reasoning.path_memory import Way, way_of
+from edge.reasoning.path_memory import PastPath, past_path_of
 from edge.run.camera import decode_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
@@ -154,7 +154,10 @@ class Replayer:
         ]
         generation = self._language.generate(
             self._language.prompt.build(
-                frames, record.instruction or self._run.instruction, self._way(record, frames), record.context.before
+                frames,
+                record.instruction or self._run.instruction,
+                self._past_path(record, frames),
+                record.context.before,
             ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
@@ -179,11 +182,11 @@ class Replayer:
         )
         return replayed.state
 
-    def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
+    def _past_path(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> PastPath:
         """The recorded path; of a log without one, the path through the frames alone."""
         if record.way is not None:
             return record.way
-        return way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
+        return past_path_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
 
     def _frame_poses(self, record: RecordedGeneration) -> Sequence[SE2]:
         if record.poses is not None:

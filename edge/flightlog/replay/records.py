@@ -15,7 +15,7 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from edge.reasoning.decoding_rules import FOLLOWS, FREE, DecodingContext, TurnDistances
-from edge.reasoning.path_memory import Way
+from edge.reasoning.path_memory import PastPath
 from edge.reasoning.prompt import format_before
 from edge.state.reasoning_text import LEFT, PROGRESS_HEAD, RIGHT, Progress, parse_progress
 from firmware_bridge.core.config import ConfigError, LimitsConfig
@@ -59,7 +59,7 @@ class RecordedGeneration:
     poses: tuple[SE2, ...] | None
     """`T_odom_base` of each frame; None: a log without poses."""
     anchor_pose: SE2
-    way: Way | None
+    way: PastPath | None
     """The path in the prompt; None: a log from before it was recorded."""
     context: DecodingContext
     max_new_tokens: int

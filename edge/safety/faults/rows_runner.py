@@ -14,7 +14,7 @@ _ROBOT = "tests/edge/run/test_robot_inputs.py::test_"
 INPUTS: tuple[Fault, ...] = (
     Fault(
         "camera-stopped", 1, Action.ZERO, 500, _HERE,
-        "No new picture arrives.",
+        "There is no new picture.",
         "Check the camera's cable and service; driving resumes 1 s after pictures arrive again.",
         _STOPPED + "[camera-stopped]",
     ),
