@@ -34,7 +34,7 @@ from edge.reasoning.prompt import InstructionError, check_instruction
 from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20
-"""Generations that a profile is made of at least: fewer show too little of the slow ones."""
+"""Smallest number of generations of a profile: fewer contain too few slow ones."""
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 
 EXAMPLES: Final = """examples:

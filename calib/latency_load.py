@@ -28,7 +28,7 @@ from edge.state.semantic import SemanticSlot, SharedState
 from export.evaluation.calibration import Clip
 
 WARM: Final = 3
-"""Generations that are left out: what they wait for is not known before there were some."""
+"""First generations that are left out: their waits depend on earlier durations."""
 SAY_EVERY_S: Final = 15.0
 POLL_S: Final = 0.05
 JOIN_S: Final = 5.0
@@ -62,7 +62,7 @@ class Generations:
 
 
 class Ticks:
-    """The control thread's work at its rate: a picture encoded into the ring, the action expert asked."""
+    """The control thread's work at its rate: encode a picture into the ring, run the action expert."""
 
     def __init__(
         self, artifacts: Artifacts, policy: Policy, ring: TokenRing, slot: SemanticSlot, clip: Clip, schedule: Schedule
@@ -92,7 +92,7 @@ class Ticks:
 
     def _tick(self) -> None:
         now_ns = time.monotonic_ns()
-        # The clip's pictures are about a second apart; each is shown for as long.
+        # The clip's pictures are about a second apart; each stays the input for as long.
         index = (self.ticks * self._period_ns // 1_000_000_000) % len(self._pictures)
         tokens = self._policy.encode(self._pictures[index], self._ring.next_buffer())
         self._ring.put(EncodedFrame(now_ns, self._poses[index], tokens))
