@@ -1,4 +1,4 @@
-"""`edge-calib latency`: how long generations take on this device beside a control thread; writes a latency profile."""
+"""`edge-calib latency`: measures generation times beside a control thread; writes a latency profile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reasoning thread of a run, as it is on a robot, beside ticks that encode and act; no robot is needed."""
+"""Runs the runner's reasoning thread beside ticks that encode and act, without a robot."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ JOIN_S: Final = 5.0
 
 
 class MeasureError(RuntimeError):
-    """A measurement that cannot be used; one line."""
+    """An unusable measurement; one line."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured: (time of a generation, how late its newest frame was captured) in s, and the ticks beside."""
+    """Measurement: (generation time, time from its start to its newest frame), s, and the ticks beside it."""
 
     times_s: tuple[tuple[float, float], ...]
     ticks: int
     late: int
-    """Ticks that were not over by the next one's deadline."""
+    """Number of ticks that ended after the next one's deadline."""
     failed: int
 
 
 @dataclass
 class Generations:
-    """Takes the records of generations, as a flight log would."""
+    """Collects the records of generations in place of a flight log."""
 
     times_s: list[tuple[float, float]] = field(default_factory=list)
 
     def put(self, topic: str, _stamp_ns: int, record: Mapping[str, Any]) -> None:
-        """Keep the times of a finished generation."""
+        """Store the times of a finished generation."""
         if topic == "/semantic":
             self.times_s.append(times_of(record))
 
@@ -75,7 +75,7 @@ class Ticks:
         self.error = ""
 
     def run(self, stop: threading.Event) -> None:
-        """Until `stop`, on absolute deadlines; those that were slept over are skipped."""
+        """Tick until `stop` on absolute deadlines; skip missed ones."""
         enter(self._schedule.control)
         deadline_ns = time.monotonic_ns() + self._period_ns
         try:
@@ -114,7 +114,7 @@ def measure(
     say: Callable[[str], None],
     stop: threading.Event,
 ) -> Measured:
-    """Run both threads until there are so many generations or the time is over; `stop` ends it before.
+    """Run both threads until the number of generations or the time limit is reached, or until `stop`.
 
     Raises ArtifactError, InstructionError, MeasureError.
     """
